@@ -1,0 +1,1 @@
+"""Off-line design: linear model, margins and fixed-structure H-infinity synthesis."""
