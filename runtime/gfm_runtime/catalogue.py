@@ -1,0 +1,77 @@
+"""The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+from gfm_runtime.errors import LawError
+from gfm_runtime.law import Law
+from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file
+
+
+@dataclass(frozen=True)
+class LawSet:
+    """What a name stands for: one law, or the stages of a gain-scheduled one.
+
+    Attributes:
+        name: the name asked for.
+        laws: one law, or one a stage in ascending order of the stage's reactance.
+        schedule: None, or when which stage is in force.
+    """
+
+    name: str
+    laws: tuple[Law, ...]
+    schedule: Schedule | None = None
+
+
+def _natural(name: str) -> list[int | str]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+
+
+@cache
+def law_names() -> tuple[str, ...]:
+    """Names of all laws that ship, in natural order (vsg-2 before vsg-10)."""
+    folder = files("gfm_runtime") / "laws"
+    found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
+    return tuple(sorted(found, key=_natural))
+
+
+@cache
+def _shipped(name: str) -> LawFile:
+    text = (files("gfm_runtime") / "laws" / f"{name}.toml").read_text(encoding="utf-8")
+    return parse_law(text, f"law {name}")
+
+
+def law_file(name: str) -> LawFile:
+    """The parsed law file of a catalogue name, or of a path that ends in ``.toml``.
+
+    Raises:
+        LawError: an unknown name (the known ones are listed), or a file that is not a law.
+    """
+    if name.endswith(".toml"):
+        return read_law_file(name)
+    if name not in law_names():
+        raise LawError(f"law {name!r}", f"unknown; use a .toml file or one of {list(law_names())}")
+    return _shipped(name)
+
+
+def load_law(name: str, **changed: float) -> LawSet:
+    """A law by catalogue name or path, with parameters changed by name if wanted.
+
+    Raises:
+        LawError: as ``law_file`` and ``build_law``.
+    """
+    file = law_file(name)
+    if file.schedule is None:
+        return LawSet(file.name, (build_law(file, changed),))
+    stages = sorted(file.schedule.stages, key=lambda stage: stage.X)
+    laws = tuple(build_law(file, {**stage.parameters, **changed}) for stage in stages)
+    return LawSet(file.name, laws, file.schedule)
+
+
+def get_law(name: str, **changed: float) -> Law:
+    """A single law; of a gain-scheduled one, the first stage."""
+    return load_law(name, **changed).laws[0]

@@ -1,0 +1,158 @@
+"""The controller's tick: checks, set-points, the active law, changes of law, the safe state.
+
+Everything that changes lives in one record of ``controller_dtype`` and the laws' own records, so
+that a tick is one njit call and the same call serves every link, in lockstep and in real time.
+States: INIT -> READY -> RUNNING -> SAFE (latched) -> STOPPED. In SAFE the outputs stay at the
+last good u and the state travels in every frame; the plant answers by blocking the bridge.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gfm_runtime.impedance import estimate
+from gfm_runtime.kernel import step
+from gfm_runtime.signals import NU, NY, group
+from gfm_runtime.switchover import change_law
+
+INIT, READY, RUNNING, SAFE, STOPPED = range(5)
+STATES = ("INIT", "READY", "RUNNING", "SAFE", "STOPPED")
+
+OK, BAD_Y, BAD_U, STALE, LOST_PEER, PLANT_TRIP, OPERATOR = range(7)
+REASONS = (
+    "",
+    "a measurement is not finite or out of range",
+    "an output is not finite",
+    "no fresh measurement for longer than late_policy allows",
+    "the plant's process is gone",
+    "the plant's protection tripped",
+    "stopped by the operator",
+)
+
+MAX_STAGES = 8
+
+controller_dtype = np.dtype(
+    [
+        ("state", "i8"),
+        ("reason", "i8"),
+        ("channel", "i8"),  # which y or u was bad
+        ("active", "i8"),  # index into the laws
+        ("request", "i8"),  # index to change to at the next tick, or -1
+        ("changes", "i8"),
+        ("bump", "f8"),  # of the last change, p.u.
+        ("stale", "i8"),  # ticks in a row without a fresh y
+        ("hold", "i8"),  # how many of them are allowed
+        ("ref", "f8", (NY,)),
+        ("ref_target", "f8", (NY,)),
+        ("ref_rate", "f8", (NY,)),  # p.u. per tick; 0 is a step
+        ("y_low", "f8", (NY,)),
+        ("y_high", "f8", (NY,)),
+        # gain scheduling: stages first..first+count-1 of the laws share one schedule
+        ("stages", "i8"),
+        ("stage_law", "i8", (MAX_STAGES,)),
+        ("stage_X", "f8", (MAX_STAGES,)),  # upper end of each stage, p.u.
+        ("hysteresis", "f8"),
+        ("dwell", "i8"),
+        ("since", "i8"),
+    ],
+    align=True,
+)
+
+
+def make_controller(hold: int = 0) -> NDArray[Any]:
+    """A controller record in INIT with the signal table's ranges and default references.
+
+    Args:
+        hold: ticks in a row without a fresh measurement before the safe state.
+    """
+    out = np.zeros(1, controller_dtype)
+    rec = out[0]
+    rec["request"], rec["hold"] = -1, hold
+    rec["ref"] = rec["ref_target"] = [s.default for s in group("ref")]
+    rec["y_low"] = [s.low for s in group("y")]
+    rec["y_high"] = [s.high for s in group("y")]
+    return out
+
+
+def set_reference(ctl: NDArray[Any], index: int, value: float, per_tick: float = 0.0) -> None:
+    """New target of one reference (p.u.); reached in steps of ``per_tick``, 0 at once."""
+    ctl["ref_target"][0, index] = value
+    ctl["ref_rate"][0, index] = abs(per_tick)
+
+
+@njit(cache=True)
+def _go_safe(ctl, reason, channel):
+    if ctl.state != SAFE:
+        ctl.state, ctl.reason, ctl.channel = SAFE, reason, channel
+
+
+@njit(cache=True)
+def missed(ctl):
+    """Count a tick without a fresh measurement; SAFE when there were too many in a row."""
+    ctl.stale += 1
+    if ctl.stale > ctl.hold:
+        _go_safe(ctl, STALE, -1)
+
+
+@njit(cache=True)
+def _schedule(ctl, est, y):
+    """Pick the stage for the estimated reactance, with hysteresis and a least dwell."""
+    X = estimate(est, y[1], y[2], y[4])
+    ctl.since += 1
+    if ctl.since <= ctl.dwell:
+        return
+    now = 0
+    for k in range(ctl.stages):
+        if ctl.stage_law[k] == ctl.active:
+            now = k
+    wanted = now
+    while wanted + 1 < ctl.stages and ctl.stage_X[wanted] * (1 + ctl.hysteresis) < X:
+        wanted += 1
+    while wanted > 0 and ctl.stage_X[wanted - 1] * (1 - ctl.hysteresis) > X:
+        wanted -= 1
+    if wanted != now:
+        ctl.request, ctl.since = ctl.stage_law[wanted], 0
+
+
+@njit(cache=True)
+def control(ctl, laws, states, est, y, u):
+    """One tick: y[k] in, u[k] out.
+
+    Args:
+        ctl, est: one-element arrays of ``controller_dtype`` and ``impedance_dtype``.
+        laws, states: arrays of ``law_dtype`` and ``state_dtype``, one element a law.
+        y: measurements, shape (5,), p.u.
+        u: in: u[k-1]; out: u[k], shape (3,), p.u. Unchanged in SAFE.
+    """
+    c = ctl[0]
+    if c.state != RUNNING:
+        return
+    for j in range(NY):
+        if not (c.y_low[j] <= y[j] <= c.y_high[j]):
+            _go_safe(c, BAD_Y, j)
+            return
+    c.stale = 0
+    for j in range(NY):
+        away = c.ref_target[j] - c.ref[j]
+        if c.ref_rate[j] == 0.0 or abs(away) <= c.ref_rate[j]:
+            c.ref[j] = c.ref_target[j]
+        else:
+            c.ref[j] += math.copysign(c.ref_rate[j], away)
+    if c.stages > 0:
+        _schedule(c, est[0], y)
+    before = (u[0], u[1], u[2])
+    if c.request >= 0:
+        k, c.request = c.request, -1
+        c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, y, u)
+        c.active, c.changes = k, c.changes + 1
+    step(laws[c.active], states[c.active], c.ref, y, u)
+    for i in range(NU):
+        if not math.isfinite(u[i]):
+            _go_safe(c, BAD_U, i)
+            u[0], u[1], u[2] = before
+            return

@@ -1,0 +1,53 @@
+"""Arithmetic over named parameters in a law file, e.g. ``"2 * H * D_p"``."""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Mapping
+
+from gfm_runtime.errors import LawError
+
+_BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
+
+
+def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) -> float:
+    """A number, or an expression of + - * / ** ( ) over ``parameters``.
+
+    Raises:
+        LawError: naming ``where``: syntax, an unknown name, a result that is no finite number.
+    """
+    if not isinstance(value, str):
+        return float(value)
+    try:
+        result = _walk(where, ast.parse(value, mode="eval").body, parameters)
+    except SyntaxError:
+        raise LawError(where, f"{value!r} is no arithmetic expression") from None
+    except (ZeroDivisionError, OverflowError) as problem:
+        raise LawError(where, f"{value!r}: {problem}") from None
+    if isinstance(result, complex) or not math.isfinite(result):
+        raise LawError(where, f"{value!r} gives {result}, not a finite number")
+    return result
+
+
+def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
+    match node:
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            return float(number)
+        case ast.Name(id=name):
+            if name not in parameters:
+                raise LawError(where, f"unknown parameter {name!r}; known: {sorted(parameters)}")
+            return parameters[name]
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -_walk(where, operand, parameters)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+            a, b = _walk(where, left, parameters), _walk(where, right, parameters)
+            return _BINARY[type(op)](a, b)
+    raise LawError(where, f"{ast.unparse(node)!r}: only + - * / ** ( ), numbers and names")

@@ -1,0 +1,98 @@
+"""Estimate of the grid's reactance from the converter's own power swings, for gain scheduling.
+
+Around an operating point p moves with the angle as dp = K d(delta), K = V V_g cos(delta)/X, and
+d(delta)/dt = omega_b (omega_u - omega_g) (Eq. (7) of the paper). Both sides pass the same
+washout, which removes the unknown omega_g and the operating point; K is the ratio of two
+exponentially forgetting sums, K = sum(p_w theta_w)/sum(theta_w^2). With p = V V_g sin(delta)/X the
+reactance follows without knowing delta: X = V V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u.
+The estimate moves only while the sums hold enough excitation, and is held otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+impedance_dtype = np.dtype(
+    [
+        ("T_s", "f8"),
+        ("omega_b", "f8"),
+        ("washout", "f8"),  # rad/s
+        ("forget", "f8"),  # per tick
+        ("excitation", "f8"),  # least sum(theta_w^2), rad^2
+        ("theta", "f8"),  # washed-out angle, rad
+        ("p_slow", "f8"),  # slow part of p that the first washout takes away, p.u.
+        ("p_slower", "f8"),  # and the second
+        ("s_pt", "f8"),
+        ("s_tt", "f8"),
+        ("omega_slow", "f8"),
+        ("started", "i8"),
+        ("X", "f8"),  # the estimate, p.u.
+    ],
+    align=True,
+)
+
+
+def make_impedance(
+    T_s: float,
+    X_0: float,
+    omega_b: float = 100 * math.pi,
+    washout_hz: float = 0.5,
+    memory_s: float = 0.5,
+    excitation: float = 1e-6,
+) -> NDArray[Any]:
+    """Estimator record, one element.
+
+    Args:
+        T_s: sampling time, s.
+        X_0: estimate to start from, p.u.
+        omega_b: base frequency, rad/s.
+        washout_hz: corner of the washout on p and on the angle, Hz.
+        memory_s: time constant of the forgetting sums, s.
+        excitation: least mean square of the washed-out angle that may move X, rad^2.
+
+    Raises:
+        ValueError: a value that is not positive.
+    """
+    values = {
+        "T_s": T_s,
+        "X_0": X_0,
+        "omega_b": omega_b,
+        "washout_hz": washout_hz,
+        "memory_s": memory_s,
+        "excitation": excitation,
+    }
+    for name, value in values.items():
+        if not value > 0.0:
+            raise ValueError(f"{name} = {value} must be > 0")
+    out = np.zeros(1, impedance_dtype)
+    out["T_s"], out["omega_b"], out["X"] = T_s, omega_b, X_0
+    out["washout"] = 2 * math.pi * washout_hz
+    out["forget"] = T_s / memory_s
+    out["excitation"] = excitation
+    return out
+
+
+@njit(cache=True)
+def estimate(est, p, omega_u, V):
+    """One tick of the estimator from p, omega_u and V (p.u.); returns X in p.u."""
+    if est.started == 0:
+        est.started = 1
+        est.p_slow, est.omega_slow = p, omega_u
+    a = est.washout * est.T_s
+    # twice through the washout, both of them: an angle under a constant omega_g is a ramp
+    est.omega_slow += a * (omega_u - est.omega_slow)
+    est.theta += est.T_s * est.omega_b * (omega_u - est.omega_slow) - a * est.theta
+    est.p_slow += a * (p - est.p_slow)
+    est.p_slower += a * (p - est.p_slow - est.p_slower)
+    p_fast = p - est.p_slow - est.p_slower
+    est.s_pt += est.forget * (p_fast * est.theta - est.s_pt)
+    est.s_tt += est.forget * (est.theta * est.theta - est.s_tt)
+    if est.s_tt > est.excitation and est.s_pt > 0.0:
+        K = est.s_pt / est.s_tt
+        est.X = V / math.sqrt(K * K + p * p)
+    return est.X

@@ -1,0 +1,169 @@
+"""The fixed-step kernel: one njit function for every law.
+
+A law reaches the kernel as one record of ``law_dtype`` (constants) and one of ``state_dtype``
+(what changes). Both are plain C structs with constant-size arrays, so that firmware can hold the
+same bytes. The kernel knows no law by name, allocates nothing, calls no BLAS and no clock.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import DTypeLike, NDArray
+
+from gfm_runtime.discretise import DiscreteLaw
+from gfm_runtime.error_maps import ERROR_MAPS, map_errors
+from gfm_runtime.errors import LawError
+from gfm_runtime.signals import NU, NY
+
+N_MAX = 12  # states; the largest law of Table II has five
+TREND_TIME = 0.01  # s; u[k] - u[k-1] is filtered with this before a bumpless change uses it
+
+
+def law_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
+    """Record of a law's constants; ``real`` is float64 or float32."""
+    f = np.dtype(real)
+    return np.dtype(
+        [
+            ("n", "i8"),
+            ("error_map", "i8"),
+            ("error_parameters", f, (2,)),
+            ("A", f, (N_MAX, N_MAX)),
+            ("B_r", f, (N_MAX, NY)),
+            ("B_y", f, (N_MAX, NY)),
+            ("C", f, (NU, N_MAX)),
+            ("D_r", f, (NU, NY)),
+            ("D_y", f, (NU, NY)),
+            ("D_u0", f, (NU, NY)),
+            ("u_0", f, (NU,)),
+            ("loop", f),  # 1/(1 - D_y[1,2]): the omega_u loop in closed form
+            ("low", f, (NU,)),
+            ("high", f, (NU,)),
+            ("W", f, (N_MAX, NU)),
+            ("decay", f),  # of the offset, per tick
+            ("follow", f),  # of the trend filter, per tick
+            ("E_r", f, (N_MAX, NY)),
+            ("E_y", f, (N_MAX, NY)),
+            ("F", f, (N_MAX, NU)),
+            ("G", f, (N_MAX, NU)),
+        ],
+        align=True,
+    )
+
+
+def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
+    """Record of what a running law changes; scratch space included, so a step allocates nothing."""
+    f = np.dtype(real)
+    return np.dtype(
+        [
+            ("x", f, (N_MAX,)),
+            ("x_next", f, (N_MAX,)),
+            ("r", f, (NY,)),  # mapped references of this tick
+            ("y", f, (NY,)),  # mapped measurements of this tick, omega_u the law's own
+            ("raw", f, (NU,)),  # u before the limits
+            ("offset", f, (NU,)),  # left by a bumpless change, decays
+            ("u", f, (NU,)),  # u of the last tick
+            ("trend", f, (NU,)),  # filtered u[k] - u[k-1]
+        ],
+        align=True,
+    )
+
+
+def pack_law(discrete: DiscreteLaw, real: DTypeLike = np.float64) -> NDArray[Any]:
+    """A discrete law as a one-element array of ``law_dtype``.
+
+    Raises:
+        LawError: more states than the kernel holds.
+    """
+    n, law = discrete.order, discrete.law
+    if n > N_MAX:
+        raise LawError(law.name, f"{n} states; the kernel holds {N_MAX}")
+    out = np.zeros(1, law_dtype(real))
+    rec = out[0]
+    rec["n"], rec["error_map"] = n, ERROR_MAPS[law.error_map]
+    rec["error_parameters"][: len(law.error_parameters)] = law.error_parameters
+    rec["A"][:n, :n], rec["C"][:, :n] = discrete.A, discrete.C
+    for name in ("B_r", "B_y", "W", "E_r", "E_y", "F", "G"):
+        rec[name][:n] = getattr(discrete, name)
+    for name in ("D_r", "D_y", "D_u0", "u_0"):
+        rec[name] = getattr(discrete, name)
+    rec["loop"] = 1.0 / (1.0 - discrete.D_y[1, 2])
+    rec["low"], rec["high"] = law.limits.low, law.limits.high
+    rec["decay"] = np.exp(-discrete.T_s / law.limits.T_off)
+    rec["follow"] = -np.expm1(-discrete.T_s / TREND_TIME)
+    return out
+
+
+@njit(cache=True)
+def set_inputs(law, state, ref, y):
+    """Map this tick's references and measurements (shape (5,), p.u.) into the state record."""
+    for j in range(NY):
+        state.r[j] = ref[j]
+        state.y[j] = y[j]
+    map_errors(law.error_map, law.error_parameters, state.r, state.y)
+
+
+@njit(cache=True)
+def _row(law, state, ref, i):
+    """u_i without the omega_u column: u_0 + C x + D_r r + D_y y + offset."""
+    a = law.u_0[i] + state.offset[i]
+    for j in range(law.n):
+        a += law.C[i, j] * state.x[j]
+    for j in range(NY):
+        a += law.D_u0[i, j] * ref[j] + law.D_r[i, j] * state.r[j]
+    for j in range(NY):
+        if j != 2:
+            a += law.D_y[i, j] * state.y[j]
+    return a
+
+
+@njit(cache=True)
+def output(law, state, ref, u):
+    """u[k] (shape (3,), p.u.) from the inputs set; omega_u first, since column 3 feeds it back."""
+    state.raw[1] = _row(law, state, ref, 1) * law.loop
+    u[1] = min(max(state.raw[1], law.low[1]), law.high[1])
+    state.y[2] = u[1]
+    for i in (0, 2):
+        state.raw[i] = _row(law, state, ref, i) + law.D_y[i, 2] * u[1]
+        u[i] = min(max(state.raw[i], law.low[i]), law.high[i])
+
+
+@njit(cache=True)
+def advance(law, state, u):
+    """x[k+1] from this tick's inputs, with back-calculation of what the limits took away."""
+    n = law.n
+    for i in range(NU):
+        excess = u[i] - state.raw[i]
+        if excess != 0.0:
+            for j in range(n):
+                state.x[j] += law.W[j, i] * excess
+        state.offset[i] *= law.decay
+        state.trend[i] += law.follow * (u[i] - state.u[i] - state.trend[i])
+        state.u[i] = u[i]
+    for i in range(n):
+        a = law.B_r[i, 0] * state.r[0]
+        for j in range(1, NY):
+            a += law.B_r[i, j] * state.r[j]
+        for j in range(NY):
+            a += law.B_y[i, j] * state.y[j]
+        for j in range(n):
+            a += law.A[i, j] * state.x[j]
+        state.x_next[i] = a
+    for i in range(n):
+        state.x[i] = state.x_next[i]
+
+
+@njit(cache=True)
+def step(law, state, ref, y, u):
+    """One tick: u[k] into ``u`` and the state to k+1.
+
+    Args:
+        law, state: records of ``law_dtype`` and ``state_dtype``.
+        ref, y: references and measurements, shape (5,), p.u.
+        u: output, shape (3,), p.u.
+    """
+    set_inputs(law, state, ref, y)
+    output(law, state, ref, u)
+    advance(law, state, u)

@@ -1,0 +1,92 @@
+"""The one signal table: every quantity that crosses the link or reaches an operator.
+
+Frames, recorder columns, scope labels and the docs are generated from this table. The order
+within a group is the order of the vectors everywhere:
+
+* ``y``   = (v_dc, p, omega_u, q, V), the measurements (Eq. (14) of the paper),
+* ``u``   = (i_u, omega_u, E_u), the control inputs (Eq. (13)),
+* ``ref`` = (V_dcref, P_ref, omega_g, Q_ref, V_ref), the references Y_ref (Eq. (17)),
+* ``d``   = (omega_g, V_g), the grid seen as disturbance (Eq. (15)).
+
+Add signals at the end of a group only; anything else is a new ``TABLE_VERSION``, which both
+sides of a link compare before they start.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import astuple, dataclass
+from typing import Literal
+
+TABLE_VERSION = 1
+
+Group = Literal["y", "u", "ref", "d"]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One row of the table.
+
+    Attributes:
+        group: the vector it belongs to.
+        name: identifier in code and files; unique within its group.
+        symbol: as printed, LaTeX.
+        unit: unit of the value on the link; ``p.u.`` of the base named in ``base``.
+        base: what 1 p.u. is.
+        scale: resolution of an integer transport, in ``unit`` per count.
+        low, high: plausible range in ``unit``; a measurement outside is refused by the
+            controller (safe state), a reference outside is refused by the scenario.
+        default: value at start if nothing else is said.
+        description: one line for people.
+    """
+
+    group: Group
+    name: str
+    symbol: str
+    unit: str
+    base: str
+    scale: float
+    low: float
+    high: float
+    default: float
+    description: str
+
+
+SIGNALS: tuple[Signal, ...] = (
+    Signal("y", "v_dc", "v_{dc}", "p.u.", "V_dcref", 1e-4, 0.0, 3.0, 1.0, "DC voltage"),
+    Signal("y", "p", "p", "p.u.", "S_n", 2e-4, -6.0, 6.0, 0.5, "active power at the capacitor"),
+    Signal("y", "omega_u", r"\omega_u", "p.u.", "omega_n", 1e-5, 0.7, 1.3, 1.0, "frequency in use"),
+    Signal("y", "q", "q", "p.u.", "S_n", 2e-4, -6.0, 6.0, 0.0, "reactive power at the capacitor"),
+    Signal("y", "V", "V", "p.u.", "V_n", 1e-4, 0.0, 3.0, 1.0, "magnitude of the capacitor voltage"),
+    Signal("u", "i_u", "i_u", "p.u.", "S_n/V_dcref", 2e-4, -6.0, 6.0, 0.0, "DC source current"),
+    Signal("u", "omega_u", r"\omega_u", "p.u.", "omega_n", 1e-5, 0.7, 1.3, 1.0, "frequency"),
+    Signal("u", "E_u", "E_u", "p.u.", "V_n", 1e-4, 0.0, 3.0, 1.0, "internal voltage magnitude"),
+    Signal("ref", "V_dcref", "V_{dcref}", "p.u.", "V_dcref", 1e-4, 0.5, 1.5, 1.0, "DC voltage"),
+    Signal("ref", "P_ref", "P_{ref}", "p.u.", "S_n", 2e-4, -2.0, 2.0, 0.5, "active power"),
+    Signal("ref", "omega_g", r"\omega_g", "p.u.", "omega_n", 1e-5, 0.8, 1.2, 1.0, "frequency"),
+    Signal("ref", "Q_ref", "Q_{ref}", "p.u.", "S_n", 2e-4, -2.0, 2.0, 0.0, "reactive power"),
+    Signal("ref", "V_ref", "V_{ref}", "p.u.", "V_n", 1e-4, 0.5, 1.5, 1.0, "voltage magnitude"),
+    Signal("d", "omega_g", r"\omega_g", "p.u.", "omega_n", 1e-5, 0.8, 1.2, 1.0, "grid frequency"),
+    Signal("d", "V_g", "V_g", "p.u.", "V_n", 1e-4, 0.0, 1.5, 1.0, "grid voltage magnitude"),
+)
+
+NY, NU = 5, 3
+
+
+def group(name: Group) -> tuple[Signal, ...]:
+    """The signals of one vector, in its order."""
+    return tuple(s for s in SIGNALS if s.group == name)
+
+
+def names(name: Group) -> tuple[str, ...]:
+    """The names of one vector's signals, in its order."""
+    return tuple(s.name for s in group(name))
+
+
+Y_NAMES, U_NAMES, REF_NAMES, D_NAMES = names("y"), names("u"), names("ref"), names("d")
+
+
+def table_hash() -> str:
+    """Eight hex digits over the whole table; both sides of a link compare it before they start."""
+    text = repr((TABLE_VERSION, [astuple(s) for s in SIGNALS]))
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

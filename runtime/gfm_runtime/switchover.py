@@ -1,0 +1,69 @@
+"""A change of law without a bump: one njit call at one tick.
+
+The new law's states are set from linear maps that were prepared when it was discretised (E_r,
+E_y, F, G): nearest to its own rest state, with u[k] and, where a row has two or more states, the
+trend of u carried over. A row without states cannot absorb the difference between the two laws;
+there it goes into ``state.offset``, which decays with the law's T_off.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from gfm_runtime.kernel import output, set_inputs
+from gfm_runtime.signals import NU, NY
+
+
+@njit(cache=True)
+def settle_into(law, state, ref, y, u, trend):
+    """Set a law's state so that its output at (ref, y) is u (3,) p.u. and goes on by trend (3,).
+
+    Where u lies outside the law's limits the output is the limit, and the difference is a bump
+    that no state can hide.
+    """
+    set_inputs(law, state, ref, y)
+    state.y[2] = u[1]
+    for i in range(NU):
+        state.offset[i] = 0.0
+        state.u[i] = u[i]
+        state.trend[i] = trend[i]
+    for i in range(law.n):
+        a = law.E_r[i, 0] * state.r[0]
+        for j in range(1, NY):
+            a += law.E_r[i, j] * state.r[j]
+        for j in range(NY):
+            a += law.E_y[i, j] * state.y[j]
+        for j in range(NU):
+            wanted = u[j] - law.u_0[j]
+            for m in range(NY):
+                wanted -= law.D_u0[j, m] * ref[m]
+            a += law.F[i, j] * wanted + law.G[i, j] * (wanted + trend[j])
+        state.x[i] = a
+    # what is left, all of it for a stateless row and rounding for the others, is the offset
+    omega_u, E_u, i_u = u[1], u[2], u[0]
+    output(law, state, ref, u)
+    state.offset[1] = (omega_u - state.raw[1]) / law.loop
+    state.y[2] = omega_u
+    output(law, state, ref, u)
+    state.offset[0] = i_u - state.raw[0]
+    state.offset[2] = E_u - state.raw[2]
+    output(law, state, ref, u)
+
+
+@njit(cache=True)
+def change_law(old, old_state, new, new_state, ref, y, u):
+    """u[k] under the new law, prepared so that it equals the old law's u[k]; returns the bump.
+
+    Args:
+        old, new: records of ``law_dtype``; old_state, new_state of ``state_dtype``.
+        ref, y: this tick's references and measurements, shape (5,), p.u.
+        u: output, shape (3,), p.u.
+
+    Returns:
+        max |u_new - u_old| in p.u.: rounding, unless the new law's limits are tighter.
+    """
+    set_inputs(old, old_state, ref, y)
+    output(old, old_state, ref, u)
+    i_u, omega_u, E_u = u[0], u[1], u[2]
+    settle_into(new, new_state, ref, y, u, old_state.trend)
+    return max(abs(u[0] - i_u), abs(u[1] - omega_u), abs(u[2] - E_u))
