@@ -1,0 +1,196 @@
+"""The options of one plant, as scenario files embed them; the defaults are the paper's simulation.
+
+Everything is ideal until told otherwise: no sensor filter, noise, quantisation or delay, and all
+elements at their nominal values. Channels carry the names of y and u. omega_u is the
+controller's own number and passes the sensors and the A/D untouched.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from gfm_plant.parameters import Element, NonNegative, Positive
+
+Measured = Literal["v_dc", "p", "q", "V"]
+Command = Literal["i_u", "omega_u", "E_u"]
+MEASURED: tuple[Measured, ...] = ("v_dc", "p", "q", "V")
+COMMANDS: tuple[Command, ...] = ("i_u", "omega_u", "E_u")
+"""The channels, in the order of the records."""
+
+
+class Options(BaseModel):
+    """Base of all options: unknown keys, wrong types and NaN are errors; instances are frozen."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class DcSource(Options):
+    """The current source that feeds C_dc, Eq. (8)."""
+
+    mode: Literal["controlled", "regulated"] = Field(
+        "controlled",
+        description="controlled: the law's i_u flows (the paper's simulation); regulated: the "
+        "source holds v_dc = 1 with its own PI and i_u is ignored (the paper's rig)",
+    )
+    k_p: NonNegative = Field(90.0, description="PI of the regulated source, p.u./p.u.")
+    k_i: NonNegative = Field(400.0, description="PI of the regulated source, p.u./(p.u. s)")
+    i_max: Positive | None = Field(None, description="limit of |i_dc|, p.u.; unlimited if none")
+
+
+class Grid(Options):
+    """The grid simulator at the start, and the local load that its breaker can leave behind."""
+
+    omega_g: Positive = Field(1.0, description="grid frequency, p.u.")
+    V_g: NonNegative = Field(1.0, description="grid voltage, p.u.")
+    load_R: NonNegative | None = Field(None, description="local series RL load, ohm")
+    load_L: Positive | None = Field(None, description="local series RL load, H")
+
+    @model_validator(mode="after")
+    def _load_is_whole(self) -> Grid:
+        if (self.load_R is None) != (self.load_L is None):
+            raise ValueError(
+                f"load_R = {self.load_R}, load_L = {self.load_L}: give both or neither"
+            )
+        return self
+
+
+class Sensors(Options):
+    """What stands between the true quantities and the A/D; errors are applied per channel."""
+
+    bandwidth_hz: Positive | None = Field(None, description="first-order low-pass; ideal if none")
+    gain: dict[Measured, float] = Field({}, description="measured over true value, default 1")
+    offset: dict[Measured, float] = Field({}, description="added to the measured value, p.u.")
+    noise_std: dict[Measured, NonNegative] = Field(
+        {}, description="standard deviation of white Gaussian noise, p.u."
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="of the noise")
+
+
+def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
+    if not limits[0] < limits[1]:
+        raise ValueError(f"range {list(limits)}: must be [lo, hi] with lo < hi")
+    return limits
+
+
+# TOML knows arrays, not tuples: strict=False admits a list, its entries stay strict.
+Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
+
+
+class _Converter(Options):
+    """A bank of A/D or D/A channels; a channel without a range is ideal."""
+
+    bits: int | None = Field(None, ge=2, le=24, description="resolution; only clamps if none")
+
+    @model_validator(mode="after")
+    def _bits_need_a_range(self) -> _Converter:
+        if self.bits is not None and not self.range:  # type: ignore[attr-defined]
+            raise ValueError(f"bits = {self.bits}: range must give at least one channel")
+        return self
+
+
+class AnalogToDigital(_Converter):
+    """The A/D converters that sample y at the tick."""
+
+    range: dict[Measured, Range] = Field({}, description="full scale [lo, hi], p.u.")
+
+
+class DigitalToAnalog(_Converter):
+    """The D/A converters that hold u from tick to tick."""
+
+    range: dict[Command, Range] = Field({}, description="full scale [lo, hi], p.u.")
+
+
+DS2004 = AnalogToDigital(
+    bits=16, range={"v_dc": (0.0, 2.0), "p": (-2.0, 2.0), "q": (-2.0, 2.0), "V": (0.0, 2.0)}
+)
+"""The rig's A/D board: 16 bit, the transducers scaled to twice the nominal value."""
+
+DS2101 = DigitalToAnalog(bits=12, range={"i_u": (-2.0, 2.0), "E_u": (0.0, 2.0)})
+"""The rig's D/A board: 12 bit. omega_u is integrated to the angle before it, so never rounded."""
+
+
+def _preset(boards: dict[str, Any]) -> BeforeValidator:
+    """Let a field take the name of a board in place of a table."""
+
+    def look_up(value: Any) -> Any:
+        if isinstance(value, str):
+            if value not in boards:
+                raise ValueError(f"{value!r}: must be {' or '.join(boards)}, or a table")
+            return boards[value]
+        return value
+
+    return BeforeValidator(look_up)
+
+
+class Delay(Options):
+    """Time from the tick that samples y[k] to the moment when u[k] acts, in sampling periods."""
+
+    samples: int = Field(0, ge=0, le=2)
+    fraction: float = Field(0.0, ge=0, lt=1)
+
+
+class Trip(Options):
+    """One protection: trips when its threshold stays crossed for a time."""
+
+    threshold: Positive = Field(description="p.u. of the protected quantity")
+    delay_s: NonNegative = Field(description="how long the threshold must stay crossed, s")
+    enabled: bool = True
+
+
+_TRIPS = {
+    "over_current": Trip(threshold=3.0, delay_s=0.001),
+    "over_voltage": Trip(threshold=1.4, delay_s=0.01),
+    "under_voltage": Trip(threshold=0.4, delay_s=0.3),
+    "dc_over_voltage": Trip(threshold=1.4, delay_s=0.001),
+    "dc_under_voltage": Trip(threshold=0.5, delay_s=0.001),
+    "over_frequency": Trip(threshold=1.1, delay_s=0.1),
+    "under_frequency": Trip(threshold=0.9, delay_s=0.1),
+}
+
+
+class Protection(Options):
+    """The converter's protection, on the true quantities; a table may give part of a trip."""
+
+    over_current: Trip = Field(_TRIPS["over_current"], description="sqrt(i_d^2 + i_q^2)")
+    over_voltage: Trip = Field(_TRIPS["over_voltage"], description="V")
+    under_voltage: Trip = Field(_TRIPS["under_voltage"], description="V")
+    dc_over_voltage: Trip = Field(_TRIPS["dc_over_voltage"], description="v_dc")
+    dc_under_voltage: Trip = Field(_TRIPS["dc_under_voltage"], description="v_dc")
+    over_frequency: Trip = Field(_TRIPS["over_frequency"], description="omega_u")
+    under_frequency: Trip = Field(_TRIPS["under_frequency"], description="omega_u")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        return {
+            name: {**_TRIPS[name].model_dump(), **trip}
+            if name in _TRIPS and isinstance(trip, dict)
+            else trip
+            for name, trip in data.items()
+        }
+
+
+class Plant(Options):
+    """Everything that makes one plant."""
+
+    converter: str = Field("paper", description="name of a shipped converter, or a .toml file")
+    factors: dict[Element, float] = Field({}, description="real over nominal value of an element")
+    dc_source: DcSource = DcSource()
+    grid: Grid = Grid()
+    sensors: Sensors = Sensors()
+    adc: Annotated[AnalogToDigital, _preset({"DS2004": DS2004})] = AnalogToDigital()
+    dac: Annotated[DigitalToAnalog, _preset({"DS2101": DS2101})] = DigitalToAnalog()
+    delay: Delay = Delay()
+    protection: Protection = Protection()
+    substeps: int = Field(10, ge=1, le=1000, description="RK4 steps in one sampling period")
+
+    @model_validator(mode="after")
+    def _elements_stay_physical(self) -> Plant:
+        for name, factor in self.factors.items():
+            if not (factor > 0 or (factor == 0 and name.startswith("R"))):
+                raise ValueError(f"factors.{name} = {factor}: must be > 0 (>= 0 for a resistor)")
+        return self

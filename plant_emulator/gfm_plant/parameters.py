@@ -1,0 +1,95 @@
+"""Converter parameters: read from a TOML file in SI units, handed on in per unit."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from gfm_plant.bases import Bases
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+
+Element = Literal["L_f", "R_f", "C_f", "L_g", "R_g", "C_dc"]
+
+ELEMENTS: dict[Element, str] = {
+    "L_f": "L",
+    "R_f": "R",
+    "C_f": "C",
+    "L_g": "L",
+    "R_g": "R",
+    "C_dc": "C_dc",
+}
+"""The circuit elements and the quantity whose base each is expressed in."""
+
+
+class ConverterParameters(BaseModel):
+    """Nominal elements of one converter and its line, in SI units (`converters/*.toml`)."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    source: str = Field(description="where the numbers come from")
+    S_n: Positive = Field(description="nominal power, VA")
+    V_n: Positive = Field(description="nominal line-to-line RMS voltage, V")
+    omega_n: Positive = Field(description="nominal angular frequency, rad/s")
+    V_dcref: Positive = Field(description="DC voltage reference, V")
+    L_f: Positive = Field(description="filter inductor, H")
+    R_f: NonNegative = Field(description="filter resistor, ohm")
+    C_f: Positive = Field(description="filter capacitor, F")
+    L_g: Positive = Field(description="line inductor, H")
+    R_g: NonNegative = Field(description="line resistor, ohm")
+    C_dc: Positive = Field(description="DC capacitor, F")
+
+    @property
+    def bases(self) -> Bases:
+        """The per-unit bases that these nominal values define."""
+        return Bases(self.S_n, self.V_n, self.omega_n, self.V_dcref)
+
+    def pu(self, factors: Mapping[Element, float] | None = None) -> dict[Element, float]:
+        """Return the elements in p.u. of the nominal bases.
+
+        Args:
+            factors: Real over nominal value of any element; 1 where not given. The bases stay
+                nominal, since the controller and its references know only those.
+
+        Raises:
+            ValueError: If a factor names no element, or makes L or C <= 0 or R < 0.
+        """
+        factors = factors or {}
+        for name, factor in factors.items():
+            if name not in ELEMENTS:
+                raise ValueError(f"factors.{name}: must be one of {', '.join(ELEMENTS)}")
+            if not (factor > 0 or (factor == 0 and ELEMENTS[name] == "R")):
+                raise ValueError(f"factors.{name} = {factor}: must be > 0 (>= 0 for a resistor)")
+        bases = self.bases
+        return {
+            name: bases.to_pu(getattr(self, name) * factors.get(name, 1.0), quantity)
+            for name, quantity in ELEMENTS.items()
+        }
+
+
+def load_converter(name_or_path: str | Path) -> ConverterParameters:
+    """Load a converter by the name of a shipped file ("paper") or the path of a .toml file.
+
+    Raises:
+        ValueError: If no such converter is shipped, or the file breaks a rule
+            (pydantic's ValidationError, which names every field, value and rule at once).
+        OSError: If the path cannot be read.
+    """
+    if isinstance(name_or_path, str) and not name_or_path.endswith(".toml"):
+        folder = resources.files("gfm_plant") / "converters"
+        shipped = sorted(entry.name[:-5] for entry in folder.iterdir())
+        if name_or_path not in shipped:
+            raise ValueError(
+                f"converter = {name_or_path!r}: must be one of {', '.join(shipped)},"
+                " or the path of a .toml file"
+            )
+        text = (folder / f"{name_or_path}.toml").read_text(encoding="utf-8")
+    else:
+        text = Path(name_or_path).read_text(encoding="utf-8")
+    return ConverterParameters.model_validate(tomllib.loads(text))

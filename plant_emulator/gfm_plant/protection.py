@@ -1,0 +1,97 @@
+"""Protection: thresholds with persistence, a latched trip, and the words for it."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from gfm_plant.records import PlantRecord
+
+TRIPS = (
+    # option, quantity, sign (+1: trips above the threshold, -1: below)
+    ("over_current", "|i_dq|", +1),
+    ("over_voltage", "V", +1),
+    ("under_voltage", "V", -1),
+    ("dc_over_voltage", "v_dc", +1),
+    ("dc_under_voltage", "v_dc", -1),
+    ("over_frequency", "omega_u", +1),
+    ("under_frequency", "omega_u", -1),
+)
+"""The protections with a threshold; their place is their index in the records."""
+
+DIVERGED = len(TRIPS) + 1
+BAD_COMMAND = len(TRIPS) + 2
+
+TRIP_REASONS: dict[int, str] = {
+    0: "none",
+    **{k + 1: name.replace("_", "-") for k, (name, *_) in enumerate(TRIPS)},
+    DIVERGED: "diverged",
+    BAD_COMMAND: "command not finite",
+}
+"""What the trip code in a plant's state means."""
+
+
+@njit(cache=True)
+def trip(st: PlantRecord, reason: int, value: float) -> None:
+    """Latch a trip, if none is latched: the bridge blocks and the DC source turns off.
+
+    The current of L_f is taken as interrupted at once. From here on the plant obeys no command;
+    its frame turns with the grid.
+    """
+    s = st[0]
+    if s.trip == 0:
+        s.trip = reason
+        s.trip_tick = s.tick
+        s.trip_value = value
+        s.x[0] = s.x[1] = 0.0
+        s.u_now[0], s.u_now[1], s.u_now[2] = 0.0, s.omega_g, 0.0
+
+
+@njit(cache=True)
+def protect(par: PlantRecord, st: PlantRecord) -> None:
+    """Check every threshold on the true values of this tick."""
+    s = st[0]
+    i = math.hypot(s.x[0], s.x[1])
+    V = math.hypot(s.x[2], s.x[3])
+    v_dc = s.x[7]
+    omega_u = s.u_now[1]
+    _watch(par, st, 0, i, 1.0)
+    _watch(par, st, 1, V, 1.0)
+    _watch(par, st, 2, V, -1.0)
+    _watch(par, st, 3, v_dc, 1.0)
+    _watch(par, st, 4, v_dc, -1.0)
+    _watch(par, st, 5, omega_u, 1.0)
+    _watch(par, st, 6, omega_u, -1.0)
+
+
+@njit(cache=True)
+def _watch(par: PlantRecord, st: PlantRecord, k: int, value: float, sign: float) -> None:
+    r, s = par[0], st[0]
+    if r.trip_ticks[k] < 0 or sign * (value - r.trip_limit[k]) <= 0.0:
+        s.crossed[k] = 0
+        return
+    # The tick that first sees a crossing starts the time.
+    if s.crossed[k] >= r.trip_ticks[k]:
+        trip(st, k + 1, value)
+    s.crossed[k] += 1
+
+
+def trip_reason(st: PlantRecord, par: PlantRecord) -> str:
+    """Say what tripped, with quantity, value, threshold and time; "" without a trip."""
+    code, tick, value = int(st[0]["trip"]), int(st[0]["trip_tick"]), float(st[0]["trip_value"])
+    if code == 0:
+        return ""
+    T_s = float(par[0]["T_s"])
+    at = f"at tick {tick} (t = {tick * T_s:.6g} s)"
+    if code == DIVERGED:
+        return f"diverged: the state left the range of the model {at}"
+    if code == BAD_COMMAND:
+        return f"command not finite: u held {value} {at}"
+    _, quantity, sign = TRIPS[code - 1]
+    limit = par[0]["trip_limit"][code - 1]
+    persistence = int(par[0]["trip_ticks"][code - 1]) * T_s
+    return (
+        f"{TRIP_REASONS[code]}: {quantity} = {value:.6g} p.u. {'>' if sign > 0 else '<'}"
+        f" {limit:.6g} p.u. for {persistence:.6g} s {at}"
+    )
