@@ -1,4 +1,4 @@
-"""One tick of the plant: sample y, take u, go on by one sampling period.
+"""The plant from tick to tick: take u, go on by one sampling period, tell the truth.
 
 The functions are compiled and allocate nothing. `par` and `st` are the records of
 `gfm_plant.records`, which `make_plant` builds; quantities are in p.u.
@@ -7,15 +7,15 @@ The functions are compiled and allocate nothing. `par` and `st` are the records 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from gfm_plant.grid import advance_grid
-from gfm_plant.integrator import Held, integrate
+from gfm_plant.integrator import Held, Vector, integrate
 from gfm_plant.model import DELTA, V_DC, rates, terminal
-from gfm_plant.noise import gaussian
 from gfm_plant.protection import BAD_COMMAND, DIVERGED, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecord
@@ -53,25 +53,6 @@ def plant_init(
 
 
 @njit(cache=True)
-def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> None:
-    """Write what the A/D reads at this tick to y (5,): (v_dc, p, omega_u, q, V).
-
-    omega_u is the one that acts at this instant, exactly.
-    """
-    s = st[0]
-    if par[0].filtered:
-        v_dc, p, q, V = s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3]
-    else:
-        v_dc = s.x[V_DC]
-        p, q, V = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
-    y[0] = _measure(par, st, 0, v_dc)
-    y[1] = _measure(par, st, 1, p)
-    y[2] = s.u_now[1]
-    y[3] = _measure(par, st, 2, q)
-    y[4] = _measure(par, st, 3, V)
-
-
-@njit(cache=True)
 def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
     """Take the command u[k] (3,) of this tick and go on to the next.
 
@@ -79,7 +60,7 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
     period and u[k-n] for the rest; without delay u[k] acts at once.
     """
     r, s = par[0], st[0]
-    _take_command(par, st, u)
+    _take_command(r, s, u)
     x = s.x
     v = (
         x[0], x[1], x[2], x[3], x[4], x[5], x[V_DC], s.i_reg, s.i_load[0], s.i_load[1],
@@ -87,8 +68,8 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
     )  # fmt: skip
     delta = x[DELTA]
     if r.steps_old > 0:
-        v, delta = _stretch(par, st, v, delta, r.delay + 1, r.steps_old, r.h_old)
-    v, delta = _stretch(par, st, v, delta, r.delay, r.steps_new, r.h_new)
+        v, delta = _stretch(r, s, v, delta, r.delay + 1, r.steps_old, r.h_old)
+    v, delta = _stretch(r, s, v, delta, r.delay, r.steps_new, r.h_new)
     s.tick += 1
 
     size = abs(delta) / _FAR  # an islanded angle may grow, if it stays a number
@@ -100,10 +81,10 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
         x[DELTA], x[V_DC] = delta, v[6]
         s.i_reg, s.i_load[0], s.i_load[1] = v[7], v[8], v[9]
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = v[10], v[11], v[12], v[13]
-        protect(par, st)
+        protect(r, s)
     else:
-        trip(st, DIVERGED, size)  # and keep the last state that was good
-    advance_grid(par, st)
+        trip(s, DIVERGED, size)  # and keep the last state that was good
+    advance_grid(r, s)
 
 
 @njit(cache=True)
@@ -121,31 +102,21 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
 
 
 @njit(cache=True)
-def _measure(par: PlantRecord, st: PlantRecord, j: int, value: float) -> float:
-    """Return a quantity as channel j reads it."""
-    r = par[0]
-    value = r.gain[j] * value + r.offset[j]
-    if r.noise_std[j] > 0.0:
-        value += r.noise_std[j] * gaussian(r.seed, st[0].tick, j)
-    return quantise(value, r.adc_lo[j], r.adc_hi[j], r.adc_lsb[j])
-
-
-@njit(cache=True)
-def _take_command(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
+def _take_command(r: Any, s: Any, u: NDArray[np.float64]) -> None:
     """Put u through the D/A into the delay line."""
-    r, s = par[0], st[0]
     for j in range(3):
         s.u[3, j], s.u[2, j], s.u[1, j] = s.u[2, j], s.u[1, j], s.u[0, j]
         if math.isfinite(u[j]):
             s.u[0, j] = quantise(u[j], r.dac_lo[j], r.dac_hi[j], r.dac_lsb[j])
         else:
-            trip(st, BAD_COMMAND, u[j])
+            trip(s, BAD_COMMAND, u[j])
 
 
 @njit(cache=True)
-def _stretch(par, st, v, delta, age, steps, h):  # type: ignore[no-untyped-def]
+def _stretch(
+    r: Any, s: Any, v: Vector, delta: float, age: int, steps: int, h: float
+) -> tuple[Vector, float]:
     """Go on by `steps` of `h` seconds under the command of `age` ticks ago."""
-    r, s = par[0], st[0]
     running = s.trip == 0
     if running:
         for j in range(3):
@@ -166,6 +137,6 @@ def _stretch(par, st, v, delta, age, steps, h):  # type: ignore[no-untyped-def]
         R_load=r.R_load,
         omega_s=r.omega_s,
     )
-    c = rates(par, 1.0 if running else 0.0)
+    c = rates(r, 1.0 if running else 0.0)
     v = integrate(v, delta, steps, h, c, held)
     return v, delta + steps * h * r.omega_b * (omega_u - s.omega_g)

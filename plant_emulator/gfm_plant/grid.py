@@ -6,6 +6,7 @@ Frequencies and voltages are in p.u., times in s. An event acts from the coming 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from numba import njit
 
@@ -60,7 +61,9 @@ def phase_jump(st: PlantRecord, degrees: float) -> None:
 
 
 def grid_impedance(par: PlantRecord, st: PlantRecord, L_g: float, R_g: float) -> None:
-    """Set the line to `L_g` and `R_g` times its nominal elements; its current is continuous.
+    """Set the line to `L_g` and `R_g` times the elements of the converter file.
+
+    Its current is continuous. Factors of the options are not applied on top.
 
     Raises:
         ValueError: If L_g <= 0 or R_g < 0, or the line becomes too fast for the sub-step. The
@@ -106,10 +109,9 @@ def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
 
 
 @njit(cache=True)
-def advance_grid(par: PlantRecord, st: PlantRecord) -> None:
+def advance_grid(r: Any, s: Any) -> None:
     """Move ramps and sags on by one tick."""
-    s = st[0]
-    T_s = par[0].T_s
+    T_s = r.T_s
     s.omega_g = _towards(s.omega_g, s.omega_g_to, s.omega_g_rate * T_s)
     s.V_g = _towards(s.V_g, s.V_g_to, s.V_g_rate * T_s)
     if s.sag_left > 0.0:

@@ -37,13 +37,12 @@ class Rates(NamedTuple):
 
 
 @njit(cache=True)
-def rates(par: NDArray[np.void], bridge: float) -> Rates:
-    """Return the rates of `par`, shape (1,) of `plant_par_dtype`.
+def rates(r: Any, bridge: float) -> Rates:
+    """Return the rates of `r`, one entry of `plant_par_dtype`.
 
     `bridge` is 1 in operation. 0 takes L_f out of the circuit: with i_d = i_q = 0 the same
     equations then describe a blocked bridge.
     """
-    r = par[0]
     w = r.omega_b
     return Rates(w, bridge * w / r.L_f, r.R_f, w / r.C_f, w / r.L_g, r.R_g, w / r.C_dc)
 
@@ -86,7 +85,7 @@ def f(x: NDArray[Any], u: NDArray[Any], d: NDArray[Any], par: NDArray[np.void]) 
     The DC source is the paper's controlled current: i_dc = i_u.
     """
     delta = x[DELTA]
-    c = rates(par, 1.0)
+    c = rates(par[0], 1.0)
     v_gd, v_gq = d[1] * np.cos(delta), -d[1] * np.sin(delta)
     slope = circuit(x[0], x[1], x[2], x[3], x[4], x[5], x[V_DC], u[0], u[1], u[2], v_gd, v_gq, c)
     dx = np.empty_like(x)

@@ -7,11 +7,12 @@ controller's own number and passes the sensors and the A/D untouched.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from gfm_plant.parameters import Element, NonNegative, Positive
+from gfm_plant.parameters import Element, NonNegative, Positive, check_factors
 
 Measured = Literal["v_dc", "p", "q", "V"]
 Command = Literal["i_u", "omega_u", "E_u"]
@@ -82,10 +83,11 @@ class _Converter(Options):
     """A bank of A/D or D/A channels; a channel without a range is ideal."""
 
     bits: int | None = Field(None, ge=2, le=24, description="resolution; only clamps if none")
+    range: Mapping[Any, Range] = {}
 
     @model_validator(mode="after")
     def _bits_need_a_range(self) -> _Converter:
-        if self.bits is not None and not self.range:  # type: ignore[attr-defined]
+        if self.bits is not None and not self.range:
             raise ValueError(f"bits = {self.bits}: range must give at least one channel")
         return self
 
@@ -190,7 +192,5 @@ class Plant(Options):
 
     @model_validator(mode="after")
     def _elements_stay_physical(self) -> Plant:
-        for name, factor in self.factors.items():
-            if not (factor > 0 or (factor == 0 and name.startswith("R"))):
-                raise ValueError(f"factors.{name} = {factor}: must be > 0 (>= 0 for a resistor)")
+        check_factors(self.factors)
         return self

@@ -61,16 +61,21 @@ class ConverterParameters(BaseModel):
             ValueError: If a factor names no element, or makes L or C <= 0 or R < 0.
         """
         factors = factors or {}
-        for name, factor in factors.items():
-            if name not in ELEMENTS:
-                raise ValueError(f"factors.{name}: must be one of {', '.join(ELEMENTS)}")
-            if not (factor > 0 or (factor == 0 and ELEMENTS[name] == "R")):
-                raise ValueError(f"factors.{name} = {factor}: must be > 0 (>= 0 for a resistor)")
+        check_factors(factors)
         bases = self.bases
         return {
             name: bases.to_pu(getattr(self, name) * factors.get(name, 1.0), quantity)
             for name, quantity in ELEMENTS.items()
         }
+
+
+def check_factors(factors: Mapping[Element, float]) -> None:
+    """Raise ValueError if a factor names no element, or makes L or C <= 0 or R < 0."""
+    for name, factor in factors.items():
+        if name not in ELEMENTS:
+            raise ValueError(f"factors.{name}: must be one of {', '.join(ELEMENTS)}")
+        if not (factor > 0 or (factor == 0 and ELEMENTS[name] == "R")):
+            raise ValueError(f"factors.{name} = {factor}: must be > 0 (>= 0 for a resistor)")
 
 
 def load_converter(name_or_path: str | Path) -> ConverterParameters:
@@ -83,7 +88,7 @@ def load_converter(name_or_path: str | Path) -> ConverterParameters:
     """
     if isinstance(name_or_path, str) and not name_or_path.endswith(".toml"):
         folder = resources.files("gfm_plant") / "converters"
-        shipped = sorted(entry.name[:-5] for entry in folder.iterdir())
+        shipped = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir())
         if name_or_path not in shipped:
             raise ValueError(
                 f"converter = {name_or_path!r}: must be one of {', '.join(shipped)},"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from numba import njit
 
@@ -33,13 +34,12 @@ TRIP_REASONS: dict[int, str] = {
 
 
 @njit(cache=True)
-def trip(st: PlantRecord, reason: int, value: float) -> None:
+def trip(s: Any, reason: int, value: float) -> None:
     """Latch a trip, if none is latched: the bridge blocks and the DC source turns off.
 
     The current of L_f is taken as interrupted at once. From here on the plant obeys no command;
     its frame turns with the grid.
     """
-    s = st[0]
     if s.trip == 0:
         s.trip = reason
         s.trip_tick = s.tick
@@ -49,31 +49,29 @@ def trip(st: PlantRecord, reason: int, value: float) -> None:
 
 
 @njit(cache=True)
-def protect(par: PlantRecord, st: PlantRecord) -> None:
+def protect(r: Any, s: Any) -> None:
     """Check every threshold on the true values of this tick."""
-    s = st[0]
     i = math.hypot(s.x[0], s.x[1])
     V = math.hypot(s.x[2], s.x[3])
     v_dc = s.x[7]
     omega_u = s.u_now[1]
-    _watch(par, st, 0, i, 1.0)
-    _watch(par, st, 1, V, 1.0)
-    _watch(par, st, 2, V, -1.0)
-    _watch(par, st, 3, v_dc, 1.0)
-    _watch(par, st, 4, v_dc, -1.0)
-    _watch(par, st, 5, omega_u, 1.0)
-    _watch(par, st, 6, omega_u, -1.0)
+    _watch(r, s, 0, i, 1.0)
+    _watch(r, s, 1, V, 1.0)
+    _watch(r, s, 2, V, -1.0)
+    _watch(r, s, 3, v_dc, 1.0)
+    _watch(r, s, 4, v_dc, -1.0)
+    _watch(r, s, 5, omega_u, 1.0)
+    _watch(r, s, 6, omega_u, -1.0)
 
 
 @njit(cache=True)
-def _watch(par: PlantRecord, st: PlantRecord, k: int, value: float, sign: float) -> None:
-    r, s = par[0], st[0]
+def _watch(r: Any, s: Any, k: int, value: float, sign: float) -> None:
     if r.trip_ticks[k] < 0 or sign * (value - r.trip_limit[k]) <= 0.0:
         s.crossed[k] = 0
         return
     # The tick that first sees a crossing starts the time.
     if s.crossed[k] >= r.trip_ticks[k]:
-        trip(st, k + 1, value)
+        trip(s, k + 1, value)
     s.crossed[k] += 1
 
 

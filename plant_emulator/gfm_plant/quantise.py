@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from numba import njit
 
 
@@ -13,5 +15,5 @@ def quantise(value: float, lo: float, hi: float, lsb: float) -> float:
     """
     value = min(max(value, lo), hi)
     if lsb > 0.0:
-        value = lo + lsb * round((value - lo) / lsb)
+        value = lo + lsb * math.floor((value - lo) / lsb + 0.5)
     return value
