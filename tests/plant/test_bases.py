@@ -1,0 +1,59 @@
+"""Per-unit conversions against values worked by hand."""
+
+import math
+
+import pytest
+
+from gfm_plant import Bases
+from gfm_plant.bases import QUANTITIES
+
+
+@pytest.mark.parametrize(
+    ("quantity", "si", "pu"),
+    [
+        # Z_b = 380^2/4000 = 36.1 ohm, Z_dc = 700^2/4000 = 122.5 ohm, omega_b = 314.159 rad/s
+        ("R", 36.1, 1.0),
+        ("L", 2e-3, 0.017404945),  # 314.159 * 2e-3 / 36.1
+        ("C", 20e-6, 0.2268230),  # 314.159 * 20e-6 * 36.1
+        ("C_dc", 500e-6, 19.242255),  # 314.159 * 500e-6 * 122.5
+        ("P", 2000.0, 0.5),
+        ("Q", -4000.0, -1.0),
+        ("V", 190.0, 0.5),
+        ("I", 6.0773714, 1.0),  # 4000 / (sqrt(3) * 380)
+        ("v_dc", 735.0, 1.05),
+        ("i_dc", 5.7142857, 1.0),  # 4000 / 700
+        ("omega", 100 * math.pi, 1.0),
+        ("f", 49.9, 0.998),
+    ],
+)
+def test_values_worked_by_hand(quantity: str, si: float, pu: float) -> None:
+    bases = Bases()
+    assert bases.to_pu(si, quantity) == pytest.approx(pu, rel=1e-6)
+    assert bases.to_si(pu, quantity) == pytest.approx(si, rel=1e-6)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_there_and_back(quantity: str) -> None:
+    bases = Bases(S_n=1e6, V_n=690.0, omega_n=120 * math.pi, V_dcref=1100.0)
+    assert bases.to_si(bases.to_pu(3.7, quantity), quantity) == pytest.approx(3.7, rel=1e-15)
+
+
+def test_bases_hang_together() -> None:
+    b = Bases()
+    assert b.Z_b == pytest.approx(36.1)
+    assert b.L_b * b.omega_b == pytest.approx(b.Z_b)
+    assert b.C_b * b.omega_b == pytest.approx(1 / b.Z_b)
+    assert b.C_dcb * b.omega_b == pytest.approx(1 / b.Z_dc)
+    assert math.sqrt(3) * b.V_b * b.I_b == pytest.approx(b.S_b)
+    assert b.V_dcref * b.I_dcb == pytest.approx(b.S_b)
+
+
+@pytest.mark.parametrize("value", [0.0, -380.0, math.nan, math.inf])
+def test_a_base_must_be_positive(value: float) -> None:
+    with pytest.raises(ValueError, match=r"V_n = .*must be finite and > 0"):
+        Bases(V_n=value)
+
+
+def test_unknown_quantity_lists_the_known() -> None:
+    with pytest.raises(ValueError, match=r"quantity = 'G': must be one of P, Q, V, .*, f"):
+        Bases().to_pu(1.0, "G")

@@ -1,0 +1,116 @@
+"""How a command reaches the bridge and the DC source: D/A, delay, limits, regulation."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit
+from numba.core.runtime import _nrt_python, rtsys
+
+from gfm_plant import plant_advance, plant_sample, plant_truth
+
+
+def commands(n: int, u0: Any) -> Any:
+    rng = np.random.default_rng(5)
+    return u0 + 1e-3 * rng.standard_normal((n, 3))
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2])
+def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) -> None:
+    late, prompt = rest(delay={"samples": samples}), rest()
+    u = commands(50, late.u)
+    shifted = np.concatenate([np.tile(late.u, (samples, 1)), u])
+    for k in range(50):
+        late.advance(u=u[k])
+        prompt.advance(u=shifted[k])
+        assert (late.st["x"] == prompt.st["x"]).all()
+        assert late.sample()[2] == shifted[k, 1]  # the omega_u that acts
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2])
+@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.5, 0.99])
+def test_fraction_splits_the_period_exactly(
+    rest: Callable[..., Any], samples: int, fraction: float
+) -> None:
+    """Reference: a plant at a hundredth of the period, its command changed at the right one."""
+    late = rest(delay={"samples": samples, "fraction": fraction}, substeps=20)
+    fine = rest(T_s=1e-6, substeps=1)
+    u = commands(20, late.u)
+    shifted = np.concatenate([np.tile(late.u, (samples + 1, 1)), u])
+    split = round(100 * fraction)
+    for k in range(20):
+        late.advance(u=u[k])
+        fine.advance(split, shifted[k])
+        fine.advance(100 - split, shifted[k + 1])
+        assert late.st["x"][0] == pytest.approx(fine.st["x"][0], abs=1e-7)
+        assert late.truth()["delta"] == pytest.approx(fine.truth()["delta"], abs=1e-13)
+
+
+def test_dac_rounds_and_clamps(rest: Callable[..., Any]) -> None:
+    plant = rest(dac={"bits": 8, "range": {"E_u": [0.0, 2.0], "i_u": [-1.0, 1.0]}})
+    plant.advance(u=np.array([5.0, 1.00123, 1.001]))
+    assert list(plant.st["u_now"][0]) == [1.0 - 2 / 256, 1.00123, 1.0]
+
+
+def test_rig_boards_by_name(rest: Callable[..., Any]) -> None:
+    plant = rest(adc="DS2004", dac="DS2101")
+    plant.advance(100)
+    assert plant.sample()[1] == pytest.approx(plant.truth()["p"], abs=2 / 2**16)
+    assert plant.st["u_now"][0, 2] == pytest.approx(plant.u[2], abs=1 / 2**12)
+
+
+def test_limited_source(rest: Callable[..., Any]) -> None:
+    limited, other = rest(dc_source={"i_max": 0.7}), rest()
+    limited.advance(10, limited.near(i_u=5.0))
+    other.advance(10, np.array([0.7, *other.u[1:]]))
+    assert (limited.st["x"] == other.st["x"]).all()
+
+
+def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -> None:
+    plant = rest(dc_source={"mode": "regulated"})
+    plant.advance(50, plant.near(i_u=9.0, omega_u=5e-3))
+    assert plant.truth()["p"] > 0.57
+    plant.advance(3000, plant.near(i_u=-9.0))
+    assert plant.truth()["v_dc"] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_regulated_source_does_not_wind_up(rest: Callable[..., Any]) -> None:
+    """Short of current the integral stands still, so that v_dc does not overshoot after."""
+    plant = rest(P=0.3, dc_source={"mode": "regulated", "i_max": 0.5})
+    plant.advance(50, plant.near(omega_u=0.01))  # the power rises beyond 0.5 p.u.
+    plant.advance(300, plant.u)
+    assert plant.truth()["p"] > 0.6
+    assert plant.truth()["v_dc"] < 0.95
+    assert plant.st[0]["i_reg"] <= 0.5
+    plant.advance(50, plant.near(omega_u=-0.01))  # and back
+    peak = 0.0
+    for _ in range(3000):
+        plant.advance(u=plant.u)
+        peak = max(peak, plant.truth()["v_dc"])
+    assert plant.truth()["v_dc"] == pytest.approx(1.0, abs=1e-3)
+    assert peak < 1.01
+
+
+def test_no_allocation_in_a_tick(rest: Callable[..., Any]) -> None:
+    @njit
+    def run(par: Any, st: Any, u: Any, y: Any, out: Any, ticks: int) -> None:
+        for _ in range(ticks):
+            plant_sample(par, st, y)
+            plant_advance(par, st, u)
+            plant_truth(par, st, out)
+
+    plant = rest(
+        sensors={"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-3}},
+        adc="DS2004",
+        dac="DS2101",
+        delay={"samples": 1, "fraction": 0.5},
+    )
+    arguments = plant.par, plant.st, plant.u, np.empty(5), np.empty(10)
+    run(*arguments, 1)
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats().alloc
+    run(*arguments, 1000)
+    after = rtsys.get_allocation_stats().alloc
+    _nrt_python.memsys_disable_stats()
+    assert after - before <= len(arguments)  # wrapping these, once a call; nothing per tick

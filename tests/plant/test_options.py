@@ -1,0 +1,90 @@
+"""Options: defaults are ideal, and what is wrong is named with its value and what is allowed."""
+
+import tomllib
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from gfm_plant import Plant, make_plant
+from gfm_plant.options import DS2004, DS2101
+
+
+def test_a_scenario_table() -> None:
+    options = Plant.model_validate(
+        tomllib.loads(
+            """
+            factors = { L_g = 1.2 }
+            adc = "DS2004"
+            dac = { bits = 12, range = { E_u = [0, 1.5] } }
+            delay = { samples = 1, fraction = 0.25 }
+            [protection.over_current]
+            threshold = 1.5
+            [sensors]
+            bandwidth_hz = 1000
+            noise_std = { p = 1e-3 }
+            """
+        )
+    )
+    assert options.adc == DS2004
+    assert options.dac.range == {"E_u": (0.0, 1.5)}
+    trip = options.protection.over_current
+    assert (trip.threshold, trip.enabled) == (1.5, True)
+    assert trip.delay_s == Plant().protection.over_current.delay_s
+    assert Plant.model_validate(options.model_dump()) == options
+
+
+@pytest.mark.parametrize(
+    ("options", "where", "message"),
+    [
+        ({"substep": 10}, "substep", "Extra inputs"),
+        ({"substeps": 0}, "substeps", "greater than or equal to 1"),
+        ({"substeps": 10.0}, "substeps", "valid integer"),
+        ({"factors": {"L_f": -1.0}}, "", r"factors.L_f = -1.0: must be > 0"),
+        ({"factors": {"L": 1.0}}, "factors.L", "'L_f', 'R_f'"),
+        ({"grid": {"load_R": 36.1}}, "grid", "load_R = 36.1, load_L = None: give both"),
+        ({"grid": {"load_R": 36.1, "load_L": -0.1}}, "grid.load_L", "greater than 0"),
+        ({"dc_source": {"mode": "ideal"}}, "dc_source.mode", "'controlled' or 'regulated'"),
+        ({"sensors": {"gain": {"omega_u": 1.0}}}, "sensors.gain.omega_u", "'v_dc', 'p'"),
+        ({"sensors": {"bandwidth_hz": "1k"}}, "sensors.bandwidth_hz", "valid number"),
+        ({"sensors": {"offset": {"p": float("nan")}}}, "sensors.offset.p", "finite"),
+        ({"adc": "DS2005"}, "adc", "'DS2005': must be DS2004"),
+        ({"adc": {"bits": 16}}, "adc", "bits = 16: range must give at least one channel"),
+        ({"adc": {"range": {"p": [1, -1]}}}, "adc.range.p", r"\[1.0, -1.0\]: .*lo < hi"),
+        ({"delay": {"samples": 3}}, "delay.samples", "less than or equal to 2"),
+        ({"delay": {"fraction": 1.0}}, "delay.fraction", "less than 1"),
+        ({"protection": {"over_current": {"threshold": 0.0}}}, "threshold", "greater than 0"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], where: str, message: str) -> None:
+    with pytest.raises(ValidationError, match=message) as caught:
+        Plant.model_validate(options)
+    assert where in ".".join(str(part) for part in caught.value.errors()[0]["loc"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"sensors": {"bandwidth_hz": 2e4}},
+            r"plant.sensors.bandwidth_hz = 20000: too fast .* stay below 15915.5 Hz",
+        ),
+        ({"factors": {"L_g": 1e-5}}, r"LC resonance .* = 1.58.*rad/s: too fast .*100000 rad/s"),
+        ({"grid": {"load_R": 36.1, "load_L": 1e-4}}, r"plant.grid load_R/load_L = 361000 rad/s"),
+    ],
+)
+def test_what_the_sub_step_cannot_follow(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_plant(Plant.model_validate(options), 1e-4)
+
+
+@pytest.mark.parametrize("T_s", [0.0, -1e-4, float("nan")])
+def test_sampling_period(T_s: float) -> None:
+    with pytest.raises(ValueError, match="T_s = "):
+        make_plant(Plant(), T_s)
+
+
+def test_boards_of_the_rig() -> None:
+    assert (DS2004.bits, DS2101.bits) == (16, 12)
+    assert set(DS2004.range) == {"v_dc", "p", "q", "V"}
+    assert "omega_u" not in DS2101.range

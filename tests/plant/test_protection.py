@@ -1,0 +1,120 @@
+"""Every protection trips in time, latches, blocks the bridge and says why."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_plant import TRIP_REASONS, trip_reason
+
+
+def code_of(reason: str) -> int:
+    return next(code for code, name in TRIP_REASONS.items() if name == reason)
+
+
+@pytest.mark.parametrize(
+    ("name", "threshold", "text"),
+    [
+        # at rest with P = 0.5: |i| = 0.569, V = 1, v_dc = 1, omega_u = 1
+        ("over_current", 0.5, "over-current: |i_dq| = 0.569"),
+        ("over_voltage", 0.9, "over-voltage: V = 1 p.u. > 0.9"),
+        ("under_voltage", 1.1, "under-voltage: V = 1 p.u. < 1.1"),
+        ("dc_over_voltage", 0.9, "dc-over-voltage: v_dc = 1 p.u. > 0.9"),
+        ("dc_under_voltage", 1.1, "dc-under-voltage: v_dc = 1 p.u. < 1.1"),
+        ("over_frequency", 0.9, "over-frequency: omega_u = 1 p.u. > 0.9"),
+        ("under_frequency", 1.1, "under-frequency: omega_u = 1 p.u. < 1.1"),
+    ],
+)
+def test_trip_after_its_time(
+    rest: Callable[..., Any], name: str, threshold: float, text: str
+) -> None:
+    plant = rest(protection={name: {"threshold": threshold, "delay_s": 0.002}})
+    plant.advance(20)  # first seen at tick 1, so 1.9 ms have passed
+    assert plant.truth()["trip"] == 0
+    assert trip_reason(plant.st, plant.par) == ""
+    plant.advance(1)
+    assert TRIP_REASONS[int(plant.truth()["trip"])] == name.replace("_", "-")
+    reason = trip_reason(plant.st, plant.par)
+    assert reason.startswith(text)
+    assert reason.endswith("p.u. for 0.002 s at tick 21 (t = 0.0021 s)")
+    assert plant.truth()["i"] == 0.0
+
+
+def test_disabled_never_trips(rest: Callable[..., Any]) -> None:
+    plant = rest(protection={"over_voltage": {"threshold": 0.9, "enabled": False}})
+    plant.advance(1000)
+    assert plant.truth()["trip"] == 0
+
+
+def test_shorter_than_its_time_does_not_trip(rest: Callable[..., Any]) -> None:
+    plant = rest(protection={"over_frequency": {"threshold": 1.01, "delay_s": 0.002}})
+    for _ in range(2):  # twice 1.5 ms
+        plant.advance(15, plant.near(omega_u=0.02))
+        plant.advance(1)
+    assert plant.truth()["trip"] == 0
+    plant.advance(21, plant.near(omega_u=0.02))
+    assert plant.truth()["trip"] == code_of("over-frequency")
+
+
+def test_trip_latches_blocks_and_the_network_goes_on(rest: Callable[..., Any]) -> None:
+    plant = rest(protection={"over_current": {"threshold": 0.5, "delay_s": 0.0}})
+    plant.advance(1)
+    v_dc, tick = plant.truth()["v_dc"], int(plant.st[0]["trip_tick"])
+    plant.advance(15_000, plant.near(i_u=0.5, omega_u=0.1, E_u=0.2))
+    truth = plant.truth()
+    assert (truth["i"], int(plant.st[0]["trip_tick"])) == (0.0, tick)
+    assert truth["v_dc"] == v_dc  # source off, bridge blocked
+    assert truth["omega_u"] == 1.0  # no command is obeyed
+    # what is left is the grid feeding C_f through the line
+    r = plant.par[0]
+    Z_g = complex(r["R_g"], r["L_g"])
+    v = 1 / (1 + 1j * r["C_f"] * Z_g)
+    assert truth["V"] == pytest.approx(abs(v), abs=1e-6)
+    assert truth["q"] == pytest.approx(abs(v) ** 2 * r["C_f"], abs=1e-6)
+
+
+def test_first_trip_is_kept(rest: Callable[..., Any]) -> None:
+    plant = rest(protection={"over_current": {"threshold": 0.5, "delay_s": 0.0}})
+    plant.advance(1)
+    plant.advance(1, np.array([math.nan, 1.0, 1.0]))
+    assert plant.truth()["trip"] == code_of("over-current")
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_command_that_is_no_number(rest: Callable[..., Any], bad: float) -> None:
+    plant = rest()
+    plant.advance(3)
+    plant.advance(1, np.array([0.5, 1.0, bad]))
+    assert trip_reason(plant.st, plant.par).startswith(
+        f"command not finite: u held {bad} at tick 3"
+    )
+    plant.advance(10)
+    assert np.isfinite(plant.sample()).all()
+
+
+OFF = {
+    name: {"enabled": False}
+    for name in (
+        "over_current",
+        "over_voltage",
+        "under_voltage",
+        "dc_over_voltage",
+        "dc_under_voltage",
+        "over_frequency",
+        "under_frequency",
+    )
+}
+
+
+@pytest.mark.parametrize(
+    "u", [[0.5, 1.0, 1e12], [0.5, 1e300, 1.0], [-1e9, 1.0, 1.0], [0.5, 1.0, 1e308], [-2, 1, 1]]
+)
+def test_divergence_leaves_finite_values(rest: Callable[..., Any], u: list[float]) -> None:
+    plant = rest(protection=OFF, sensors={"bandwidth_hz": 1000.0})
+    plant.advance(2000, np.array(u))
+    assert plant.truth()["trip"] == code_of("diverged")
+    assert "diverged: the state left the range of the model" in trip_reason(plant.st, plant.par)
+    assert np.isfinite(plant.sample()).all()
+    assert np.isfinite(list(plant.truth().values())).all()
