@@ -71,8 +71,8 @@ def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -
     plant = rest(dc_source={"mode": "regulated"})
     plant.advance(50, plant.near(i_u=9.0, omega_u=5e-3))
     assert plant.truth()["p"] > 0.57
-    plant.advance(3000, plant.near(i_u=-9.0))
-    assert plant.truth()["v_dc"] == pytest.approx(1.0, abs=1e-5)
+    plant.advance(10_000, plant.near(i_u=-9.0))
+    assert plant.truth()["v_dc"] == pytest.approx(1.0, abs=1e-4)
 
 
 def test_regulated_source_does_not_wind_up(rest: Callable[..., Any]) -> None:
