@@ -1,0 +1,5 @@
+"""``python -m gfm_hil`` is ``gfmhil``."""
+
+from gfm_hil.cli import main
+
+raise SystemExit(main())

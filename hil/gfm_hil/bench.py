@@ -1,0 +1,71 @@
+"""A scenario made ready: the plant's and the controller's records at the operating point.
+
+Both sides build the same bench from the same scenario, each on its own machine if need be, so
+that nothing but frames has to cross the link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.operating_point import OperatingPoint, operating_point
+from gfm_hil.errors import UserError
+from gfm_hil.scenario import Scenario
+from gfm_plant import NoEquilibrium, make_plant, plant_init
+from gfm_runtime import load_law
+from gfm_runtime.assembly import Controller
+from gfm_runtime.signals import NY
+
+
+@dataclass
+class Bench:
+    """Everything that one run changes.
+
+    Attributes:
+        par, st: the plant's records.
+        controller: the controller, its first law at rest and RUNNING.
+        y: measurements of the current tick, shape (5,), p.u.
+        u: inputs of the current tick, shape (3,), p.u.
+    """
+
+    scenario: Scenario
+    par: NDArray[Any]
+    st: NDArray[Any]
+    controller: Controller
+    start: OperatingPoint
+    y: NDArray[np.float64]
+    u: NDArray[np.float64]
+
+
+def make_bench(scenario: Scenario) -> Bench:
+    """Build both sides of a scenario at its operating point.
+
+    Raises:
+        UserError: the law has no steady state on this grid.
+    """
+    plant = scenario.plant
+    if scenario.seed:
+        plant = plant.model_copy(
+            update={"sensors": plant.sensors.model_copy(update={"seed": scenario.seed})}
+        )
+    par, st = make_plant(plant, scenario.T_s)
+    references = scenario.references.vector()
+    sets = [load_law(name) for name in scenario.laws()]
+    controller = Controller(sets, scenario.T_s, references, hold=scenario.late_policy.hold)
+    try:
+        start = operating_point(
+            par,
+            controller.active_law,
+            np.asarray(references),
+            scenario.plant.grid.omega_g,
+            scenario.plant.grid.V_g,
+        )
+    except NoEquilibrium as problem:
+        raise UserError(f"references, plant.grid: {problem}") from None
+    plant_init(par, st, start.x, start.u)
+    controller.start(start.x_law, start.u)
+    return Bench(scenario, par, st, controller, start, np.zeros(NY), start.u.copy())

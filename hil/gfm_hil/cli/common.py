@@ -1,0 +1,141 @@
+"""What several commands share: options, the progress bar, the closing table."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from gfm_hil.errors import UserError
+from gfm_hil.report import EVENT_COLUMNS, cell
+from gfm_hil.runner import Progress as TellProgress
+from gfm_hil.scenario import Scenario, load_scenario
+
+EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
+
+
+def add_scenario_options(command: argparse.ArgumentParser) -> None:
+    """Options that override what a scenario says."""
+    command.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    command.add_argument("--mode", choices=["lockstep", "realtime"], help="override mode")
+    command.add_argument("--link", choices=["zmq", "inproc"], help="override link.type")
+    command.add_argument("--endpoint", help="override link.endpoint, e.g. tcp://127.0.0.1:5555")
+    command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
+    command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
+
+
+def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
+    """The scenario with its overrides; --link inproc alone implies lockstep.
+
+    Raises:
+        UserError: as ``load_scenario``.
+    """
+    mode = options.mode
+    if mode is None and options.link == "inproc":
+        mode = "lockstep"
+    return load_scenario(
+        options.scenario,
+        mode=mode,
+        link__type=options.link,
+        link__endpoint=options.endpoint,
+        duration=options.duration,
+        seed=options.seed,
+        **more,
+    )
+
+
+def new_folder(out: str | None, stem: str) -> Path:
+    """Where a run goes: --out, or runs/<stem>-<time> that is not there yet."""
+    if out is not None:
+        return Path(out)
+    base = Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folder, k = base, 1
+    while folder.exists():
+        k += 1
+        folder = base.with_name(f"{base.name}-{k}")
+    return folder
+
+
+@contextmanager
+def progress_bar(scenario: Scenario, label: str, quiet: bool) -> Iterator[tuple[TellProgress, Any]]:
+    """A bar with simulated time and misses on stderr; yields (progress, notice)."""
+    console = Console(stderr=True, quiet=quiet)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[sim]}"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        refresh_per_second=5,
+    ) as bar:
+        task = bar.add_task(label, total=scenario.ticks, sim="")
+
+        def tell(ticks: int, misses: int) -> None:
+            sim = f"{ticks * scenario.T_s:.2f} s simulated"
+            bar.update(task, completed=ticks, sim=sim + (f", {misses} misses" if misses else ""))
+
+        def notice(text: str) -> None:
+            bar.console.print(text, style="dim", highlight=False)
+
+        yield tell, notice
+
+
+def print_summary(summary: dict[str, Any], folder: Path) -> None:
+    """The short table that ends a run."""
+    console = Console()
+    colour = "green" if summary["status"] == summary["expected"] else "red"
+    reason = f" — {summary['reason']}" if summary["reason"] else ""
+    console.print(f"[bold {colour}]{summary['status']}[/]{reason}", highlight=False)
+    laws = " → ".join(summary["laws"])
+    console.print(
+        f"{laws} · {summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
+        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {summary['misses']} misses",
+        highlight=False,
+    )
+    if summary["round_trip_us"]:
+        text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
+        console.print(f"round trip [µs]: {text}".replace("[µs]", "\\[µs]"), highlight=False)
+    if summary["events"]:
+        console.print(events_table(summary["events"]))
+    console.print(f"run folder: {folder}", highlight=False, soft_wrap=True)
+
+
+def events_table(events: list[dict[str, Any]]) -> Table:
+    """One row a quantity, one column an event: fits a terminal."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for event in events:
+        table.add_column(f"{event['label']} @ {event['t']:g} s", justify="right")
+    for name, title in EVENT_COLUMNS[2:]:
+        values = [e.get(name) for e in events]
+        if any(v is not None for v in values):
+            table.add_row(title.replace("[", "\\["), *[cell(v) for v in values])
+    return table
+
+
+def exit_code(summary: dict[str, Any]) -> int:
+    """0 as expected, 130 interrupted, 3 otherwise."""
+    if summary["status"] == summary["expected"]:
+        return 0
+    return EXIT_INTERRUPTED if summary["status"] == "interrupted" else EXIT_OTHERWISE
+
+
+def split_laws(text: str) -> list[str]:
+    """Names from a comma-separated list.
+
+    Raises:
+        UserError: an empty one.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise UserError(f"--laws {text!r}: names separated by commas, none empty")
+    return names

@@ -1,0 +1,78 @@
+"""gfmhil compare: one scenario under several laws, side by side."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gfm_hil.cli.common import (
+    add_scenario_options,
+    exit_code,
+    new_folder,
+    progress_bar,
+    resolve,
+    split_laws,
+)
+from gfm_hil.errors import UserError
+from gfm_hil.figures import draw_comparison
+from gfm_hil.report import EVENT_COLUMNS, cell
+from gfm_hil.runner import Run, run_scenario
+from gfm_hil.scenario import find_scenario
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser("compare", help="run a scenario under several laws")
+    add_scenario_options(command)
+    command.add_argument("--laws", help="names separated by commas; the scenario's by default")
+    command.add_argument("--out", help="folder; runs/<scenario>-compare-<time> by default")
+    command.add_argument("--json", action="store_true", help="print the summaries as JSON")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry the command out; returns the worst exit code of its runs."""
+    base = resolve(options)
+    names = split_laws(options.laws) if options.laws else base.compare
+    if not names:
+        raise UserError("--laws: the scenario's compare list is empty; name some laws")
+    scenarios = {name: resolve(options, law=name) for name in dict.fromkeys(names)}
+    folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
+    runs: dict[str, Run] = {}
+    for name, scenario in scenarios.items():
+        with progress_bar(scenario, name, options.quiet) as (progress, notice):
+            place = folder / name.removesuffix(".toml").replace("/", "_")
+            runs[name] = run_scenario(scenario, place, progress, notice)
+    events = next(iter(runs.values())).summary["events"]
+    signals = {name: run.signals for name, run in runs.items()}
+    draw_comparison(folder / "comparison.png", base, signals, events)
+    summaries = {name: run.summary for name, run in runs.items()}
+    (folder / "comparison.json").write_text(json.dumps(summaries, indent=2) + "\n", "utf-8")
+    if options.json:
+        print(json.dumps(summaries, indent=2))
+    else:
+        _print(summaries, events)
+        Console().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
+    return max(exit_code(run.summary) for run in runs.values())
+
+
+def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
+    console = Console()
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for name in summaries:
+        table.add_column(name, justify="right")
+    table.add_row("status", *[s["status"] for s in summaries.values()])
+    for k, event in enumerate(events):
+        table.add_row(f"[bold]{event['label']} @ {event['t']:g} s[/]")
+        for key, title in EVENT_COLUMNS[2:]:
+            values = [s["events"][k].get(key) if k < len(s["events"]) else None
+                      for s in summaries.values()]  # fmt: skip
+            if any(v is not None for v in values):
+                table.add_row("  " + title.replace("[", "\\["), *[cell(v) for v in values])
+    console.print(table)

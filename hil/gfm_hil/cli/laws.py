@@ -1,0 +1,131 @@
+"""gfmhil laws: the catalogue, and one law with its matrices."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law
+from gfm_runtime.lawfile import ElementSpec, LawFile
+from gfm_runtime.signals import U_NAMES, Y_NAMES
+
+MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
+
+
+def add(commands: Any) -> None:
+    """Add the command and its sub-command to the parser."""
+    command = commands.add_parser("laws", help="list the laws, or show one")
+    command.add_argument("--json", action="store_true", help="as JSON")
+    command.set_defaults(call=call_list)
+    show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
+    show.add_argument("name", help="catalogue name or law file")
+    show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
+    show.add_argument("--json", action="store_true", help="as JSON")
+    show.set_defaults(call=call_show)
+
+
+def element_text(spec: ElementSpec | list[ElementSpec]) -> str:
+    """An element as Table II writes it, e.g. ``IF×PD``."""
+    specs = spec if isinstance(spec, list) else [spec]
+    return "×".join(s.type for s in specs)
+
+
+def cell_text(file: LawFile, key: str) -> str:
+    """One cell of Table II, with the feedback-only term in braces; 0 if empty."""
+    phi, psi = file.phi.get(key), file.psi.get(key)
+    text = element_text(phi) if phi else ""
+    text += f"{{{element_text(psi)}}}" if psi else ""
+    return text or "0"
+
+
+def call_list(options: argparse.Namespace) -> int:
+    """List the catalogue."""
+    rows = []
+    for name in law_names():
+        laws, file = load_law(name), law_file(name)
+        first = laws.laws[0]
+        rows.append(
+            {
+                "name": name,
+                "title": first.title,
+                "order": discretise(first, 1e-4).order,
+                "error_map": first.error_map,
+                "elements": {
+                    k: cell_text(file, k)
+                    for k in sorted({*file.phi, *file.psi})
+                },
+                "stages": len(laws.laws),
+                "home_grid": {"L_g": first.home_grid.L_g, "R_g": first.home_grid.R_g,
+                              "note": first.home_grid.note},
+                "source": " ".join(first.source.split()),
+            }
+        )  # fmt: skip
+    if options.json:
+        print(json.dumps(rows, indent=2, ensure_ascii=False))
+        return 0
+    table = Table("law", "states", "elements of Φ(s)", "title", box=None, pad_edge=False)
+    for row in rows:
+        cells = "  ".join(f"φ{k} {v}" for k, v in row["elements"].items())  # type: ignore[attr-defined]
+        weak = "" if row["home_grid"]["L_g"] == 1 else " [dim](weak grid)[/]"  # type: ignore[index]
+        table.add_row(str(row["name"]), str(row["order"]), cells, f"{row['title']}{weak}")
+    Console().print(table)
+    return 0
+
+
+def call_show(options: argparse.Namespace) -> int:
+    """Show one law."""
+    laws, file = load_law(options.name), law_file(options.name)
+    discrete = [discretise(law, options.T_s) for law in laws.laws]
+    if options.json:
+        print(json.dumps(_as_json(file, discrete), indent=2, ensure_ascii=False))
+        return 0
+    console = Console(highlight=False)
+    first = laws.laws[0]
+    console.print(f"[bold]{laws.name}[/]: {first.title}")
+    console.print(" ".join(first.source.split()).replace("[", "\\["), style="dim")
+    console.print(f"errors: {first.error_map} · grid: {first.home_grid.note}")
+    table = Table("Φ(s)", *Y_NAMES, box=None, pad_edge=False)
+    for i, u in enumerate(U_NAMES):
+        table.add_row(u, *[cell_text(file, f"{i + 1}{j + 1}") for j in range(5)])
+    console.print(table)
+    names = Table("parameter", "value", "unit", "source", box=None, pad_edge=False)
+    for name, p in first.parameters.items():
+        names.add_row(name, f"{p.value:g}", p.unit, p.source)
+    console.print(names)
+    for k, d in enumerate(discrete):
+        stage = f", stage {k}" if len(discrete) > 1 else ""
+        console.print(f"[bold]discrete, T_s = {d.T_s:g} s{stage}[/]: {d.order} states")
+        for name in MATRICES:
+            matrix = getattr(d, name)
+            if matrix.size:
+                text = np.array2string(
+                    matrix, precision=8, suppress_small=False, max_line_width=120
+                )
+                console.print(f"{name} =\n{text}".replace("[", "\\["))
+    return 0
+
+
+def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
+    law = discrete[0].law
+    return {
+        "name": file.name,
+        "title": law.title,
+        "source": " ".join(law.source.split()),
+        "error_map": law.error_map,
+        "phi": [[cell_text(file, f"{i + 1}{j + 1}") for j in range(5)] for i in range(3)],
+        "parameters": {
+            n: {"value": p.value, "unit": p.unit, "source": p.source}
+            for n, p in law.parameters.items()
+        },
+        "home_grid": {"L_g": law.home_grid.L_g, "R_g": law.home_grid.R_g,
+                      "note": law.home_grid.note},
+        "order": discrete[0].order,
+        "discrete": [
+            {"T_s": d.T_s, **{n: getattr(d, n).tolist() for n in MATRICES}} for d in discrete
+        ],
+    }  # fmt: skip

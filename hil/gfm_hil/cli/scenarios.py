@@ -1,0 +1,34 @@
+"""gfmhil scenarios: what ships."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gfm_hil.scenario import load_scenario, shipped_scenarios
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser("scenarios", help="list the scenarios that ship")
+    command.add_argument("--json", action="store_true", help="as JSON")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry the command out; returns the exit code."""
+    found = {name: load_scenario(name) for name in shipped_scenarios()}
+    if options.json:
+        rows = [{"name": n, "title": s.title, "mode": s.mode, "law": s.law, "duration": s.duration}
+                for n, s in found.items()]  # fmt: skip
+        print(json.dumps(rows, indent=2))
+        return 0
+    table = Table("scenario", "mode", "laws", "s", "title", box=None, pad_edge=False)
+    for name, s in found.items():
+        table.add_row(name, s.mode, ", ".join(s.laws()), f"{s.duration:g}", s.title)
+    Console().print(table)
+    return 0

@@ -1,0 +1,52 @@
+"""gfmhil controller and gfmhil plant: one side alone, so that two machines can be used."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from gfm_hil.bench import make_bench
+from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import Side
+from gfm_hil.runner import finish
+from gfm_hil.side import run_side
+from gfm_hil.toml_out import scenario_toml
+
+
+def add(commands: Any) -> None:
+    """Add both commands to the parser."""
+    for side, text in (
+        ("controller", "start the controller alone; it binds the endpoint"),
+        ("plant", "start the plant emulator alone; it connects to the endpoint"),
+    ):
+        command = commands.add_parser(side, help=text)
+        add_scenario_options(command)
+        command.add_argument("--law", help="override law: catalogue name or law file")
+        command.add_argument("--out", help="run folder; runs/<side>-<time> by default")
+        command.add_argument("--quiet", action="store_true", help="say nothing but errors")
+        command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
+        command.set_defaults(call=call, side=side)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry one side out; returns the exit code."""
+    side: Side = options.side
+    scenario = resolve(options, law=options.law)
+    if scenario.link.type != "zmq":
+        raise UserError(f"link.type = {scenario.link.type!r}: a side alone needs a link: zmq")
+    folder = new_folder(options.out, side)
+
+    def notice(text: str) -> None:
+        if not options.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    outcome = run_side(side, scenario, folder, notice)
+    if options.part:  # a part of `gfmhil run`, which puts the parts together
+        return 0
+    (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
+    run = finish(scenario, folder, make_bench(scenario).controller.labels, 0.0)
+    if not options.quiet:
+        print_summary(run.summary, folder)
+    return exit_code({**run.summary, "status": outcome.status})

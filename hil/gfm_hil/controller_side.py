@@ -1,0 +1,80 @@
+"""The controller process: y[k] in, u[k] out, until somebody ends it.
+
+It is driven by the plant's frames. In real time it also watches the clock: ticks that pass
+without a frame are counted and, beyond ``late_policy.hold``, lead to the safe state.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from gfm_hil.bench import Bench
+from gfm_hil.frames import FrameError, FrameReader, FrameWriter
+from gfm_hil.links import Link
+from gfm_hil.recording import Part, record_controller
+from gfm_hil.timeline import Timeline
+from gfm_hil.waiting import await_message
+from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED, missed
+
+
+def run_controller(
+    bench: Bench,
+    link: Link,
+    part: Part,
+    timeline: Timeline,
+    t0_ns: int,
+    stopped: Callable[[], bool],
+) -> FrameReader:
+    """Run the controller's side of a scenario after the handshake; returns its frame counters."""
+    scenario, c = bench.scenario, bench.controller
+    realtime = scenario.mode == "realtime"
+    T_ns = round(scenario.T_s * 1e9)
+    patience_ns = int(scenario.link.peer_timeout_s * 1e9)
+    reader, writer = FrameReader("y"), FrameWriter("u")
+    signals, times, progress = part.signals, part.times, part.progress
+    done, tick = 0, 0  # ticks processed; the tick of the newest frame
+    heard = time.monotonic_ns()
+
+    def leave(status: str, reason: str, state: int, code: int) -> None:
+        timeline.end(status, reason, tick)  # type: ignore[arg-type]
+        link.send(writer.pack(tick, state, code, bench.u))
+
+    while timeline.running:
+        wait_ns = T_ns if realtime else patience_ns
+        frame = await_message(link, time.monotonic_ns() + wait_ns, stopped)
+        now = time.monotonic_ns()
+        if stopped():
+            leave("interrupted", "stopped by the operator", STOPPED, 0)
+            break
+        if frame is None:
+            if now - heard >= patience_ns:
+                leave("safe", REASONS[LOST_PEER], SAFE, LOST_PEER)
+            elif realtime and done:  # before tick 0 nothing can be stale
+                while int(c.ctl["stale"][0]) < (now - heard) // T_ns:
+                    missed(c.ctl)
+                if int(c.ctl["state"][0]) == SAFE:
+                    leave("safe", REASONS[STALE], SAFE, STALE)
+            continue
+        heard = now
+        try:
+            tick = reader.unpack(frame, bench.y)
+        except FrameError:
+            continue  # counted; in lockstep the plant repeats nothing and both will time out
+        if reader.state == SAFE:
+            leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
+            break
+        if reader.state == STOPPED:
+            timeline.end("interrupted" if reader.reason else "completed", "", tick)
+            break
+        timeline.carry_out(tick)
+        c.step(bench.y, bench.u)
+        computed = time.monotonic_ns()
+        link.send(writer.pack(tick, int(c.ctl["state"][0]), int(c.ctl["reason"][0]), bench.u))
+        row = times[tick]
+        row[0], row[1], row[2], row[3] = t0_ns + tick * T_ns, now, computed, time.monotonic_ns()
+        record_controller(signals[tick], c.ctl, c.est)
+        timeline.look(tick)
+        done += 1
+        progress[0] = done
+    return reader

@@ -1,0 +1,73 @@
+"""Both sides in one process: the same tick functions in one compiled loop, in lockstep.
+
+Bit for bit the result of two processes over a link, since a frame carries float64 and each tick
+calls the same functions in the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from numba import njit
+
+from gfm_hil.bench import Bench
+from gfm_hil.recording import Part, record_controller, record_plant
+from gfm_hil.timeline import Timeline
+from gfm_plant import plant_advance, plant_sample
+from gfm_runtime.controller import RUNNING, control
+
+CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
+
+
+@njit(cache=True, nogil=True)
+def run_ticks(par, st, ctl, laws, states, est, y, u, plant_rows, controller_rows, start, stop):
+    """Run ticks [start, stop); returns the tick after the last one done.
+
+    Ends early, after recording the tick, when the law changed, when the controller left RUNNING
+    or when the protection tripped.
+    """
+    changes = ctl[0].changes
+    for k in range(start, stop):
+        plant_sample(par, st, y)
+        control(ctl, laws, states, est, y, u)
+        record_controller(controller_rows[k], ctl, est)
+        record_plant(plant_rows[k], y, u, par, st)
+        if ctl[0].state != RUNNING:
+            return k + 1
+        plant_advance(par, st, u)
+        if ctl[0].changes != changes or st[0].trip != 0:
+            return k + 1
+    return stop
+
+
+def run_inproc(
+    bench: Bench,
+    plant_part: Part,
+    controller_part: Part,
+    timeline: Timeline,
+    go_on: Callable[[int], bool],
+) -> None:
+    """Run a whole scenario; ``go_on`` is told the ticks done and says whether to go on."""
+    c, ticks = bench.controller, bench.scenario.ticks
+    k = 0
+    while k < ticks and timeline.running:
+        timeline.carry_out(k)
+        stop = min(k + CHUNK, timeline.next_tick(), ticks)
+        k = run_ticks(
+            bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
+            plant_part.signals, controller_part.signals, k, stop,
+        )  # fmt: skip
+        timeline.look(k - 1)
+        if not go_on(k):
+            timeline.end("interrupted", "stopped by the operator", k)
+    if timeline.running:
+        timeline.end("completed", "", k)
+
+
+def compile_loop(bench: Bench, plant_part: Part, controller_part: Part) -> None:
+    """Compile (or load from cache) the loop without running a tick."""
+    c = bench.controller
+    run_ticks(
+        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
+        plant_part.signals, controller_part.signals, 0, 0,
+    )  # fmt: skip

@@ -1,0 +1,67 @@
+"""ZeroMQ link: a PAIR socket at each end, the controller binds, the plant connects."""
+
+from __future__ import annotations
+
+import contextlib
+
+import zmq
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import Side
+
+_LAST_WORDS = 200  # ms
+_ROOM = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
+
+
+class ZmqLink:
+    """One end of the link; implements ``gfm_hil.links.Link``.
+
+    Args:
+        side: the controller binds, the plant connects (and keeps trying while nobody listens).
+        endpoint: ``ipc:///path`` or ``tcp://host:port``.
+
+    Raises:
+        UserError: not such an endpoint, or it cannot be bound because it is in use.
+    """
+
+    def __init__(self, side: Side, endpoint: str) -> None:
+        if not endpoint.startswith(("ipc://", "tcp://")):
+            raise UserError(f"link.endpoint = {endpoint!r}: must be ipc://path or tcp://host:port")
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PAIR)
+        self._socket.set(zmq.SNDHWM, _ROOM)
+        self._socket.set(zmq.RCVHWM, _ROOM)
+        try:
+            if side == "controller":
+                self._socket.bind(endpoint)
+            else:
+                self._socket.connect(endpoint)
+        except zmq.ZMQError as problem:
+            self.close()
+            verb = "bound" if side == "controller" else "connected to"
+            raise UserError(
+                f"link.endpoint = {endpoint!r}: cannot be {verb}: {problem.strerror}"
+            ) from None
+
+    def send(self, message: bytes) -> bool:
+        """Hand a message over; False if the peer has no room or is not there."""
+        try:
+            self._socket.send(message, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def receive(self) -> bytes | None:
+        """The next message, or None."""
+        with contextlib.suppress(zmq.Again):
+            return self._socket.recv(zmq.NOBLOCK)
+        return None
+
+    def wait(self, seconds: float) -> bool:
+        """Sleep until a message is there, at most ``seconds`` (rounded up to a millisecond)."""
+        return bool(self._socket.poll(max(1, round(seconds * 1000)), zmq.POLLIN))
+
+    def close(self) -> None:
+        """Free the endpoint; the last words get a moment to leave."""
+        self._socket.close(linger=_LAST_WORDS)
+        self._context.term()

@@ -1,0 +1,139 @@
+"""The plant process: samples y[k], sends it, takes u[k], goes on by one tick.
+
+Lockstep: waits for u[k], whatever it takes. Real time: tick k is sampled at its deadline
+t_0 + k T_s on CLOCK_MONOTONIC; u[k] has until the next deadline. What is not there by then is a
+miss: the plant goes on with the newest u it has, and after ``late_policy.hold`` in a row blocks.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gfm_hil.bench import Bench
+from gfm_hil.frames import FrameError, FrameReader, FrameWriter
+from gfm_hil.links import Link
+from gfm_hil.recording import Part, record_plant
+from gfm_hil.timeline import Timeline
+from gfm_hil.waiting import await_message
+from gfm_plant import plant_advance, plant_sample
+from gfm_runtime.controller import REASONS, SAFE, STOPPED
+
+
+@dataclass
+class _Plant:
+    """What one run of the plant's side holds on to."""
+
+    bench: Bench
+    link: Link
+    part: Part
+    timeline: Timeline
+    stopped: Callable[[], bool]
+
+    def __post_init__(self) -> None:
+        self.reader, self.writer = FrameReader("u"), FrameWriter("y")
+        self.T_ns = round(self.bench.scenario.T_s * 1e9)
+        self.patience_ns = int(self.bench.scenario.link.peer_timeout_s * 1e9)
+        self.misses = 0
+        self.late = 0  # misses in a row
+
+    def sample(self, tick: int) -> None:
+        b = self.bench
+        self.timeline.carry_out(tick)
+        plant_sample(b.par, b.st, b.y)
+        self.link.send(self.writer.pack(tick, 0, 0, b.y))
+        self.part.times[tick, 2] = time.monotonic_ns()
+
+    def take(self, frame: bytes) -> int:
+        """Tick of a good frame, its values now in ``bench.u``; -1 for one that was refused."""
+        try:
+            return self.reader.unpack(frame, self.bench.u)
+        except FrameError:
+            return -1
+
+    def advance(self, tick: int) -> None:
+        b = self.bench
+        record_plant(self.part.signals[tick], b.y, b.u, b.par, b.st)
+        self.part.progress[0] = tick + 1
+        if self.reader.state == SAFE:
+            self.timeline.end("safe", REASONS[self.reader.reason], tick)
+            return
+        if self.reader.state == STOPPED:
+            self.timeline.end("interrupted", "the controller was stopped", tick)
+            return
+        plant_advance(b.par, b.st, b.u)
+
+    def lockstep(self, tick: int) -> None:
+        self.sample(tick)
+        deadline = time.monotonic_ns() + self.patience_ns
+        while True:
+            frame = await_message(self.link, deadline, self.stopped)
+            if frame is None:
+                break
+            # a controller that leaves says so under the last tick it saw
+            if self.take(frame) == tick or self.reader.state in (SAFE, STOPPED):
+                self.part.times[tick, 3] = time.monotonic_ns()
+                self.advance(tick)
+                return
+        if not self.stopped():
+            self.timeline.end("safe", "the controller's process is gone", tick)
+
+    def realtime(self, tick: int, deadline: int) -> None:
+        times = self.part.times[tick]
+        times[0], times[1] = deadline, time.monotonic_ns()
+        self.sample(tick)
+        newest = -1
+        until = deadline + self.T_ns
+        while newest < tick:
+            frame = self.link.receive()
+            now = time.monotonic_ns()
+            if frame is not None:
+                newest = max(newest, self.take(frame))
+                times[3] = now if newest == tick else -1
+            elif now >= until:
+                break
+            else:
+                os.sched_yield()
+        self.late = 0 if newest == tick else self.late + 1
+        self.misses += newest != tick
+        self.part.progress[1] = self.misses
+        self.advance(tick)
+        while time.monotonic_ns() < until:
+            os.sched_yield()
+        if self.late * self.T_ns >= self.patience_ns:
+            self.timeline.end("safe", "the controller's process is gone", tick)
+        elif self.late > self.bench.scenario.late_policy.hold:
+            self.timeline.end("safe", "no fresh u for longer than late_policy.hold allows", tick)
+
+
+def run_plant(
+    bench: Bench,
+    link: Link,
+    part: Part,
+    timeline: Timeline,
+    t0_ns: int,
+    stopped: Callable[[], bool],
+) -> FrameReader:
+    """Run the plant's side of a scenario after the handshake; returns its frame counters."""
+    p = _Plant(bench, link, part, timeline, stopped)
+    ticks, realtime = bench.scenario.ticks, bench.scenario.mode == "realtime"
+    if realtime:
+        while time.monotonic_ns() < t0_ns:
+            os.sched_yield()
+    tick = 0
+    while tick < ticks and timeline.running and not stopped():
+        if realtime:
+            p.realtime(tick, t0_ns + tick * p.T_ns)
+        else:
+            p.lockstep(tick)
+        timeline.look(tick)
+        tick += 1
+    if stopped():
+        timeline.end("interrupted", "stopped by the operator", tick)
+    timeline.end("completed", "", tick)
+    assert timeline.outcome is not None
+    state = SAFE if timeline.outcome.status == "tripped" else STOPPED
+    link.send(p.writer.pack(tick, state, int(timeline.outcome.status != "completed"), bench.y))
+    return p.reader

@@ -1,0 +1,131 @@
+"""Recording every tick, on disk from the first one, so that nothing recorded is ever lost.
+
+Each side writes its rows into arrays that are memory-mapped files in the run folder: what was
+written survives the process, however it ends. ``merge`` turns the parts into ``signals.npz`` and
+``timing.npz``. Columns are generated from the signal table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gfm_plant import TRUTH, plant_truth
+from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
+
+PLANT_COLUMNS = (
+    *(f"y_{n}" for n in Y_NAMES),  # what the A/D read
+    *(f"u_{n}" for n in U_NAMES),  # the input in hand for this tick
+    *(f"true_{n}" for n in TRUTH),  # the plant itself, without sensors
+)
+CONTROLLER_COLUMNS = (
+    *(f"ref_{n}" for n in REF_NAMES),
+    "law",  # index into `laws` of signals.npz
+    "state",  # of the controller, gfm_runtime.controller.STATES
+    "X_est",  # estimated grid reactance of a scheduled law, p.u.
+)
+PLANT_TIMES = ("scheduled", "woke", "sent", "received")  # ns, CLOCK_MONOTONIC; -1: never
+CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent")
+
+_TRUE = NY + NU
+
+
+@njit(cache=True)
+def record_plant(row, y, u, par, st):
+    """One row of PLANT_COLUMNS."""
+    for j in range(NY):
+        row[j] = y[j]
+    for j in range(NU):
+        row[NY + j] = u[j]
+    plant_truth(par, st, row[_TRUE:])
+
+
+@njit(cache=True)
+def record_controller(row, ctl, est):
+    """One row of CONTROLLER_COLUMNS."""
+    c = ctl[0]
+    for j in range(NY):
+        row[j] = c.ref[j]
+    row[NY] = c.active
+    row[NY + 1] = c.state
+    row[NY + 2] = est[0].X
+
+
+@dataclass
+class Part:
+    """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
+    ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress``
+    (ticks done, misses) for whoever watches."""
+
+    signals: NDArray[np.float64]
+    times: NDArray[np.int64]
+    progress: NDArray[np.int64]
+
+    @staticmethod
+    def create(folder: Path, side: str, ticks: int) -> Part:
+        """New files in ``folder``/parts, filled so that no page is first touched in the loop."""
+        columns = PLANT_COLUMNS if side == "plant" else CONTROLLER_COLUMNS
+        times = PLANT_TIMES if side == "plant" else CONTROLLER_TIMES
+        parts = folder / "parts"
+        parts.mkdir(parents=True, exist_ok=True)
+
+        def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
+            path = parts / f"{side}_{what}.npy"
+            array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+            array[:] = fill
+            return np.asarray(array)  # a memmap's own indexing costs microseconds
+
+        return Part(
+            mapped("signals", "f8", (ticks, len(columns)), np.nan),
+            mapped("times", "i8", (ticks, len(times)), -1),
+            mapped("progress", "i8", (2,), 0),
+        )
+
+    @staticmethod
+    def open(folder: Path, side: str) -> Part | None:
+        """The files of a side as they are, or None if that side never came so far."""
+        try:
+            arrays = [
+                np.load(folder / "parts" / f"{side}_{what}.npy", mmap_mode="r")
+                for what in ("signals", "times", "progress")
+            ]
+        except (OSError, ValueError, EOFError):  # not there, or just being made
+            return None
+        return Part(*arrays)
+
+
+def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
+    """Write signals.npz and timing.npz from the parts, remove the parts, return the signals.
+
+    Rows end where the plant's recording does (where it is missing, the controller's).
+    """
+    signals: dict[str, NDArray[Any]] = {}
+    timing: dict[str, NDArray[Any]] = {}
+    done = 0
+    for side, columns, times in (
+        ("plant", PLANT_COLUMNS, PLANT_TIMES),
+        ("controller", CONTROLLER_COLUMNS, CONTROLLER_TIMES),
+    ):
+        part = Part.open(folder, side)
+        if part is None:
+            continue
+        recorded = np.flatnonzero(~np.isnan(part.signals[:, 0]))
+        count = int(recorded[-1]) + 1 if len(recorded) else 0
+        done = count if side == "plant" else (done or count)
+        for j, name in enumerate(columns):
+            signals[name] = np.array(part.signals[:done, j])
+        if (part.times >= 0).any():
+            for j, name in enumerate(times):
+                timing[f"{side}_{name}"] = np.array(part.times[:done, j])
+    signals = {"tick": np.arange(done), "t": np.arange(done) * T_s, **signals}
+    np.savez(folder / "signals.npz", laws=np.array(laws), **signals)  # type: ignore[arg-type]
+    np.savez(folder / "timing.npz", **timing)  # type: ignore[arg-type]
+    for path in (folder / "parts").glob("*.npy"):
+        path.unlink()
+    (folder / "parts").rmdir()
+    return signals

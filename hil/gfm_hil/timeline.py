@@ -1,0 +1,128 @@
+"""What happens when: carries out a scenario's events tick by tick and writes down what came of it.
+
+The log is one JSON object a line, written at once, so that it is there however a run ends.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from gfm_hil.bench import Bench
+from gfm_hil.events import CONTROLLER_EVENTS, LawChange, Reference, apply_grid_event
+from gfm_plant import trip_reason
+from gfm_runtime.controller import BAD_U, BAD_Y, REASONS, SAFE
+from gfm_runtime.signals import U_NAMES, Y_NAMES
+
+Status = Literal["completed", "tripped", "safe", "interrupted"]
+SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended: status, reason in words, and the tick."""
+
+    status: Status
+    reason: str
+    tick: int
+
+
+class Timeline:
+    """The events of one side, or of both in process, and the log of the run.
+
+    Args:
+        bench: the records that events act on.
+        log: file to append to.
+        sides: which events are ours.
+    """
+
+    def __init__(self, bench: Bench, log: Path, sides: tuple[str, ...]) -> None:
+        self._bench, self._sides = bench, sides
+        self._log = log.open("a", encoding="utf-8")
+        scenario = bench.scenario
+        self._todo = [
+            (e.at(scenario.T_s), e)
+            for e in scenario.sorted_events()
+            if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in sides
+        ]
+        self._changes = 0
+        self.outcome: Outcome | None = None
+
+    @property
+    def running(self) -> bool:
+        """Nothing has ended the run yet."""
+        return self.outcome is None
+
+    def next_tick(self) -> int:
+        """Tick of the next event; far away if there is none."""
+        return self._todo[0][0] if self._todo else 2**62
+
+    def carry_out(self, tick: int) -> None:
+        """Carry out every event due at this tick."""
+        while self._todo and self._todo[0][0] <= tick:
+            event = self._todo.pop(0)[1]
+            self.write(tick, event.type, label=event.label())
+            match event:
+                case Reference():
+                    for name, value in event.values().items():
+                        self._bench.controller.set(name, value, event.ramp_s)
+                case LawChange():
+                    self._bench.controller.select(event.law)
+                case _:
+                    apply_grid_event(event, self._bench.par, self._bench.st)
+
+    def look(self, tick: int) -> None:
+        """Write down what the tick just done brought: a change of law, a safe state, a trip."""
+        ctl, st = self._bench.controller.ctl, self._bench.st
+        if "controller" in self._sides and int(ctl["changes"][0]) != self._changes:
+            self._changes = int(ctl["changes"][0])
+            self.write(
+                tick,
+                "law-active",
+                law=self._bench.controller.active,
+                bump_pu=float(ctl["bump"][0]),
+            )
+        if "plant" in self._sides and int(st["trip"][0]) != 0:
+            self.end("tripped", trip_reason(st, self._bench.par), tick)
+        elif "controller" in self._sides and int(ctl["state"][0]) == SAFE:
+            self.end("safe", safe_reason(ctl), tick)
+
+    def end(self, status: Status, reason: str, tick: int) -> None:
+        """The run is over; the first reason stays."""
+        if self.outcome is None:
+            self.outcome = Outcome(status, reason, tick)
+            self.write(tick, "end", status=status, reason=reason, side="+".join(self._sides))
+
+    def write(self, tick: int, kind: str, **more: Any) -> None:
+        """One line of the log."""
+        t = round(tick * self._bench.scenario.T_s, 9)
+        self._log.write(json.dumps({"tick": tick, "t": t, "event": kind, **more}) + "\n")
+        self._log.flush()
+
+    def close(self) -> None:
+        """Close the log."""
+        self._log.close()
+
+
+def safe_reason(ctl: Any) -> str:
+    """Why the controller is in SAFE, in words."""
+    reason, channel = int(ctl["reason"][0]), int(ctl["channel"][0])
+    names = {BAD_Y: Y_NAMES, BAD_U: U_NAMES}.get(reason)
+    return REASONS[reason] + (f": {names[channel]}" if names else "")
+
+
+def read_log(*paths: Path) -> list[dict[str, Any]]:
+    """The lines of one or more logs, in order of their ticks."""
+    lines: list[dict[str, Any]] = []
+    for path in paths:
+        if path.is_file():
+            lines += [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    return sorted(lines, key=lambda line: line["tick"])
+
+
+def worst(lines: list[dict[str, Any]]) -> Outcome | None:
+    """The outcome that counts when both sides wrote one: the most severe."""
+    ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
+    return max(ends, key=lambda o: SEVERITY.index(o.status)) if ends else None

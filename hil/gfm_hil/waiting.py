@@ -1,0 +1,30 @@
+"""Waiting for the other side: spin with a yield while an answer is near, then sleep."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+
+from gfm_hil.links import Link
+
+_SPIN_NS = 1_000_000  # an answer that takes longer is not near: sleep instead of burning a core
+
+
+def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
+    """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
+
+    A pure spin would starve libzmq's own thread on two cores; every look is followed by a yield.
+    """
+    spin_until = time.monotonic_ns() + _SPIN_NS
+    while True:
+        message = link.receive()
+        if message is not None:
+            return message
+        now = time.monotonic_ns()
+        if now >= deadline_ns or stopped():
+            return None
+        if now < spin_until:
+            os.sched_yield()
+        else:
+            link.wait(min(0.02, (deadline_ns - now) * 1e-9))

@@ -1,0 +1,132 @@
+"""From named laws to the records that ``control`` runs on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from gfm_runtime.catalogue import LawSet
+from gfm_runtime.controller import (
+    MAX_STAGES,
+    RUNNING,
+    control,
+    make_controller,
+    missed,
+    set_reference,
+)
+from gfm_runtime.discretise import DiscreteLaw, discretise
+from gfm_runtime.errors import LawError
+from gfm_runtime.impedance import make_impedance
+from gfm_runtime.kernel import pack_law, state_dtype
+from gfm_runtime.signals import NU, NY, REF_NAMES
+
+X_MAX = 10.0  # p.u.; stands for "no upper end" of a schedule's last stage
+
+
+class Controller:
+    """A controller with several laws ready, one of them active.
+
+    Everything that a tick needs is in the records ``ctl``, ``laws``, ``states`` and ``est``;
+    ``gfm_runtime.controller.control`` takes them as they are.
+
+    Args:
+        sets: the laws that may become active, each under its name; the first one starts.
+        T_s: sampling time, s.
+        references: Y_ref at the start, shape (5,), p.u.
+        hold: ticks in a row without a fresh measurement before the safe state.
+        real: float64 or float32 for the laws' arithmetic.
+
+    Raises:
+        LawError: a law that does not discretise at T_s.
+    """
+
+    def __init__(
+        self,
+        sets: Sequence[LawSet],
+        T_s: float,
+        references: Sequence[float],
+        hold: int = 0,
+        real: DTypeLike = np.float64,
+    ) -> None:
+        self.T_s = T_s
+        self.sets = {s.name: s for s in sets}
+        self.discrete: list[DiscreteLaw] = []
+        self.labels: list[str] = []
+        self._first: dict[str, int] = {}
+        for s in self.sets.values():
+            self._first[s.name] = len(self.discrete)
+            self.discrete += [discretise(law, T_s) for law in s.laws]
+            self.labels += [s.name] if len(s.laws) == 1 else _stage_labels(s)
+        self.laws = np.concatenate([pack_law(d, real) for d in self.discrete])
+        self.states = np.zeros(len(self.laws), state_dtype(real))
+        self.ctl = make_controller(hold)
+        self.ctl["ref"] = self.ctl["ref_target"] = np.asarray(references, dtype=float)
+        self.est = make_impedance(T_s, 1.0)
+        self.select(sets[0].name)
+        self.ctl["active"], self.ctl["request"] = self.ctl["request"], -1
+
+    @property
+    def active(self) -> str:
+        """Label of the active law; of a scheduled one with its stage."""
+        return self.labels[int(self.ctl["active"][0])]
+
+    @property
+    def active_law(self) -> DiscreteLaw:
+        """The active law itself."""
+        return self.discrete[int(self.ctl["active"][0])]
+
+    def select(self, name: str) -> None:
+        """Ask for a law; the change is carried out, bumpless, at the next tick.
+
+        Raises:
+            LawError: the law is not among those made ready.
+        """
+        if name not in self.sets:
+            raise LawError(f"law {name!r}", f"not ready; ready are {list(self.sets)}")
+        first, schedule = self._first[name], self.sets[name].schedule
+        self.ctl["request"], self.ctl["stages"] = first, 0
+        if schedule is not None:
+            n = len(schedule.stages)
+            X = sorted(stage.X for stage in schedule.stages)
+            self.ctl["stages"] = n
+            self.ctl["stage_law"][0, :n] = range(first, first + n)
+            self.ctl["stage_X"][0, :n] = [*X[:-1], X_MAX]
+            self.ctl["hysteresis"], self.ctl["since"] = schedule.hysteresis, 0
+            self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
+            self.est = make_impedance(self.T_s, schedule.X_0)
+            self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
+
+    def set(self, name: str, value: float, ramp_s: float = 0.0) -> None:
+        """New reference by name, p.u., reached at once or evenly over ``ramp_s``."""
+        j = REF_NAMES.index(name)
+        away = value - float(self.ctl["ref"][0, j])
+        set_reference(self.ctl, j, value, abs(away) * self.T_s / ramp_s if ramp_s > 0 else 0.0)
+
+    def start(self, x_law: NDArray[Any], u: NDArray[Any]) -> None:
+        """Go to RUNNING from rest: the active law's state x_law (n,), u (3,) in p.u."""
+        k = int(self.ctl["active"][0])
+        self.states["x"][k, : len(x_law)] = x_law
+        self.states["u"][k] = u
+        self.ctl["state"] = RUNNING
+
+    def step(self, y: NDArray[np.float64], u: NDArray[np.float64]) -> None:
+        """One tick from Python: y (5,) in, u (3,) in and out, p.u."""
+        control(self.ctl, self.laws, self.states, self.est, y, u)
+
+
+def _stage_labels(s: LawSet) -> list[str]:
+    if len(s.laws) > MAX_STAGES:
+        raise LawError(f"law {s.name}", f"{len(s.laws)} stages; the controller holds {MAX_STAGES}")
+    return [f"{s.name}[{k}]" for k in range(len(s.laws))]
+
+
+def warm_up(controller: Controller) -> None:
+    """Compile everything a tick calls, on copies, so that nothing compiles once it runs."""
+    ctl, states = controller.ctl.copy(), controller.states.copy()
+    ctl["state"], ctl["request"] = RUNNING, ctl["active"]
+    y, u = np.ones(NY), np.ones(NU)
+    control(ctl, controller.laws, states, controller.est.copy(), y, u)
+    missed(ctl)
