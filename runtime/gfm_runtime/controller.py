@@ -93,10 +93,14 @@ def _go_safe(ctl, reason, channel):
 
 @njit(cache=True)
 def missed(ctl):
-    """Count a tick without a fresh measurement; SAFE when there were too many in a row."""
-    ctl.stale += 1
-    if ctl.stale > ctl.hold:
-        _go_safe(ctl, STALE, -1)
+    """Count a tick without a fresh measurement; SAFE when there were too many in a row.
+
+    ``ctl`` is the one-element array of ``controller_dtype``, as for ``control``.
+    """
+    c = ctl[0]
+    c.stale += 1
+    if c.stale > c.hold:
+        _go_safe(c, STALE, -1)
 
 
 @njit(cache=True)

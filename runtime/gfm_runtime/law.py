@@ -35,8 +35,8 @@ class Limits:
         T_off: time constant with which the offset left by a bumpless change decays, s.
     """
 
-    low: tuple[float, float, float] = (-2.0, 0.9, 0.0)
-    high: tuple[float, float, float] = (2.0, 1.1, 1.5)
+    low: tuple[float, float, float] = (-5.0, 0.9, 0.0)
+    high: tuple[float, float, float] = (5.0, 1.1, 1.5)
     T_t: float = 0.02
     T_off: float = 0.2
 

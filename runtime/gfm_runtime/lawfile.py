@@ -67,7 +67,7 @@ class SetPoints(_Model):
 class LimitsSpec(_Model):
     """Clamps of u in p.u., times in s."""
 
-    i_u: Range = Field(default_factory=lambda: [-2.0, 2.0])
+    i_u: Range = Field(default_factory=lambda: [-5.0, 5.0])
     omega_u: Range = Field(default_factory=lambda: [0.9, 1.1])
     E_u: Range = Field(default_factory=lambda: [0.0, 1.5])
     T_t: float = 0.02
