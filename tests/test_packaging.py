@@ -25,7 +25,7 @@ MAY_IMPORT = {
 }
 RUNTIME_NEEDS = {"numpy", "numba"}
 # The reader of law files, which the loop does not use (annotated_types is a part of pydantic).
-BESIDE_THE_LOOP = {"lawfile.py": {"pydantic", "annotated_types"}}
+BESIDE_THE_LOOP = {"lawfile.py": {"pydantic", "pydantic_core"}}
 SOURCES = [*FOLDERS.values(), *(ROOT / name for name in ("tests", "benchmarks", "docs"))]
 TEXT = {".py", ".md", ".toml", ".yml", ".yaml", ".json", ".service", ".sh", ".dbc", ".html"}
 HOME = re.compile(r"/(home|Users|root|work)/")

@@ -48,16 +48,18 @@ class LinearPlant:
 
 @dataclass(frozen=True)
 class LinearLaw:
-    """The law around its operating point: x' = A x + B y,  u = C x + D y.
+    """The law around its operating point: x' = A x + B y + B_r r,  u = C x + D y + D_r r.
 
-    x' is dx/dt or the next x. The omega_u loop is closed and the error map is in B and D (its
-    references held), so y are plain measurements. Rows that are not in force have no states.
+    x' is dx/dt or the next x. The omega_u loop is closed and the error map is in the matrices, so
+    y and r are plain measurements and references. Rows that are not in force have no states.
     """
 
     A: Matrix
     B: Matrix
     C: Matrix
     D: Matrix
+    B_r: Matrix
+    D_r: Matrix
 
 
 @dataclass(frozen=True)
@@ -108,26 +110,33 @@ def linearise_law(
     law: Law, ss: DiscreteLaw | LawStateSpace, op: OperatingPoint, ref: Matrix, dc_control: bool
 ) -> LinearLaw:
     """A law, discrete or continuous, around ``op``; ``dc_control`` says that row 1 is in force."""
-    by_r, by_y = _error_map_slopes(law, op.y, ref)
-    B, D = ss.B_r @ by_r + ss.B_y @ by_y, ss.D_r @ by_r + ss.D_y @ by_y
-    gain = 1.0 / (1.0 - D[OMEGA_ROW, OMEGA_COLUMN])  # omega_u = c x + d y + D omega_u
+    mapped_r, mapped_y = _error_map_slopes(law, op.y, ref)
+    # one matrix for (y, r), so that the omega_u loop is closed through both at once
+    B = ss.B_r @ mapped_r + ss.B_y @ mapped_y
+    D = ss.D_r @ mapped_r + ss.D_y @ mapped_y
+    D[:, NY:] += ss.D_u0
+    gain = 1.0 / (1.0 - D[OMEGA_ROW, OMEGA_COLUMN])  # omega_u = c x + d (y, r) + D omega_u
     b, d = B[:, [OMEGA_COLUMN]] * gain, D[:, [OMEGA_COLUMN]] * gain
     B[:, OMEGA_COLUMN], D[:, OMEGA_COLUMN] = 0.0, 0.0
     c_omega, d_omega = ss.C[[OMEGA_ROW]], D[[OMEGA_ROW]].copy()
     A, B, C, D = ss.A + b @ c_omega, B + b @ d_omega, ss.C + d @ c_omega, D + d @ d_omega
-    kept = [i for i, row in enumerate(ss.rows) if dc_control or row != 0]
-    return LinearLaw(A[np.ix_(kept, kept)], B[kept], C[:, kept], D)
+    k = [i for i, row in enumerate(ss.rows) if dc_control or row != 0]
+    return LinearLaw(A[np.ix_(k, k)], B[k, :NY], C[:, k], D[:, :NY], B[k, NY:], D[:, NY:])
 
 
 def _error_map_slopes(law: Law, y: Matrix, ref: Matrix) -> tuple[Matrix, Matrix]:
-    """d(mapped r)/dy and d(mapped y)/dy, both (5,5)."""
+    """Slopes of the mapped r and of the mapped y over (y, r), both (5,10)."""
+    if law.error_map == "linear":
+        zero, eye = np.zeros((NY, NY)), np.eye(NY)
+        return np.hstack([zero, eye]), np.hstack([eye, zero])
     impedance = np.zeros(2)
     impedance[: len(law.error_parameters)] = law.error_parameters
-    mapped = np.empty((2, 2, NY, NY))  # up or down, r or y, component, by which y
+    mapped = np.empty((2, 2, NY, 2 * NY))  # up or down, r or y, component, by which input
     for k, sign in enumerate((1.0, -1.0)):
-        for j in range(NY):
-            r, z = ref.copy(), y.copy()
-            z[j] += sign * _NUDGE
+        for j in range(2 * NY):
+            inputs = np.concatenate([y, ref])
+            inputs[j] += sign * _NUDGE
+            z, r = inputs[:NY], inputs[NY:]
             map_errors(ERROR_MAPS[law.error_map], impedance, r, z)
             mapped[k, 0, :, j], mapped[k, 1, :, j] = r, z
     slopes = (mapped[0] - mapped[1]) / (2 * _NUDGE)

@@ -11,7 +11,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+)
+from pydantic_core import PydanticCustomError
 
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
@@ -21,7 +29,21 @@ from gfm_runtime.expressions import evaluate
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.signals import U_NAMES
 
-Number = float | str  # a number or an expression over the law's parameters
+
+
+def _number(value: Any) -> float | str:
+    if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+        return value
+    raise PydanticCustomError("number", "must be a number or an expression over the parameters")
+
+
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, dict) else value
+
+
+# a number or an expression over the law's parameters; one union would give two errors a mistake
+Number = Annotated[float | str, PlainValidator(_number)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -40,12 +62,18 @@ class ElementSpec(_Model):
     T_f: Number | None = None
 
 
+# the factors of one cell; a single one may stand without its list
+Factors = Annotated[list[ElementSpec], BeforeValidator(_listed), Field(min_length=1, max_length=8)]
+
+
 class ParameterSpec(_Model):
-    """A named number."""
+    """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
 
     value: float
     unit: str
     source: str
+    free: Range | None = None
+    tied: str | None = None
 
 
 class ErrorMapSpec(_Model):
@@ -59,9 +87,9 @@ class ErrorMapSpec(_Model):
 class SetPoints(_Model):
     """u_0: numbers (p.u.) or names of references."""
 
-    i_u: float | str = 0.0
-    omega_u: float | str = 1.0
-    E_u: float | str = "V_ref"
+    i_u: Number = 0.0
+    omega_u: Number = 1.0
+    E_u: Number = "V_ref"
 
 
 class LimitsSpec(_Model):
@@ -106,9 +134,9 @@ class LawFile(_Model):
     source: str
     error_map: ErrorMapSpec = ErrorMapSpec()
     u_0: SetPoints = SetPoints()
-    parameters: dict[str, ParameterSpec] = Field(default_factory=dict)
-    phi: dict[str, ElementSpec | list[ElementSpec]]
-    psi: dict[str, ElementSpec | list[ElementSpec]] = Field(default_factory=dict)
+    parameters: dict[Name, ParameterSpec] = Field(default_factory=dict)
+    phi: dict[str, Factors]
+    psi: dict[str, Factors] = Field(default_factory=dict)
     limits: LimitsSpec = LimitsSpec()
     home_grid: GridSpec = GridSpec()
     schedule: Schedule | None = None
@@ -136,21 +164,27 @@ def build_element(where: str, spec: ElementSpec, parameters: Mapping[str, float]
         forms = " or ".join(sorted({str(sorted(form)) for form in _NUMBERS[spec.type]}))
         raise LawError(where, f"{spec.type} takes {forms}, not {sorted(given)}")
     numbers = {k: evaluate(f"{where}.{k}", v, parameters) for k, v in given.items()}
-    try:
-        if "k_i" in numbers:  # k + k_i/s, the form the paper prints its gains in
-            part = elements.P(numbers.get("k", 0.0))
-            element = part + Element.of((numbers["k_i"],), (elements.INTEGRATOR,))
-        else:
-            element = getattr(elements, spec.type)(**numbers)
-        if spec.T_f is not None:
-            element = element * elements.IF(1.0, evaluate(f"{where}.T_f", spec.T_f, parameters))
-    except LawError as problem:
-        raise LawError(f"{where}, {problem.where}", problem.why) from None
+    if "k_i" in numbers:  # k + k_i/s, the form the paper prints its gains in
+        integral = _made(f"{where}.k_i", "P", k=numbers["k_i"]) * elements.I(1.0)
+        element = _made(where, "P", k=numbers.get("k", 0.0)) + integral
+    else:
+        element = _made(where, spec.type, **numbers)
+    if spec.T_f is not None:
+        T_f = evaluate(f"{where}.T_f", spec.T_f, parameters)
+        element = element * _made(f"{where}.T_f", "IF", k=1.0, T=T_f)
     return element
 
 
+def _made(where: str, kind: str, **numbers: float) -> Element:
+    try:
+        made: Element = getattr(elements, kind)(**numbers)
+    except LawError as problem:
+        raise LawError(f"{where}, {kind}", problem.why) from None
+    return made
+
+
 def _cells(
-    matrix: str, specs: Mapping[str, ElementSpec | list[ElementSpec]], numbers: Mapping[str, float]
+    matrix: str, specs: Mapping[str, list[ElementSpec]], numbers: Mapping[str, float]
 ) -> dict[Cell, Element]:
     cells: dict[Cell, Element] = {}
     for key, spec in specs.items():
@@ -158,7 +192,7 @@ def _cells(
             raise LawError(f"{matrix}.{key}", "a cell is row 1..3 and column 1..5, e.g. 22")
         cell = (int(key[0]) - 1, int(key[1]) - 1)
         product = elements.P(1.0)
-        for factor in spec if isinstance(spec, list) else [spec]:
+        for factor in spec:
             product = product * build_element(cell_name(matrix, cell), factor, numbers)
         cells[cell] = product
     return cells
@@ -182,6 +216,13 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
     needs = ERROR_MAPS[code] == HYBRID_ANGLE
     if needs != (None not in impedance) or (not needs and impedance != (None, None)):
         raise LawError("error_map", "R and X belong to hybrid-angle, which needs both")
+    error_parameters = tuple(
+        evaluate(f"error_map.{n}", v, numbers)
+        for n, v in zip("RX", impedance, strict=True)
+        if v is not None
+    )
+    if needs and not (error_parameters[0] >= 0.0 and error_parameters[1] > 0.0):
+        raise LawError("error_map", f"R, X = {error_parameters} p.u. must be R >= 0 and X > 0")
     parameters = {
         name: Parameter(numbers[name], spec.unit, spec.source)
         for name, spec in file.parameters.items()
@@ -195,11 +236,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
         psi=_cells("psi", file.psi, numbers),
         u_0=(file.u_0.i_u, file.u_0.omega_u, file.u_0.E_u),
         error_map=code,
-        error_parameters=tuple(
-            evaluate(f"error_map.{n}", v, numbers)
-            for n, v in zip("RX", impedance, strict=True)
-            if v is not None
-        ),
+        error_parameters=error_parameters,
         limits=Limits(low, high, file.limits.T_t, file.limits.T_off),
         parameters=parameters,
         home_grid=HomeGrid(**file.home_grid.model_dump()),

@@ -1,0 +1,152 @@
+"""The paper's performance problem (Section III-B): w, z, the six weights, and gamma of given gains.
+
+    w = (P_ref, omega_g),   z = (P_ref - p, p, omega_u, q + V/D_q)
+
+gamma is the H-infinity norm of diag(W_ij T_ij), which is the largest of the six channels' norms.
+Signals are deviations in p.u. from an operating point; omega_g is the grid's frequency, and the
+controller's own reference omega_g stays where it is (no PLL, as in the paper's MIMO-GFM).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.hinf import Norm, hinf_norm
+from gfm_design.linear import LinearLaw, LinearPlant
+from gfm_runtime.signals import REF_NAMES
+
+Matrix = NDArray[np.float64]
+StateSpace = tuple[Matrix, Matrix, Matrix, Matrix]
+
+D_Q = 0.05  # p.u., Table III
+_P_REF = REF_NAMES.index("P_ref")
+
+
+@dataclass(frozen=True)
+class Weight:
+    """W_ij(s) = num(s)/den(s) on T_ij, the transfer function from w_j to z_i (i, j from 1).
+
+    num, den: coefficients in descending powers of s.
+    """
+
+    i: int
+    j: int
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        name = f"W_{self.i}{self.j}"
+        if not (1 <= self.i <= 4 and 1 <= self.j <= 2):
+            raise ValueError(f"{name}: i must be 1..4 and j 1..2")
+        if len(self.num) > len(self.den):
+            raise ValueError(
+                f"{name}: improper, its numerator has degree {len(self.num) - 1} and its "
+                f"denominator {len(self.den) - 1}; a weight must be proper"
+            )
+        if not np.isfinite([*self.num, *self.den]).all() or self.den[0] == 0.0:
+            raise ValueError(f"{name}: coefficients must be finite, den[0] not 0")
+        if len(self.den) > 1 and np.roots(self.den).real.max() >= 0.0:
+            raise ValueError(f"{name}: must be stable; {self.den} has a root outside")
+
+    def __call__(self, s: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+        """Value at the complex frequencies s [rad/s]."""
+        return np.polyval(self.num, s) / np.polyval(self.den, s)
+
+    def state_space(self) -> StateSpace:
+        """Controllable canonical form."""
+        den = np.asarray(self.den) / self.den[0]
+        num = np.zeros(len(den))
+        num[len(den) - len(self.num) :] = np.asarray(self.num) / self.den[0]
+        n = len(den) - 1
+        A, B = np.zeros((n, n)), np.zeros((n, 1))
+        if n:
+            A[0], B[0, 0] = -den[1:], 1.0
+            A[1:, :-1] = np.eye(n - 1)
+        return A, B, (num[1:] - num[0] * den[1:])[None, :], np.array([[num[0]]])
+
+
+def _lead(T_1: float, T_2: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return (T_1, 1.0), (T_2, 1.0)
+
+
+def _squared(c: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(float(v) for v in np.polymul(c, c))
+
+
+_LEAD = _lead(1.447e-3, 1.447e-5)
+
+#: the paper's six weights, Table "Numbers Used in Weighting Functions"
+PAPER_WEIGHTS: tuple[Weight, ...] = (
+    Weight(1, 1, (1.0, 4.0), (1.0, 0.0004)),
+    Weight(2, 1, _squared(_LEAD[0]), _squared(_LEAD[1])),
+    Weight(2, 2, (1.447e-3 / 100, 1.0 / 100), _LEAD[1]),
+    Weight(3, 1, (1.0 / 0.015, 0.0), _LEAD[1]),
+    Weight(3, 2, *_LEAD),
+    Weight(4, 1, (1.0, 60.0), (1.0, 0.006)),
+)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """||W_ij T_ij||: its norm, and the frequency [rad/s] at which it is reached."""
+
+    i: int
+    j: int
+    norm: float
+    omega: float
+
+
+def performance_loop(plant: LinearPlant, law: LinearLaw, D_q: float = D_Q) -> StateSpace:
+    """State space of T(s), from w (2) to z (4), of the continuous closed loop.
+
+    ``plant`` must be the ideal one (no sensors): z speaks of true quantities.
+    """
+    n, m = len(plant.A), len(law.A)
+    by_p_ref = law.D_r[:, [_P_REF]]
+    A = np.block(
+        [
+            [plant.A + plant.B @ law.D @ plant.C, plant.B @ law.C],
+            [law.B @ plant.C, law.A],
+        ]
+    )
+    B = np.zeros((n + m, 2))
+    B[:n, :1], B[n:, :1] = plant.B @ by_p_ref, law.B_r[:, [_P_REF]]
+    B[:n, 1] = plant.B_d[:, 0]
+    p, q, V = plant.C[1], plant.C[3], plant.C[4]
+    omega_u = np.concatenate([law.D[1] @ plant.C, law.C[1]])
+    C = np.zeros((4, n + m))
+    C[0, :n], C[1, :n], C[2], C[3, :n] = -p, p, omega_u, q + V / D_q
+    D = np.zeros((4, 2))
+    D[0, 0], D[2, 0] = 1.0, by_p_ref[1, 0]
+    return A, B, C, D
+
+
+def channel_system(loop: StateSpace, weight: Weight) -> StateSpace:
+    """State space of W_ij T_ij."""
+    A, B, C, D = loop
+    b, c, d = B[:, [weight.j - 1]], C[[weight.i - 1]], D[[weight.i - 1], weight.j - 1][None, :]
+    Aw, Bw, Cw, Dw = weight.state_space()
+    return (
+        np.block([[A, np.zeros((len(A), len(Aw)))], [Bw @ c, Aw]]),
+        np.vstack([b, Bw @ d]),
+        np.hstack([Dw @ c, Cw]),
+        Dw @ d,
+    )
+
+
+def channel_norms(
+    loop: StateSpace, weights: tuple[Weight, ...] = PAPER_WEIGHTS
+) -> tuple[Channel, ...]:
+    """The norm of every weighted channel, with the guarantee of ``hinf_norm``.
+
+    Raises:
+        Unstable: the loop is not stable; it has no gamma.
+    """
+    channels = []
+    for weight in weights:
+        norm: Norm = hinf_norm(*channel_system(loop, weight))
+        channels.append(Channel(weight.i, weight.j, norm.gain, norm.omega))
+    return tuple(channels)
