@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "gfm_hil": ("gfm_runtime", "gfm_plant", "gfm_design"),
 }
 RUNTIME_NEEDS = {"numpy", "numba"}
-# The reader of law files, which the loop does not use (annotated_types is a part of pydantic).
+# The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 BESIDE_THE_LOOP = {"lawfile.py": {"pydantic", "pydantic_core"}}
 SOURCES = [*FOLDERS.values(), *(ROOT / name for name in ("tests", "benchmarks", "docs"))]
 TEXT = {".py", ".md", ".toml", ".yml", ".yaml", ".json", ".service", ".sh", ".dbc", ".html"}

@@ -11,7 +11,12 @@ from gfm_hil.scenario import Scenario
 
 def scenario_toml(scenario: Scenario) -> str:
     """The resolved scenario; ``load_scenario`` reads it back to an equal one."""
-    return "\n".join(_table(scenario.model_dump(mode="json", exclude_none=True), ())) + "\n"
+    return toml_text(scenario.model_dump(mode="json", exclude_none=True))
+
+
+def toml_text(content: dict[str, Any]) -> str:
+    """Nested tables, lists of tables and plain values as TOML."""
+    return "\n".join(_table(content, ())) + "\n"
 
 
 def _table(content: dict[str, Any], path: tuple[str, ...]) -> list[str]:

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from gfm_hil.cli import compare, laws, run, scenarios, sides
+from gfm_hil.cli import compare, design, laws, run, scenarios, sides
 from gfm_hil.errors import UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
@@ -24,7 +24,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"gfmhil {version('gfmhil')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (run, compare, laws, scenarios, sides):
+    for module in (run, compare, laws, design, scenarios, sides):
         module.add(commands)
     return top
 
