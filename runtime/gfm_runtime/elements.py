@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polydiv
 
 from gfm_runtime.errors import LawError
 
@@ -26,6 +27,8 @@ Factor = tuple[float, ...]
 
 INTEGRATOR: Factor = (0.0, 1.0)
 _CANCELS = 1e-12  # relative remainder below which a factor divides a numerator
+T_MIN, T_MAX = 1e-9, 1e9  # s; what lies outside is a slip of the pen and would overflow
+K_MAX = 1e12
 
 
 def poly_mul(a: Sequence[float], b: Sequence[float]) -> Polynomial:
@@ -49,14 +52,21 @@ def _trim(a: Sequence[float]) -> Polynomial:
 
 
 def _divide(a: Polynomial, factor: Factor) -> Polynomial | None:
-    """a / factor where factor divides a (to rounding), else None."""
-    if len(a) < len(factor):
+    """a / factor where factor divides a (to rounding), else None.
+
+    Divides in s/w, w the factor's own frequency, so that rounding is judged alike at any T; w is
+    rounded to a power of two, which is exact.
+    """
+    order = len(factor) - 1
+    if len(a) <= order:
         return None
-    quotient, remainder = np.polynomial.polynomial.polydiv(a, factor)
-    scale = max(abs(c) for c in a)
-    if scale == 0.0 or np.max(np.abs(remainder)) > _CANCELS * scale:
+    w = 2.0 ** round(math.log2(factor[0] / factor[-1]) / order) if factor[0] > 0.0 else 1.0
+    scaled = np.asarray(a) * w ** np.arange(len(a))
+    divisor = np.asarray(factor) * w ** np.arange(order + 1)
+    quotient, remainder = (np.asarray(c) for c in polydiv(scaled, divisor))
+    if np.max(np.abs(remainder)) > _CANCELS * np.max(np.abs(scaled)):
         return None
-    return tuple(float(c) for c in quotient)
+    return tuple(float(c) for c in quotient / w ** np.arange(len(quotient)))
 
 
 @dataclass(frozen=True)
@@ -146,62 +156,62 @@ def over(element: Element, den: tuple[Factor, ...]) -> Polynomial:
 ZERO = Element((0.0,))
 
 
-def _finite(kind: str, **values: float) -> None:
+def _gain(kind: str, **values: float) -> None:
     for name, value in values.items():
-        if not math.isfinite(value):
-            raise LawError(kind, f"{name} = {value} is not finite")
+        if not abs(value) <= K_MAX:
+            raise LawError(kind, f"{name} = {value:g} must lie within +-{K_MAX:g}")
 
 
-def _time(kind: str, **values: float) -> None:
-    _finite(kind, **values)
-    for name, value in values.items():
-        if value <= 0.0:
-            raise LawError(kind, f"{name} = {value:g} s must be > 0 (else the element is unstable)")
+def _time(kind: str, T: float) -> None:
+    if T <= 0.0:
+        raise LawError(kind, f"T = {T:g} s must be > 0 (else the element is unstable)")
+    if not T_MIN <= T <= T_MAX:
+        raise LawError(kind, f"T = {T:g} s must lie in [{T_MIN:g}, {T_MAX:g}] s")
 
 
 def P(k: float) -> Element:
     """Proportional, k."""
-    _finite("P", k=k)
+    _gain("P", k=k)
     return Element.of((k,))
 
 
 def I(T: float) -> Element:  # noqa: E743 - the paper's letter
     """Integral, 1/(Ts); T in s."""
-    _time("I", T=T)
+    _time("I", T)
     return Element.of((1.0 / T,), (INTEGRATOR,))
 
 
 def D(T: float) -> Element:
     """Derivative, Ts; T in s. Improper alone: multiply by an IF or give a filter."""
-    _time("D", T=T)
+    _time("D", T)
     return Element.of((0.0, T))
 
 
 def PI(k: float, T: float) -> Element:
     """Proportional-integral, k(1+1/(Ts)); T in s."""
-    _finite("PI", k=k)
-    _time("PI", T=T)
+    _gain("PI", k=k)
+    _time("PI", T)
     return Element.of((k / T, k), (INTEGRATOR,))
 
 
 def PD(k: float, T: float) -> Element:
     """Proportional-derivative, k(1+Ts); T in s. Improper alone, as D."""
-    _finite("PD", k=k)
-    _time("PD", T=T)
+    _gain("PD", k=k)
+    _time("PD", T)
     return Element.of((k, k * T))
 
 
 def IF(k: float, T: float) -> Element:
     """Inertia factor (first-order lag), k/(Ts+1); T in s."""
-    _finite("IF", k=k)
-    _time("IF", T=T)
+    _gain("IF", k=k)
+    _time("IF", T)
     return Element.of((k,), ((1.0, T),))
 
 
 def O(k: float, T: float, xi: float) -> Element:  # noqa: E743 - the paper's letter
     """Oscillatory factor, k/(T^2 s^2+2T xi s+1); T in s, xi damping ratio > 0."""
-    _finite("O", k=k, xi=xi)
-    _time("O", T=T)
+    _gain("O", k=k, xi=xi)
+    _time("O", T)
     if xi <= 0.0:
         raise LawError("O", f"xi = {xi:g} must be > 0 (else the element is unstable)")
     return Element.of((k,), ((1.0, 2.0 * T * xi, T * T),))

@@ -16,6 +16,10 @@ _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Div: operator.truediv,
     ast.Pow: operator.pow,
 }
+_UNARY: dict[type[ast.unaryop], Callable[[float], float]] = {
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
 
 
 def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) -> float:
@@ -24,17 +28,24 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
     Raises:
         LawError: naming ``where``: syntax, an unknown name, a result that is no finite number.
     """
-    if not isinstance(value, str):
-        return float(value)
     try:
-        result = _walk(where, ast.parse(value, mode="eval").body, parameters)
-    except SyntaxError:
-        raise LawError(where, f"{value!r} is no arithmetic expression") from None
-    except (ZeroDivisionError, OverflowError) as problem:
+        result = _walk(where, _parse(where, value), parameters)
+    except RecursionError:
+        raise LawError(where, "the expression is nested too deeply") from None
+    except ArithmeticError as problem:
         raise LawError(where, f"{value!r}: {problem}") from None
     if isinstance(result, complex) or not math.isfinite(result):
         raise LawError(where, f"{value!r} gives {result}, not a finite number")
     return result
+
+
+def _parse(where: str, value: float | str) -> ast.expr:
+    if not isinstance(value, str):
+        return ast.Constant(value)
+    try:
+        return ast.parse(value.strip(), mode="eval").body
+    except (SyntaxError, ValueError, MemoryError):  # ValueError: a null byte; Memory: nesting
+        raise LawError(where, f"{value!r} is no arithmetic expression") from None
 
 
 def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
@@ -45,8 +56,8 @@ def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
             if name not in parameters:
                 raise LawError(where, f"unknown parameter {name!r}; known: {sorted(parameters)}")
             return parameters[name]
-        case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return -_walk(where, operand, parameters)
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _UNARY:
+            return _UNARY[type(op)](_walk(where, operand, parameters))
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
             a, b = _walk(where, left, parameters), _walk(where, right, parameters)
             return _BINARY[type(op)](a, b)

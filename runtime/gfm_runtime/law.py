@@ -9,10 +9,11 @@ channel only. With a nonlinear error map the references and measurements are map
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gfm_runtime.elements import ZERO, Element
+from gfm_runtime.elements import INTEGRATOR, ZERO, Element
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
 
@@ -103,13 +104,26 @@ class Law:
                     raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
                 _check(cell_name(matrix, cell), element)
         for name, value in zip(U_NAMES, self.u_0, strict=True):
-            if isinstance(value, str) and value not in REF_NAMES:
-                raise LawError(f"u_0.{name}", f"{value!r} is no reference; use {list(REF_NAMES)}")
+            if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):
+                raise LawError(
+                    f"u_0.{name}",
+                    f"{value!r} is neither a finite number nor one of {list(REF_NAMES)}",
+                )
 
     def element(self, matrix: str, cell: Cell) -> Element:
         """The element of ``"phi"`` or ``"psi"`` at a cell, ZERO where there is none."""
         cells = self.phi if matrix == "phi" else self.psi
         return cells.get(cell, ZERO)
+
+    def dynamic(self, row: int | None = None) -> str:
+        """The elements with states of one row, or of all, by the paper's names."""
+        found = {
+            cell_name(matrix, cell)
+            for matrix, cells in (("phi", self.phi), ("psi", self.psi))
+            for cell, element in cells.items()
+            if element.den and row in (None, cell[0])
+        }
+        return ", ".join(sorted(found)) or self.name
 
     def __call__(self, s: complex) -> list[list[complex]]:
         """Phi(s) at the complex frequency s [rad/s], 3 rows of 5."""
@@ -117,6 +131,8 @@ class Law:
 
 
 def _check(where: str, element: Element) -> None:
+    if not all(math.isfinite(c) for part in (element.num, *element.den) for c in part):
+        raise LawError(where, "a coefficient is not finite")
     if not element.is_proper:
         raise LawError(
             where,
@@ -124,7 +140,8 @@ def _check(where: str, element: Element) -> None:
             f"{element.order}; give a filter T_f to D or PD, or multiply by an IF",
         )
     for factor in element.den:
-        if any(c < 0.0 for c in factor):
+        # of degree one or two: stable when, and only when, all its coefficients are positive
+        if factor != INTEGRATOR and not (len(factor) in (2, 3) and min(factor) > 0.0):
             raise LawError(where, f"unstable factor {factor} (ascending powers of s)")
-    if element.den.count((0.0, 1.0)) > 1:
+    if element.den.count(INTEGRATOR) > 1:
         raise LawError(where, "unstable: a double integrator 1/s^2")

@@ -30,7 +30,6 @@ from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.signals import U_NAMES
 
 
-
 def _number(value: Any) -> float | str:
     if isinstance(value, (int, float, str)) and not isinstance(value, bool):
         return value
