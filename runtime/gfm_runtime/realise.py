@@ -14,9 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.elements import Factor, Polynomial, over, poly_add, poly_mul, union
+from gfm_runtime.elements import (
+    INTEGRATOR,
+    Factor,
+    Polynomial,
+    over,
+    poly_add,
+    poly_mul,
+    union,
+)
 from gfm_runtime.errors import LawError
-from gfm_runtime.law import Law
+from gfm_runtime.law import Law, cell_name
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
 Matrix = NDArray[np.float64]
@@ -51,16 +59,18 @@ class LawStateSpace:
 
     def __call__(self, s: complex) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Transfer matrices (r to u, y to u) at s, without u_0; both (3,5)."""
-        X = np.linalg.inv(s * np.eye(self.order) - self.A) if self.order else np.zeros((0, 0))
-        return self.C @ X @ self.B_r + self.D_r, self.C @ X @ self.B_y + self.D_y
+        A, B_r, B_y, C = (m.astype(np.complex128) for m in (self.A, self.B_r, self.B_y, self.C))
+        CX = C @ np.linalg.inv(s * np.eye(self.order) - A)
+        return CX @ B_r + self.D_r, CX @ B_y + self.D_y
 
 
 def realise(law: Law) -> LawStateSpace:
     """State space of a law.
 
     Raises:
-        LawError: more than one integrator would act on one output in series.
+        LawError: two integrators in series through omega_u, a coefficient that is not finite.
     """
+    _check_series(law)
     blocks = [_row(law, i) for i in range(NU)]
     n = sum(len(a) for a, *_ in blocks)
     A, C = np.zeros((n, n)), np.zeros((NU, n))
@@ -82,13 +92,27 @@ def realise(law: Law) -> LawStateSpace:
     return LawStateSpace(A, B_r, B_y, C, D_r, D_y, D_u0, u_0, tuple(rows))
 
 
+def _check_series(law: Law) -> None:
+    """Refuse an integrator of omega_u before one behind it; one in column 3 closes its own loop."""
+
+    def integrates(matrix: str, i: int, j: int) -> bool:
+        return INTEGRATOR in law.element(matrix, (i, j)).den
+
+    own = any(integrates(m, 1, 2) for m in ("phi", "psi"))
+    if own or not any(integrates(m, 1, j) for m in ("phi", "psi") for j in range(NY)):
+        return
+    for matrix in ("phi", "psi"):
+        for i in (0, 2):
+            if integrates(matrix, i, 2):
+                why = "integrates omega_u, itself an integral: a double integrator 1/s^2"
+                raise LawError(cell_name(matrix, (i, 2)), why)
+
+
 def _row(law: Law, i: int) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
     """Observer form of row i: A, B_r, B_y, D_r, D_y; its C is (1, 0, ..., 0)."""
     phi = [law.element("phi", (i, j)) for j in range(NY)]
     psi = [law.element("psi", (i, j)) for j in range(NY)]
     den = union([e.den for e in (*phi, *psi)])
-    if den.count((0.0, 1.0)) > 1:
-        raise LawError(f"row {i + 1}", "a double integrator 1/s^2")
     d, m = _expand(den)
     A = np.zeros((m, m))
     for k in range(m):
@@ -102,8 +126,9 @@ def _row(law: Law, i: int) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
         on_y = poly_add([-c for c in on_error], [-c for c in feedback])
         D_r[j], B_r[:, j] = _numerator(on_error, den, d)
         D_y[j], B_y[:, j] = _numerator(on_y, den, d)
-    scale = _scale(d)
-    T = 2.0 ** np.round(np.log2(scale) * np.arange(m))  # exact powers of two; T[0] = 1
+    if not all(np.isfinite(part).all() for part in (A, B_r, B_y, D_r, D_y)):
+        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
+    T = 2.0 ** np.round(np.log2(_scale(d)) * np.arange(m))  # exact powers of two; T[0] = 1
     return A * T[None, :] / T[:, None], B_r / T[:, None], B_y / T[:, None], D_r, D_y
 
 
