@@ -32,31 +32,35 @@ ERROR_MAPS = {
     "hybrid-angle": HYBRID_ANGLE,
 }
 
+#: for all parts of the kernel's step: left to itself the compiler calls them, and saves registers
+inlined = njit(cache=True, forceinline=True)
+
 _V_MIN = 1e-3  # p.u.; a dead bus must not divide by zero
 
 
-@njit(cache=True, inline="always")
+@inlined
 def _angle_across(p, q, V, R, X):
     """Angle [rad] by which V leads the voltage behind R + jX when p + jq flows into it."""
     return math.atan2(X * p - R * q, V * V - (R * p + X * q))
 
 
-@njit(cache=True)
+@inlined
 def map_errors(code, parameters, r, y):
-    """Map r and y (shape (5,), p.u.) in place by the map of that code."""
+    """Map r and y (shape (5,), p.u.) in place by the map of that code, in their own precision."""
+    half = r.dtype.type(0.5)
     if code == DC_ENERGY:
-        r[0] = r[0] * r[0] / 2
-        y[0] = y[0] * y[0] / 2
+        r[0] = half * r[0] * r[0]
+        y[0] = half * y[0] * y[0]
     elif code == DVOC:
-        v2_ref = max(r[4], _V_MIN) ** 2
-        v2 = max(y[4], _V_MIN) ** 2
-        r[1] /= v2_ref
-        r[3] /= v2_ref
-        y[1] /= v2
-        y[3] /= v2
+        v_ref = max(r[4], r.dtype.type(_V_MIN))
+        v = max(y[4], r.dtype.type(_V_MIN))
+        r[1] /= v_ref * v_ref
+        r[3] /= v_ref * v_ref
+        y[1] /= v * v
+        y[3] /= v * v
     elif code == HYBRID_ANGLE:
         R, X = parameters[0], parameters[1]
         target = _angle_across(r[1], r[3], r[4], R, X)
         actual = _angle_across(y[1], y[3], y[4], R, X)
-        r[1] = math.sin((target - actual) / 2)
-        y[1] = 0.0
+        r[1] = math.sin(half * (target - actual))
+        y[1] = 0

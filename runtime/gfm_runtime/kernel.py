@@ -10,15 +10,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
 from gfm_runtime.discretise import DiscreteLaw
-from gfm_runtime.error_maps import ERROR_MAPS, map_errors
+from gfm_runtime.error_maps import ERROR_MAPS, inlined, map_errors
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY
 
 N_MAX = 12  # states; the largest law of Table II has five
+NEGLIGIBLE = 2.0**-100  # p.u.; what decays is 0 below it; exact in float32 too
 TREND_TIME = 0.01  # s; u[k] - u[k-1] is filtered with this before a bumpless change uses it
 
 
@@ -66,6 +66,7 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("offset", f, (NU,)),  # left by a bumpless change, decays
             ("u", f, (NU,)),  # u of the last tick
             ("trend", f, (NU,)),  # filtered u[k] - u[k-1]
+            ("ref", f, (NY,)),  # references of this tick as given, for a u_0 that follows one
         ],
         align=True,
     )
@@ -75,7 +76,7 @@ def pack_law(discrete: DiscreteLaw, real: DTypeLike = np.float64) -> NDArray[Any
     """A discrete law as a one-element array of ``law_dtype``.
 
     Raises:
-        LawError: more states than the kernel holds.
+        LawError: more states than the kernel holds, a number that overflows ``real``.
     """
     n, law = discrete.order, discrete.law
     if n > N_MAX:
@@ -93,55 +94,70 @@ def pack_law(discrete: DiscreteLaw, real: DTypeLike = np.float64) -> NDArray[Any
     rec["low"], rec["high"] = law.limits.low, law.limits.high
     rec["decay"] = np.exp(-discrete.T_s / law.limits.T_off)
     rec["follow"] = -np.expm1(-discrete.T_s / TREND_TIME)
+    for name in ("A", "B_r", "B_y", "C", "D_r", "D_y", "u_0", "W", "E_r", "E_y", "F", "G"):
+        if not np.isfinite(rec[name]).all():
+            raise LawError(law.dynamic(), f"{name} is not finite in {np.dtype(real)}")
     return out
 
 
-@njit(cache=True)
+@inlined
 def set_inputs(law, state, ref, y):
     """Map this tick's references and measurements (shape (5,), p.u.) into the state record."""
     for j in range(NY):
-        state.r[j] = ref[j]
+        state.ref[j] = state.r[j] = ref[j]
         state.y[j] = y[j]
     map_errors(law.error_map, law.error_parameters, state.r, state.y)
 
 
-@njit(cache=True)
-def _row(law, state, ref, i):
+@inlined
+def _row(law, state, i):
     """u_i without the omega_u column: u_0 + C x + D_r r + D_y y + offset."""
     a = law.u_0[i] + state.offset[i]
     for j in range(law.n):
         a += law.C[i, j] * state.x[j]
     for j in range(NY):
-        a += law.D_u0[i, j] * ref[j] + law.D_r[i, j] * state.r[j]
+        a += law.D_u0[i, j] * state.ref[j] + law.D_r[i, j] * state.r[j]
     for j in range(NY):
         if j != 2:
             a += law.D_y[i, j] * state.y[j]
     return a
 
 
-@njit(cache=True)
-def output(law, state, ref, u):
+@inlined
+def _limited(law, state, i):
+    return min(max(state.raw[i], law.low[i]), law.high[i])
+
+
+@inlined
+def output(law, state, u):
     """u[k] (shape (3,), p.u.) from the inputs set; omega_u first, since column 3 feeds it back."""
-    state.raw[1] = _row(law, state, ref, 1) * law.loop
-    u[1] = min(max(state.raw[1], law.low[1]), law.high[1])
-    state.y[2] = u[1]
+    state.raw[1] = _row(law, state, 1) * law.loop
+    u[1] = state.y[2] = _limited(law, state, 1)
     for i in (0, 2):
-        state.raw[i] = _row(law, state, ref, i) + law.D_y[i, 2] * u[1]
-        u[i] = min(max(state.raw[i], law.low[i]), law.high[i])
+        state.raw[i] = _row(law, state, i) + law.D_y[i, 2] * state.y[2]
+        u[i] = _limited(law, state, i)
 
 
-@njit(cache=True)
-def advance(law, state, u):
+@inlined
+def _faded(value):
+    """0 for what has decayed to nothing: subnormal numbers can double the time of a tick."""
+    return 0.0 if abs(value) < NEGLIGIBLE else value
+
+
+@inlined
+def advance(law, state):
     """x[k+1] from this tick's inputs, with back-calculation of what the limits took away."""
     n = law.n
     for i in range(NU):
-        excess = u[i] - state.raw[i]
+        u = _limited(law, state, i)
+        excess = u - state.raw[i]
         if excess != 0.0:
             for j in range(n):
                 state.x[j] += law.W[j, i] * excess
-        state.offset[i] *= law.decay
-        state.trend[i] += law.follow * (u[i] - state.u[i] - state.trend[i])
-        state.u[i] = u[i]
+        state.offset[i] = _faded(state.offset[i] * law.decay)
+        trend = state.trend[i]
+        state.trend[i] = _faded(trend + law.follow * (u - state.u[i] - trend))
+        state.u[i] = u
     for i in range(n):
         a = law.B_r[i, 0] * state.r[0]
         for j in range(1, NY):
@@ -152,10 +168,10 @@ def advance(law, state, u):
             a += law.A[i, j] * state.x[j]
         state.x_next[i] = a
     for i in range(n):
-        state.x[i] = state.x_next[i]
+        state.x[i] = _faded(state.x_next[i])
 
 
-@njit(cache=True)
+@inlined
 def step(law, state, ref, y, u):
     """One tick: u[k] into ``u`` and the state to k+1.
 
@@ -163,7 +179,10 @@ def step(law, state, ref, y, u):
         law, state: records of ``law_dtype`` and ``state_dtype``.
         ref, y: references and measurements, shape (5,), p.u.
         u: output, shape (3,), p.u.
+
+    Fields of a record are the quickest for ref, y and u: numba counts references to an array
+    wherever it hands one on, atomically, but not to a part of a record.
     """
     set_inputs(law, state, ref, y)
-    output(law, state, ref, u)
-    advance(law, state, u)
+    output(law, state, u)
+    advance(law, state)

@@ -24,8 +24,8 @@ def settle_into(law, state, ref, y, u, trend):
     set_inputs(law, state, ref, y)
     state.y[2] = u[1]
     for i in range(NU):
-        state.offset[i] = 0.0
-        state.u[i] = u[i]
+        state.offset[i] = 0
+        state.u[i] = u[i] - trend[i]
         state.trend[i] = trend[i]
     for i in range(law.n):
         a = law.E_r[i, 0] * state.r[0]
@@ -36,18 +36,17 @@ def settle_into(law, state, ref, y, u, trend):
         for j in range(NU):
             wanted = u[j] - law.u_0[j]
             for m in range(NY):
-                wanted -= law.D_u0[j, m] * ref[m]
-            a += law.F[i, j] * wanted + law.G[i, j] * (wanted + trend[j])
+                wanted -= law.D_u0[j, m] * state.ref[m]
+            a += law.F[i, j] * wanted + law.G[i, j] * trend[j]
         state.x[i] = a
     # what is left, all of it for a stateless row and rounding for the others, is the offset
-    omega_u, E_u, i_u = u[1], u[2], u[0]
-    output(law, state, ref, u)
+    i_u, omega_u, E_u = u[0], u[1], u[2]
+    output(law, state, u)
     state.offset[1] = (omega_u - state.raw[1]) / law.loop
-    state.y[2] = omega_u
-    output(law, state, ref, u)
+    output(law, state, u)
     state.offset[0] = i_u - state.raw[0]
     state.offset[2] = E_u - state.raw[2]
-    output(law, state, ref, u)
+    output(law, state, u)
 
 
 @njit(cache=True)
@@ -63,7 +62,7 @@ def change_law(old, old_state, new, new_state, ref, y, u):
         max |u_new - u_old| in p.u.: rounding, unless the new law's limits are tighter.
     """
     set_inputs(old, old_state, ref, y)
-    output(old, old_state, ref, u)
+    output(old, old_state, u)
     i_u, omega_u, E_u = u[0], u[1], u[2]
     settle_into(new, new_state, ref, y, u, old_state.trend)
     return max(abs(u[0] - i_u), abs(u[1] - omega_u), abs(u[2] - E_u))
