@@ -11,7 +11,10 @@ from numpy.typing import DTypeLike, NDArray
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import (
     MAX_STAGES,
+    OK,
+    READY,
     RUNNING,
+    STATES,
     control,
     make_controller,
     missed,
@@ -67,6 +70,7 @@ class Controller:
         self.est = make_impedance(T_s, 1.0)
         self.select(sets[0].name)
         self.ctl["active"], self.ctl["request"] = self.ctl["request"], -1
+        self.ctl["state"] = READY
 
     @property
     def active(self) -> str:
@@ -96,7 +100,7 @@ class Controller:
             self.ctl["stage_X"][0, :n] = [*X[:-1], X_MAX]
             self.ctl["hysteresis"], self.ctl["since"] = schedule.hysteresis, 0
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
-            self.est = make_impedance(self.T_s, schedule.X_0)
+            self.est[:] = make_impedance(self.T_s, schedule.X_0)
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
 
     def set(self, name: str, value: float, ramp_s: float = 0.0) -> None:
@@ -106,11 +110,24 @@ class Controller:
         set_reference(self.ctl, j, value, abs(away) * self.T_s / ramp_s if ramp_s > 0 else 0.0)
 
     def start(self, x_law: NDArray[Any], u: NDArray[Any]) -> None:
-        """Go to RUNNING from rest: the active law's state x_law (n,), u (3,) in p.u."""
+        """Go from READY to RUNNING, at rest: the active law's state x_law (n,), u (3,) in p.u.
+
+        Raises:
+            LawError: the controller is not READY; SAFE is latched until ``reset``.
+        """
+        state = int(self.ctl["state"][0])
+        if state != READY:
+            raise LawError("controller", f"is {STATES[state]}; only READY can start, see reset()")
         k = int(self.ctl["active"][0])
+        self.states[k] = np.zeros((), self.states.dtype)
         self.states["x"][k, : len(x_law)] = x_law
         self.states["u"][k] = u
         self.ctl["state"] = RUNNING
+
+    def reset(self) -> None:
+        """Re-arm: leave SAFE or STOPPED for READY; the reason is forgotten, the laws stay."""
+        self.ctl["state"], self.ctl["reason"], self.ctl["channel"] = READY, OK, 0
+        self.ctl["stale"] = 0
 
     def step(self, y: NDArray[np.float64], u: NDArray[np.float64]) -> None:
         """One tick from Python: y (5,) in, u (3,) in and out, p.u."""

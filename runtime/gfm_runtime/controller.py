@@ -152,8 +152,9 @@ def control(ctl, laws, states, est, y, u):
     before = (u[0], u[1], u[2])
     if c.request >= 0:
         k, c.request = c.request, -1
-        c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, y, u)
-        c.active, c.changes = k, c.changes + 1
+        if k != c.active:
+            c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, y, u)
+            c.active, c.changes = k, c.changes + 1
     step(laws[c.active], states[c.active], c.ref, y, u)
     for i in range(NU):
         if not math.isfinite(u[i]):

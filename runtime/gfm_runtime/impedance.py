@@ -4,7 +4,8 @@ Around an operating point p moves with the angle as dp = K d(delta), K = V V_g c
 d(delta)/dt = omega_b (omega_u - omega_g) (Eq. (7) of the paper). Both sides pass the same
 washout, which removes the unknown omega_g and the operating point; K is the ratio of two
 exponentially forgetting sums, K = sum(p_w theta_w)/sum(theta_w^2). With p = V V_g sin(delta)/X the
-reactance follows without knowing delta: X = V V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u.
+reactance follows without knowing delta: X = V V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u. and
+p, like K, that of the operating point, without the swing.
 The estimate moves only while the sums hold enough excitation, and is held otherwise.
 """
 
@@ -94,5 +95,5 @@ def estimate(est, p, omega_u, V):
     est.s_tt += est.forget * (est.theta * est.theta - est.s_tt)
     if est.s_tt > est.excitation and est.s_pt > 0.0:
         K = est.s_pt / est.s_tt
-        est.X = V / math.sqrt(K * K + p * p)
+        est.X = V / math.sqrt(K * K + est.p_slow * est.p_slow)
     return est.X
