@@ -50,6 +50,8 @@ controller_dtype = np.dtype(
         ("ref", "f8", (NY,)),
         ("ref_target", "f8", (NY,)),
         ("ref_rate", "f8", (NY,)),  # p.u. per tick; 0 is a step
+        ("y", "f8", (NY,)),  # of this tick: the kernel takes fields of a record
+        ("u", "f8", (NU,)),
         ("y_low", "f8", (NY,)),
         ("y_high", "f8", (NY,)),
         # gain scheduling: stages first..first+count-1 of the laws share one schedule
@@ -131,7 +133,7 @@ def control(ctl, laws, states, est, y, u):
         ctl, est: one-element arrays of ``controller_dtype`` and ``impedance_dtype``.
         laws, states: arrays of ``law_dtype`` and ``state_dtype``, one element a law.
         y: measurements, shape (5,), p.u.
-        u: in: u[k-1]; out: u[k], shape (3,), p.u. Unchanged in SAFE.
+        u: output, u[k], shape (3,), p.u. Unchanged in SAFE.
     """
     c = ctl[0]
     if c.state != RUNNING:
@@ -140,6 +142,7 @@ def control(ctl, laws, states, est, y, u):
         if not (c.y_low[j] <= y[j] <= c.y_high[j]):
             _go_safe(c, BAD_Y, j)
             return
+        c.y[j] = y[j]
     c.stale = 0
     for j in range(NY):
         away = c.ref_target[j] - c.ref[j]
@@ -148,16 +151,18 @@ def control(ctl, laws, states, est, y, u):
         else:
             c.ref[j] += math.copysign(c.ref_rate[j], away)
     if c.stages > 0:
-        _schedule(c, est[0], y)
-    before = (u[0], u[1], u[2])
+        _schedule(c, est[0], c.y)
     if c.request >= 0:
         k, c.request = c.request, -1
         if k != c.active:
-            c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, y, u)
+            c.bump = change_law(
+                laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u
+            )
             c.active, c.changes = k, c.changes + 1
-    step(laws[c.active], states[c.active], c.ref, y, u)
+    step(laws[c.active], states[c.active], c.ref, c.y, c.u)
     for i in range(NU):
-        if not math.isfinite(u[i]):
+        if not math.isfinite(c.u[i]):
             _go_safe(c, BAD_U, i)
-            u[0], u[1], u[2] = before
             return
+    for i in range(NU):
+        u[i] = c.u[i]

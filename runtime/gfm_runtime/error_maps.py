@@ -35,7 +35,7 @@ ERROR_MAPS = {
 #: for all parts of the kernel's step: left to itself the compiler calls them, and saves registers
 inlined = njit(cache=True, forceinline=True)
 
-_V_MIN = 1e-3  # p.u.; a dead bus must not divide by zero
+V_MIN = 1e-3  # p.u.; a dead bus must not divide by zero
 
 
 @inlined
@@ -52,8 +52,8 @@ def map_errors(code, parameters, r, y):
         r[0] = half * r[0] * r[0]
         y[0] = half * y[0] * y[0]
     elif code == DVOC:
-        v_ref = max(r[4], r.dtype.type(_V_MIN))
-        v = max(y[4], r.dtype.type(_V_MIN))
+        v_ref = max(r[4], r.dtype.type(V_MIN))
+        v = max(y[4], r.dtype.type(V_MIN))
         r[1] /= v_ref * v_ref
         r[3] /= v_ref * v_ref
         y[1] /= v * v
