@@ -1,0 +1,187 @@
+"""Time of one kernel step, beside the same recursion in C on the same bytes.
+
+Both run a closed chain of steps: each tick's measurements are moved a little by the u before it,
+so that nothing can be computed ahead or left out. Before anything is timed, inputs that drive
+every output into its limits are put through both, and outputs and states are compared bit by bit.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import DTypeLike, NDArray
+from rich.table import Table
+
+from benchmarks.c_twin import FLAGS, Drive, compile_twin, version_line
+from benchmarks.timing import Spread, arguments, machine, ratio, seconds, show, take_turns
+from gfm_runtime import discretise, get_law, law_names
+from gfm_runtime.kernel import pack_law, state_dtype, step
+from gfm_runtime.signals import NU, NY, group
+
+T_S = 1e-4  # s
+ROWS = 256  # different measurements in turn
+FEEDBACK = 1e-6  # p.u. of y for one p.u. of u
+TARGET_NS, TARGET_RATIO = 100.0, 1.2
+
+
+def io_dtype(real: DTypeLike) -> np.dtype[Any]:
+    """Record of what a step takes and gives."""
+    f = np.dtype(real)
+    return np.dtype([("ref", f, (NY,)), ("y", f, (NY,)), ("u", f, (NU,))], align=True)
+
+
+@njit(cache=True)
+def drive(law, state, io, inputs, outputs, steps, feedback):
+    """``steps`` steps on the rows of ``inputs`` in turn; the last u of each row in ``outputs``.
+
+    ``law``, ``state`` and ``io`` are one-element arrays; inputs (rows, 5), outputs (rows, 3) and
+    feedback are of the law's own real type. What a record holds travels without a reference
+    count: as plain arrays, ref, y and u would cost more atomic operations than some laws cost.
+    """
+    law0, state0, now = law[0], state[0], io[0]
+    m = 0
+    for _ in range(steps):
+        for j in range(NY):
+            now.y[j] = inputs[m, j] + feedback * now.u[j % NU]
+        step(law0, state0, now.ref, now.y, now.u)
+        for i in range(NU):
+            outputs[m, i] = now.u[i]
+        m = 0 if m + 1 == len(inputs) else m + 1
+
+
+@dataclass
+class Chain:
+    """One law at its reference, with measurements that scatter around it, and what comes out."""
+
+    law: NDArray[Any]
+    state: NDArray[Any]
+    io: NDArray[Any]
+    inputs: NDArray[Any]
+    outputs: NDArray[Any]
+
+    @staticmethod
+    def make(name: str, real: DTypeLike, scatter: float) -> Chain:
+        """A fresh chain; ``scatter`` is the standard deviation of the measurements, p.u."""
+        ref = np.array([s.default for s in group("ref")])
+        y = ref + scatter * np.random.default_rng(1).standard_normal((ROWS, NY))
+        law = pack_law(discretise(get_law(name), T_S), real)
+        state = np.zeros(1, state_dtype(real))
+        io = np.zeros(1, io_dtype(real))
+        io["ref"], io["u"] = ref, 1.0
+        return Chain(law, state, io, y.astype(real), np.zeros((ROWS, NU), real))
+
+    def run(self, drive: Drive, steps: int) -> None:
+        """So many steps on, by numba's or C's ``drive``."""
+        feedback = self.inputs.dtype.type(FEEDBACK)
+        drive(self.law, self.state, self.io, self.inputs, self.outputs, steps, feedback)
+
+    def limited(self) -> NDArray[np.bool_]:
+        """Which of the outputs (rows, 3) are at a limit."""
+        law = self.law[0]
+        at: NDArray[np.bool_] = (self.outputs <= law["low"]) | (self.outputs >= law["high"])
+        return at
+
+
+def ulps(a: NDArray[Any], b: NDArray[Any]) -> int:
+    """Greatest distance of two arrays in units of the last place; 0 is bit for bit the same."""
+    whole = np.dtype(f"i{a.dtype.itemsize}")
+
+    def ordered(x: NDArray[Any]) -> NDArray[Any]:
+        bits = np.ascontiguousarray(x).view(whole)
+        return np.where(bits < 0, np.iinfo(whole).min - bits, bits)
+
+    return int(np.max(np.abs(ordered(a) - ordered(b)), initial=0))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far two chains came apart, and how often the outputs i_u, omega_u, E_u were limited."""
+
+    ulps: int
+    limited: tuple[int, ...]
+
+
+def compare(name: str, real: DTypeLike, rival: Drive, rounds: int) -> Agreement:
+    """Put the same wild inputs through numba and a rival; ``rounds`` times all rows."""
+    ours, theirs = (Chain.make(name, real, scatter=0.5) for _ in range(2))
+    worst, limited = 0, np.zeros(NU, int)
+    for _ in range(rounds):
+        ours.run(drive, ROWS)
+        theirs.run(rival, ROWS)
+        worst = max(worst, ulps(ours.outputs, theirs.outputs))
+        for field in ours.state.dtype.names or ():
+            worst = max(worst, ulps(ours.state[field], theirs.state[field]))
+        limited += ours.limited().sum(axis=0)
+    return Agreement(worst, tuple(int(n) for n in limited))
+
+
+def time_laws(
+    names: list[str], real: DTypeLike, twin: Drive, steps: int, turns: int
+) -> dict[str, dict[str, Spread]]:
+    """ns per step of every law, by numba and by C, and their ratio."""
+
+    def job(name: str, how: Drive) -> float:
+        chain = Chain.make(name, real, scatter=1e-3)
+        chain.run(how, ROWS)  # warm
+        return seconds(lambda: chain.run(how, steps)) / steps * 1e9
+
+    ways: dict[str, Drive] = {"numba": drive, "c": twin}
+    jobs = {
+        f"{n} {way}": (lambda n=n, how=how: job(n, how)) for n in names for way, how in ways.items()
+    }
+    found = take_turns(jobs, turns)
+    return {
+        n: {way: Spread.of(found[f"{n} {way}"]) for way in ways}
+        | {"ratio": ratio(found[f"{n} numba"], found[f"{n} c"])}
+        for n in names
+    }
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "", turns=5)
+    parser.add_argument("--laws", help="names, by commas (default: all)")
+    parser.add_argument("--cflags", default=FLAGS, help="for the C compiler (default: %(default)s)")
+    args = parser.parse_args()
+    names = args.laws.split(",") if args.laws else list(law_names())
+    steps, rounds = (500, 2) if args.quick else (100_000, 40)
+    result: dict[str, Any] = {"laws": {}, "machine": machine() | {"cc": version_line()}}
+    tables = []
+    for real in ("float64", "float32"):
+        with tempfile.TemporaryDirectory() as place:
+            twin = compile_twin(Path(place), real, args.cflags)
+            agreements = {n: compare(n, real, twin, rounds) for n in names}
+            times = time_laws(names, real, twin, steps, 1 if args.quick else args.turns)
+        table = Table(title=f"ns per kernel step, {real}: median (min–max) of {args.turns} turns")
+        for column in ("law", "states", "numba", f"cc {args.cflags}", "ratio", "apart, ulp"):
+            table.add_column(column, justify="left" if column == "law" else "right")
+        for n in names:
+            order = int(Chain.make(n, real, 0.0).law["n"][0])
+            result["laws"].setdefault(n, {})[real] = {
+                "states": order, **times[n], "ulps": agreements[n].ulps,
+                "limited": agreements[n].limited,
+            }  # fmt: skip
+            t = times[n]
+            table.add_row(
+                n, str(order), t["numba"].text(1), t["c"].text(1), t["ratio"].text(2),
+                str(agreements[n].ulps),
+            )  # fmt: skip
+        tables.append(table)
+    everything = [r for law in result["laws"].values() for r in law.values()]
+    slowest = max(r["numba"].median for r in everything)
+    worst = max(r["ratio"].median for r in everything)
+    result["remarks"] = [
+        f"slowest law {slowest:.1f} ns (target {TARGET_NS:g}), "
+        f"worst ratio {worst:.2f} (target {TARGET_RATIO:g})",
+        f"outputs and states of numba and C at most {max(r['ulps'] for r in everything)} ulp apart "
+        f"over {rounds * ROWS} steps each, limits included",
+    ]
+    show(result, tables, args.json)
+
+
+if __name__ == "__main__":
+    main()

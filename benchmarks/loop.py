@@ -1,0 +1,189 @@
+"""Time of the whole closed loop in one process, and where it goes.
+
+The loop is the one that ``gfmhil run --link inproc`` calls, on a scenario's own records, from a
+step of P_ref at tick 0. Its parts are timed by themselves on what the whole run recorded: the plant
+is given the u of every tick, the controller the y. A part alone can overlap its ticks on the
+processor, which the closed loop cannot, so the parts need not add up to the whole.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numba.core.runtime.nrt import rtsys
+from rich.table import Table
+
+from benchmarks.timing import Spread, arguments, machine, seconds, show, take_turns
+from gfm_hil.bench import Bench, make_bench
+from gfm_hil.inproc import run_ticks
+from gfm_hil.recording import Part, record_controller, record_plant
+from gfm_hil.scenario import load_scenario
+from gfm_plant import plant_advance, plant_sample
+from gfm_runtime.controller import control
+from gfm_runtime.signals import NU, NY
+
+# Laws whose defaults are stable on the paper's stiff grid; the last row is the rig with its noise,
+# sensor filters, quantisation and delay.
+LAWS = (
+    "mimo-gfm", "mimo-gfm-scheduled", "vsg-2", "vsg-11", "droop-2", "droop-5", "psc-2",
+    "matching-1", "hybrid-angle",
+)  # fmt: skip
+RIG = "mimo-gfm, rig"
+TARGET = 50.0  # times real time
+
+
+@njit(cache=True)
+def plant_alone(par, st, y, u, us):
+    """The plant under the recorded commands ``us`` (ticks, 3)."""
+    for k in range(len(us)):
+        for i in range(NU):
+            u[i] = us[k, i]
+        plant_sample(par, st, y)
+        plant_advance(par, st, u)
+
+
+@njit(cache=True)
+def controller_alone(ctl, laws, states, est, y, u, ys):
+    """The controller on the recorded measurements ``ys`` (ticks, 5)."""
+    for k in range(len(ys)):
+        for j in range(NY):
+            y[j] = ys[k, j]
+        control(ctl, laws, states, est, y, u)
+
+
+@njit(cache=True)
+def recording_alone(par, st, ctl, est, y, u, plant_rows, controller_rows):
+    """The recording of one and the same tick into every row."""
+    for k in range(len(plant_rows)):
+        record_controller(controller_rows[k], ctl, est)
+        record_plant(plant_rows[k], y, u, par, st)
+
+
+class Loop:
+    """A bench that can be put back to its start, and files to record into."""
+
+    def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
+        bench = make_bench(load_scenario(scenario, law=law, link__type="inproc", mode="lockstep"))
+        bench.controller.set("P_ref", 0.8)
+        self.bench, self.ticks = bench, ticks
+        self.T_s = bench.scenario.T_s
+        self.substeps = bench.scenario.plant.substeps
+        self.plant = Part.create(folder, "plant", ticks).signals
+        self.controller = Part.create(folder, "controller", ticks).signals
+        c = bench.controller
+        self._kept = [bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
+        self._start = [a.copy() for a in self._kept]
+        self.whole()
+        self._y, self._u = np.split(self.plant[:, : NY + NU].copy(), [NY], axis=1)
+
+    def reset(self) -> Bench:
+        for array, start in zip(self._kept, self._start, strict=True):
+            array[:] = start
+        return self.bench
+
+    def whole(self, ticks: int | None = None) -> float:
+        """ns per tick of the closed loop.
+
+        Raises:
+            SystemExit: the run ended early, so that there is nothing to time.
+        """
+        b, n = self.reset(), ticks or self.ticks
+        c = b.controller
+        done = 0
+
+        def run() -> None:
+            nonlocal done
+            done = run_ticks(
+                b.par, b.st, c.ctl, c.laws, c.states, c.est, b.y, b.u,
+                self.plant, self.controller, 0, n,
+            )  # fmt: skip
+
+        time = seconds(run) / n * 1e9
+        if done != n:
+            raise SystemExit(f"{c.active}: tripped or safe at tick {done - 1} of {n}")
+        return time
+
+    def plant_part(self) -> float:
+        """ns per tick of the plant alone."""
+        b = self.reset()
+        return self._per_tick(lambda: plant_alone(b.par, b.st, b.y, b.u, self._u))
+
+    def controller_part(self) -> float:
+        """ns per tick of the controller alone."""
+        b, c = self.reset(), self.bench.controller
+        return self._per_tick(
+            lambda: controller_alone(c.ctl, c.laws, c.states, c.est, b.y, b.u, self._y)
+        )
+
+    def recording_part(self) -> float:
+        """ns per tick of the recording alone."""
+        b, c = self.reset(), self.bench.controller
+        rows = (self.plant, self.controller)
+        return self._per_tick(lambda: recording_alone(b.par, b.st, c.ctl, c.est, b.y, b.u, *rows))
+
+    def allocations_per_tick(self) -> float:
+        """Of numba's runtime; a call's own, whatever its length, cancel."""
+        short, long = self._allocations(self.ticks // 2), self._allocations(self.ticks)
+        return (long - short) / (self.ticks - self.ticks // 2)
+
+    def _allocations(self, ticks: int) -> int:
+        before: int = rtsys.get_allocation_stats().alloc
+        self.whole(ticks)
+        return int(rtsys.get_allocation_stats().alloc) - before
+
+    def _per_tick(self, work: Callable[[], object]) -> float:
+        return seconds(work) / self.ticks * 1e9
+
+
+def measure(loop: Loop, turns: int) -> dict[str, Any]:
+    """Everything that is printed of one loop."""
+    found = take_turns(
+        {
+            "whole": loop.whole,
+            "plant": loop.plant_part,
+            "controller": loop.controller_part,
+            "recording": loop.recording_part,
+        },
+        turns,
+    )
+    return {name: Spread.of(times) for name, times in found.items()} | {
+        "times_real_time": Spread.of([loop.T_s * 1e9 / ns for ns in found["whole"]]),
+        "allocations_per_tick": loop.allocations_per_tick(),
+        "substeps": loop.substeps,
+    }
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "", turns=5)
+    parser.add_argument("--laws", default=",".join(LAWS), help="by commas (default: %(default)s)")
+    args = parser.parse_args()
+    ticks, turns = (200, 1) if args.quick else (20_000, args.turns)
+    jobs = {name: ("pref_step", name) for name in args.laws.split(",")}
+    jobs[RIG] = ("rig_pref_step", "mimo-gfm")
+    result: dict[str, Any] = {"loops": {}, "machine": machine()}
+    table = Table(title=f"ns per tick in one process: median (min–max) of {turns} turns")
+    columns = ("whole", "plant", "controller", "recording")
+    for column in ("law", *columns, "× real time", "allocations per tick"):
+        table.add_column(column, justify="left" if column == "law" else "right")
+    with tempfile.TemporaryDirectory() as place:
+        for name, (scenario, law) in jobs.items():
+            loop = Loop(scenario, law, ticks, Path(place) / name)
+            found = result["loops"][name] = measure(loop, turns)
+            table.add_row(
+                name,
+                *(found[column].text(0) for column in columns),
+                found["times_real_time"].text(1),
+                f"{found['allocations_per_tick']:g}",
+            )
+    slowest = min(found["times_real_time"].median for found in result["loops"].values())
+    result["remarks"] = [f"slowest: {slowest:.1f} times real time (target {TARGET:g})"]
+    show(result, [table], args.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Simulated seconds per second of gfmhil's closed loop and of motulator's grid-forming example.
+
+motulator (PyPI, MIT licence; ``pip install gfmhil[bench]``) is a simulator of converters and drives
+in plain Python. Its example is set up here from its public API with the values of its
+documentation: a 12.5 kVA converter under reference-feedforward power-synchronization control at
+100 µs, with steps of the power reference. The two do not simulate the same thing; see the remarks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from benchmarks.loop import Loop
+from benchmarks.timing import Spread, arguments, machine, ratio, seconds, show, take_turns
+
+try:
+    from motulator.grid import control, model
+    from motulator.grid.utils import ACFilterPars, BaseValues, NominalValues
+except ModuleNotFoundError as missing:
+    raise SystemExit(f"{missing.name}: not installed; pip install 'gfmhil[bench]'") from None
+
+T_S = 1e-4  # s, of both
+TARGET = 100.0
+REMARKS = (
+    "both: 100 µs, inputs held for a whole period (no switching ripple), steps of P_ref",
+    "motulator: L filter and line, stiff DC voltage, one sample of delay; SciPy's adaptive RK45 "
+    "at its default rtol of 1e-3, every solver step kept in lists, arrays made of them at the end",
+    "gfmhil: LC filter, line and DC link, no delay, 10 RK4 sub-steps a period (accuracy: "
+    "tests/plant/test_accuracy.py), sensors, limits, protection; every tick recorded; compiling, "
+    "some ten seconds once a machine, is not counted",
+    "what the ratio shows is compiled against interpreted code, not one method against another; "
+    "motulator's switching model, its drives and its plots have no counterpart here",
+)
+
+
+@dataclass
+class Example:
+    """motulator's example over ``duration`` s."""
+
+    duration: float
+    p: float = 0.0  # before the last step, p.u.: 1 if the example ran as it should
+
+    def build(self) -> Any:
+        """A fresh simulation: nothing of the last one may be kept."""
+        nominal = NominalValues(U=400, I=18, f=50, P=12.5e3)
+        base = BaseValues.from_nominal(nominal)
+        grid = ACFilterPars(L_fc=0.15 * base.L, R_fc=0.05 * base.Z, L_g=0.74 * base.L)
+        system = model.GridConverterSystem(
+            model.VoltageSourceConverter(u_dc=650),
+            model.ACFilter(grid),
+            model.ThreePhaseVoltageSource(w_g=base.w, abs_e_g=base.u),
+        )
+        law = control.PowerSynchronizationControl(
+            control.PowerSynchronizationControlCfg(
+                nom_u=base.u,
+                nom_w=base.w,
+                max_i=1.3 * base.i,
+                R=0.05 * base.Z,
+                R_a=0.2 * base.Z,
+                T_s=T_S,
+            )
+        )
+        law.ref.v_c = lambda t: base.u
+        # three steps up and one down, at 0.2, 0.5, 0.8 and 1.2 s of its own 1.5 s
+        *up, down = (self.duration / 1.5 * t for t in (0.2, 0.5, 0.8, 1.2))
+        law.ref.p_g = lambda t: (sum(t > step for step in up) / 3 - (t > down)) * nominal.P
+        return model.Simulation(system, law)
+
+    def run(self) -> float:
+        """Simulated seconds per second."""
+        simulation = self.build()
+        rate = self.duration / seconds(lambda: simulation.simulate(t_stop=self.duration))
+        p = simulation.ctrl.data.fbk.p_g
+        self.p = float(p[round(0.79 * len(p))]) / 12.5e3
+        return rate
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "", turns=5)
+    parser.add_argument("--law", default="psc-2", help="of gfmhil's loop (default: %(default)s)")
+    parser.add_argument("--duration", type=float, default=1.5, help="s of each (%(default)s)")
+    args = parser.parse_args()
+    duration, turns = (0.01, 1) if args.quick else (args.duration, args.turns)
+    theirs = Example(duration)
+    with tempfile.TemporaryDirectory() as place:
+        loop = Loop("pref_step", args.law, round(duration / T_S), Path(place))
+        found = take_turns(
+            {"gfmhil": lambda: loop.T_s * 1e9 / loop.whole(), "motulator": theirs.run}, turns
+        )
+    rates = {name: Spread.of(values) for name, values in found.items()}
+    faster = ratio(found["gfmhil"], found["motulator"])
+    table = Table(title=f"simulated seconds per second: median (min–max) of {turns} turns")
+    for column in (f"gfmhil, {args.law}", "motulator, its GFM example", "ratio"):
+        table.add_column(column, justify="right")
+    table.add_row(rates["gfmhil"].text(1), rates["motulator"].text(3), faster.text(0))
+    result = {
+        **rates,
+        "ratio": faster,
+        "motulator_p_pu": theirs.p,
+        "remarks": [f"{faster.median:.0f} times as fast (target {TARGET:g})", *REMARKS],
+        "machine": machine("scipy", "motulator"),
+    }
+    show(result, [table], args.json)
+
+
+if __name__ == "__main__":
+    main()
