@@ -1,0 +1,116 @@
+"""What several tests of the runtime use: rows and blocks in the plainest form, plausible inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from gfm_runtime import DiscreteLaw, Law, law_names, load_law, pack_law, state_dtype, step
+from gfm_runtime.error_maps import ERROR_MAPS, map_errors
+from gfm_runtime.signals import NU, NY, REF_NAMES
+
+Vector = NDArray[np.float64]
+
+REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
+
+#: Every law that ships, each stage of a scheduled one by itself.
+LAWS = {
+    law.name if len(s.laws) == 1 else f"{law.name}[{k}]": law
+    for s in map(load_law, law_names())
+    for k, law in enumerate(s.laws)
+}
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """dx/dt = A x + B w, u = C x + D w with w = (r, y, u_0), element by element, loop closed.
+
+    Written without ``gfm_runtime.realise``: each element is its own block from SciPy, nothing is
+    shared, and the omega_u loop is closed in continuous time.
+    """
+
+    A: Vector
+    B: Vector
+    C: Vector
+    D: Vector
+
+
+def blocks(law: Law) -> Blocks:
+    """A law in its plainest form, with far more states than it needs."""
+    parts = []
+    for sign_r, cells in ((1.0, law.phi), (0.0, law.psi)):
+        for (i, j), e in cells.items():
+            den = np.array([1.0])
+            for factor in e.den:
+                den = np.convolve(den, factor)
+            if e.is_zero:
+                continue
+            a, b, c, d = signal.tf2ss(e.num[::-1], den[::-1])
+            parts.append((i, j, sign_r, a if e.order else np.zeros((0, 0)), b, c, d))
+    n = sum(len(p[3]) for p in parts)
+    A, B = np.zeros((n, n)), np.zeros((n, 2 * NY + NU))
+    C, D = np.zeros((NU, n)), np.zeros((NU, 2 * NY + NU))
+    at = 0
+    for i, j, sign_r, a, b, c, d in parts:
+        k = slice(at, at + len(a))
+        at += len(a)
+        if len(a):
+            A[k, k], C[i, k] = a, c[0]
+            B[k, j], B[k, NY + j] = sign_r * b[:, 0], -b[:, 0]
+        D[i, j] += sign_r * d[0, 0]
+        D[i, NY + j] -= d[0, 0]
+    D[:, 2 * NY :] = np.eye(NU)
+    gain = 1.0 / (1.0 - D[1, NY + 2])
+    b3, d3 = B[:, [NY + 2]].copy(), D[:, [NY + 2]].copy()
+    B[:, NY + 2], D[:, NY + 2] = 0.0, 0.0
+    A, B = A + gain * b3 @ C[[1]], B + gain * b3 @ D[[1]]
+    return Blocks(A, B, C + gain * d3 @ C[[1]], D + gain * d3 @ D[[1]])
+
+
+def u_0(law: Law, ref: Vector) -> Vector:
+    """Set-points of u, those that follow a reference included."""
+    return np.array([ref[REF_NAMES.index(v)] if isinstance(v, str) else v for v in law.u_0])
+
+
+def mapped(law: Law, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
+    """Mapped copies of references and measurements."""
+    r, y = ref.copy(), y.copy()
+    map_errors(ERROR_MAPS[law.error_map], np.array([*law.error_parameters, 0.0, 0.0])[:2], r, y)
+    return r, y
+
+
+@dataclass
+class Running:
+    """A law in the kernel."""
+
+    law: NDArray[Any]
+    state: NDArray[Any]
+
+    @staticmethod
+    def of(discrete: DiscreteLaw, real: type = np.float64) -> Running:
+        return Running(pack_law(discrete, real), np.zeros(1, state_dtype(real)))
+
+    def step(self, ref: Vector, y: Vector) -> Vector:
+        u = np.zeros(NU)
+        step(self.law[0], self.state[0], ref, y, u)
+        return u
+
+    def run(self, refs: Vector, ys: Vector) -> Vector:
+        """One row of u for each row of references and measurements."""
+        return np.array([self.step(r, y) for r, y in zip(refs, ys, strict=True)])
+
+    def unlimited(self) -> Running:
+        """The same law without limits."""
+        self.law["low"], self.law["high"] = -np.inf, np.inf
+        return self
+
+
+def wander(ticks: int, seed: int = 1, size: float = 0.05) -> tuple[Vector, Vector]:
+    """References and measurements (ticks, 5) that wander about the operating point."""
+    rng = np.random.default_rng(seed)
+    slow = np.cumsum(rng.normal(size=(2, ticks, NY)), axis=1) / np.sqrt(ticks)
+    return REF + size * slow[0], REF + size * (slow[1] + 0.1 * rng.normal(size=(ticks, NY)))

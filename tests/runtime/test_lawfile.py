@@ -1,0 +1,362 @@
+"""Law files: what is written comes out, and every mistake is one clear line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gfm_runtime import (
+    Law,
+    LawError,
+    Limits,
+    build_law,
+    discretise,
+    load_law,
+    parse_law,
+    read_law_file,
+)
+from gfm_runtime.elements import IF, PD, PI, D, Element, I, O, P
+from gfm_runtime.kernel import pack_law
+
+CUSTOM = """
+name = "custom-1"
+title = "all that a law file can say"
+source = "this test"
+
+[error_map]
+type = "hybrid-angle"
+R = 0.001
+X = "2 * X_half"
+
+[u_0]
+i_u = "P_ref"
+omega_u = 1.0
+E_u = 1
+
+[phi]
+11 = { type = "PI", k = "k_p", k_i = 400 }
+12 = { type = "PI", k = 2.0, T = 0.5 }
+21 = { type = "PD", k = 0.1, T = 0.02, T_f = 0.001 }
+22 = [{ type = "O", k = "D_p", T = 0.03, xi = 0.7 }, { type = "PD", k = 1.0, T = "1 / 50" }]
+23 = { type = "IF", k = 1.0, T = 0.2 }
+34 = { type = "I", T = 2.0 }
+35 = { type = "I", k_i = "-k_p / 10" }
+
+[psi]
+22 = [{ type = "D", T = 0.1 }, { type = "IF", k = 1.0, T = 0.1 }]
+
+[limits]
+i_u = [-2.0, 2]
+omega_u = [0.95, 1.05]
+E_u = [0.1, 1.2]
+T_t = 0.03
+T_off = 0.4
+
+[home_grid]
+L_g = 5.0
+note = "weak"
+
+[parameters]
+k_p = { value = 90.0, unit = "p.u.", source = "chosen" }
+D_p = { value = 0.01, unit = "p.u.", source = "Table III" }
+X_half = { value = 0.05, unit = "p.u.", source = "chosen" }
+"""
+
+
+def custom() -> Law:
+    return build_law(parse_law(CUSTOM))
+
+
+def test_round_trip() -> None:
+    law = custom()
+    integral = Element.of((-9.0,), ((0.0, 1.0),))
+    assert law.phi == {
+        (0, 0): P(90.0) + P(400.0) * I(1.0),
+        (0, 1): PI(2.0, 0.5),
+        (1, 0): PD(0.1, 0.02) * IF(1.0, 0.001),
+        (1, 1): O(0.01, 0.03, 0.7) * PD(1.0, 0.02),
+        (1, 2): IF(1.0, 0.2),
+        (2, 3): I(2.0),
+        (2, 4): integral,
+    }
+    assert law.psi == {(1, 1): D(0.1) * IF(1.0, 0.1)}
+    assert law.u_0 == ("P_ref", 1.0, 1)
+    assert (law.error_map, law.error_parameters) == ("hybrid-angle", (0.001, 0.1))
+    assert law.limits == Limits((-2.0, 0.95, 0.1), (2.0, 1.05, 1.2), 0.03, 0.4)
+    assert (law.home_grid.L_g, law.home_grid.R_g, law.home_grid.note) == (5.0, 1.0, "weak")
+    assert law.parameters["D_p"].source == "Table III"
+
+
+def test_from_a_path(tmp_path: Path) -> None:
+    path = tmp_path / "my law.toml"
+    path.write_text(CUSTOM, encoding="utf-8")
+    assert load_law(str(path)).laws == (custom(),)
+
+
+def test_parameters_can_be_changed() -> None:
+    law = build_law(parse_law(CUSTOM), {"D_p": 0.02, "k_p": 10.0})
+    assert law.phi[1, 1] == O(0.02, 0.03, 0.7) * PD(1.0, 0.02)
+    assert law.phi[2, 4](1.0) == pytest.approx(-1.0)
+    assert law.parameters["D_p"].value == 0.02
+
+
+def test_a_shape_may_be_a_list_of_one() -> None:
+    one = 'name = "a"\ntitle = ""\nsource = ""\n[phi]\n22 = {}\n'
+    element = '{ type = "P", k = 0.01 }'
+    a, b = (build_law(parse_law(one.format(e))) for e in (element, f"[{element}]"))
+    assert a == b
+
+
+MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    # name: what is replaced, by what, and what the message has to say
+    "unknown key": (
+        '"IF", k = 1.0, T = 0.2',
+        '"IF", gain = 3, k = 1.0, T = 0.2',
+        ("phi.23.0.gain", "3"),
+    ),
+    "unknown table": ("[psi]", "[chi]", ("chi", "not permitted")),
+    "unknown type": (
+        '"IF", k = 1.0, T = 0.2',
+        '"XY", k = 1.0, T = 0.2',
+        ("phi.23.0.type", "XY", "'PI'"),
+    ),
+    "wrong type of a number": (
+        "T = 2.0 }",
+        "T = [2.0] }",
+        ("phi.34.0.T", "[2.0]", "number or an exp"),
+    ),
+    "a boolean number": (
+        "T = 2.0 }",
+        "T = true }",
+        ("phi.34.0.T", "True", "number or an expression"),
+    ),
+    "a number for a name": ('name = "custom-1"', "name = 3", ("name", "3", "string")),
+    "bad name": ('name = "custom-1"', 'name = "a b"', ("name", "'a b'", "pattern")),
+    "no type": ('type = "I", T = 2.0', "T = 2.0", ("phi.34.0.type", "required")),
+    "no factors": ('{ type = "I", T = 2.0 }', "[]", ("phi.34", "at least 1")),
+    "too many factors": (
+        '{ type = "I", T = 2.0 }',
+        str(["P"] * 9).replace("'P'", '{type="P", k=1}'),
+        ("phi.34", "at most 8"),
+    ),
+    "missing number": (
+        '"IF", k = 1.0, T = 0.2',
+        '"IF", k = 1.0',
+        ("phi_23", "IF takes ['T', 'k']", "['k']"),
+    ),
+    "number too many": (
+        '"IF", k = 1.0, T = 0.2',
+        '"IF", k = 1.0, T = 0.2, xi = 1',
+        ("phi_23", "'xi'"),
+    ),
+    "both forms": ("T = 2.0 }", "T = 2.0, k_i = 1 }", ("phi_34", "['T'] or ['k_i']")),
+    "improper": (", T_f = 0.001", "", ("phi_21", "improper", "T_f")),
+    "unstable T": ("k = 1.0, T = 0.2", "k = 1.0, T = -0.2", ("phi_23, IF", "T = -0.2", "> 0")),
+    "unstable T_f": ("T_f = 0.001", "T_f = -1", ("phi_21.T_f", "-1", "> 0")),
+    "unstable xi": ("xi = 0.7", "xi = 0", ("phi_22, O", "xi = 0", "> 0")),
+    "absurd T": ("T = 2.0 }", "T = 1e-200 }", ("phi_34, I", "1e-200", "[1e-09, 1e+09]")),
+    "infinite gain": ("k_i = 400", "k_i = inf", ("phi_11.k_i", "inf", "finite")),
+    "gigantic integer": ("k_i = 400", "k_i = 1" + 400 * "0", ("phi.11.0.k_i", "must be a number")),
+    "gigantic parameter": ("value = 90.0", "value = 1" + 400 * "0", ("parameters.k_p.value",)),
+    "absurd gain": ("k_i = 400", "k_i = 1e300", ("phi_11.k_i", "1e+300", "1e+12")),
+    "nan parameter": ("value = 90.0", "value = nan", ("phi_11.k", "nan", "finite")),
+    "unknown parameter": ('k = "D_p"', 'k = "D_q"', ("phi_22.k", "'D_q'", "D_p")),
+    "bad parameter name": ("k_p = {", '"k p" = {', ("parameters.k p", "pattern")),
+    "parameter without source": (
+        ', source = "Table III"',
+        "",
+        ("parameters.D_p.source", "required"),
+    ),
+    "parameter as expression": (
+        "value = 0.05",
+        'value = "0.1 / 2"',
+        ("parameters.X_half.value", "number"),
+    ),
+    "syntax of an expression": ('"1 / 50"', '"1 /"', ("phi_22.T", "'1 /'", "no arithmetic")),
+    "call in an expression": ('"1 / 50"', '"exit()"', ("phi_22.T", "'exit()'", "only + -")),
+    "division by zero": ('"1 / 50"', '"1 / 0"', ("phi_22.T", "'1 / 0'", "zero")),
+    "cell 46": ("34 = {", "46 = {", ("phi.46", "row 1..3", "column 1..5")),
+    "cell 123": ("34 = {", "123 = {", ("phi.123", "row 1..3")),
+    "cell x": ("34 = {", "x1 = {", ("phi.x1", "row 1..3")),
+    "double integrator": (
+        '[{ type = "D", T = 0.1 }, { type = "IF", k = 1.0, T = 0.1 }]',
+        '[{ type = "I", T = 1.0 }, { type = "I", T = 1.0 }]',
+        ("psi_22", "double integrator"),
+    ),
+    "unknown error map": (
+        'type = "hybrid-angle"',
+        'type = "angle"',
+        ("error_map.type", "'angle'", "dvoc"),
+    ),
+    "hybrid-angle without X": ('X = "2 * X_half"', "", ("error_map", "R and X", "hybrid-angle")),
+    "hybrid-angle with X = 0": (
+        'X = "2 * X_half"',
+        "X = 0",
+        ("error_map", "(0.001, 0.0)", "X > 0"),
+    ),
+    "X for another map": ('type = "hybrid-angle"', 'type = "dvoc"', ("error_map", "hybrid-angle")),
+    "set-point": ('i_u = "P_ref"', 'i_u = "P"', ("u_0.i_u", "'P'", "P_ref")),
+    "infinite set-point": ("omega_u = 1.0", "omega_u = nan", ("u_0.omega_u", "nan", "finite")),
+    "limits upside down": (
+        "[0.95, 1.05]",
+        "[1.05, 0.95]",
+        ("limits.omega_u", "[1.05, 0.95]", "ascending"),
+    ),
+    "one limit": ("[0.95, 1.05]", "[0.95]", ("limits.omega_u", "[0.95]", "at least 2")),
+    "T_t": ("T_t = 0.03", "T_t = 0.0", ("limits.T_t", "0 s", "> 0")),
+    "T_off": ("T_off = 0.4", "T_off = nan", ("limits.T_off", "nan", "> 0")),
+    "home grid": ("L_g = 5.0", "L_g = 0.0", ("home_grid.L_g", "0.0", "greater than 0")),
+    "not TOML": ("[psi]", "[psi", ("law file", "not TOML", "line")),
+    "key twice": ("34 = {", "23 = {", ("law file", "not TOML")),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_clear_line(mistake: str) -> None:
+    old, new, says = MISTAKES[mistake]
+    assert CUSTOM.count(old) == 1
+    with pytest.raises(LawError) as caught:
+        build_law(parse_law(CUSTOM.replace(old, new)))
+    message = str(caught.value)
+    assert all(part in message for part in says), message
+    assert "\n" not in message and "; " not in caught.value.why.replace("; use", "").replace(
+        "; give", ""
+    ).replace("; known", ""), f"one message for one mistake: {message}"
+
+
+def test_all_mistakes_at_once() -> None:
+    text = CUSTOM.replace("T = 2.0 }", "T = true }").replace("T_t = 0.03", 'T_t = "x"')
+    with pytest.raises(LawError) as caught:
+        parse_law(text, "law file a.toml")
+    assert str(caught.value).startswith("law file a.toml: ")
+    assert "phi.34.0.T" in caught.value.why and "limits.T_t" in caught.value.why
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(LawError, match=r"law file .*nowhere\.toml: cannot be read: .*No such file"):
+        read_law_file(tmp_path / "nowhere.toml")
+    with pytest.raises(LawError, match="cannot be read"):
+        load_law(str(tmp_path / "nowhere.toml"))
+    with pytest.raises(LawError, match="cannot be read"):
+        read_law_file(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"')
+    with pytest.raises(LawError, match="cannot be read"):
+        read_law_file(tmp_path / "latin.toml")
+
+
+@pytest.mark.parametrize(
+    ("phi", "says"),
+    [
+        ({(3, 0): P(1.0)}, "phi_41: row must be 1..3"),
+        ({(0, 5): P(1.0)}, "phi_16: row must be"),
+        ({(1, 1): D(1.0)}, "phi_22: improper"),
+        ({(1, 1): Element((float("nan"),))}, "phi_22: a coefficient is not finite"),
+        ({(1, 1): Element((1.0,), ((1.0, -0.5),))}, "phi_22: unstable factor (1.0, -0.5)"),
+        ({(1, 1): Element((1.0,), ((1.0, 0.0, 0.1),))}, "phi_22: unstable factor"),
+        ({(1, 1): Element((1.0,), ((2.0, 1.0, 1.0, 1.0),))}, "phi_22: unstable factor"),
+        ({(1, 1): Element((1.0,), ((0.0, 1.0), (0.0, 1.0)))}, "phi_22: unstable: a double integ"),
+    ],
+)
+def test_laws_made_in_python_pass_the_same_checks(phi: Any, says: str) -> None:
+    with pytest.raises(LawError) as caught:
+        Law("a", "", "", phi)
+    assert says in str(caught.value)
+
+
+number = st.one_of(
+    st.floats(),
+    st.integers(-3, 3),
+    st.floats(1e-3, 10.0),
+    st.sampled_from(["D_p", "1 / D_p", "-D_p", "2 *", "D_p.real", "nothing", "D_p ** 300", ""]),
+    st.booleans(),
+)
+factor = st.fixed_dictionaries(
+    {"type": st.sampled_from(["P", "I", "D", "PI", "PD", "IF", "O", "X"])},
+    optional={name: number for name in ("k", "k_i", "T", "xi", "T_f", "gain")},
+)
+# such as stand a chance of being right
+sound = st.one_of(
+    st.fixed_dictionaries({"type": st.sampled_from(["P"]), "k": st.floats(-5, 5)}),
+    st.fixed_dictionaries(
+        {
+            "type": st.sampled_from(["PI", "PD", "IF"]),
+            "k": st.floats(-5, 5),
+            "T": st.floats(1e-6, 1e3),
+        }
+    ),
+    st.fixed_dictionaries({"type": st.sampled_from(["I", "D"]), "T": st.floats(1e-6, 1e3)}),
+    st.fixed_dictionaries(
+        {"type": st.just("O"), "k": number, "T": st.floats(1e-6, 1e3), "xi": st.floats(0.01, 9)}
+    ),
+)
+cells = st.dictionaries(
+    st.sampled_from([f"{i}{j}" for i in range(1, 4) for j in range(1, 6)] + ["46", "2"]),
+    st.one_of(sound, st.lists(sound, max_size=4), factor, st.lists(factor, max_size=3)),
+    max_size=4,
+)
+law_files = st.fixed_dictionaries(
+    {
+        "name": st.sampled_from(["a", "a b", ""]) | st.just("a"),
+        "title": st.just(""),
+        "source": st.just(""),
+        "phi": cells,
+        "parameters": st.fixed_dictionaries(
+            {
+                "D_p": st.fixed_dictionaries(
+                    {"value": st.floats(), "unit": st.just(""), "source": st.just("")}
+                )
+            }
+        ),
+    },
+    optional={
+        "psi": cells,
+        "error_map": st.fixed_dictionaries(
+            {"type": st.sampled_from(["linear", "dvoc", "dc-energy", "hybrid-angle", "x"])},
+            optional={"R": number, "X": number},
+        ),
+        "u_0": st.fixed_dictionaries(
+            {}, optional={"i_u": number | st.just("P_ref"), "E_u": st.floats()}
+        ),
+        "limits": st.fixed_dictionaries(
+            {},
+            optional={
+                "i_u": st.lists(st.floats(), max_size=3),
+                "T_t": st.floats(),
+                "T_off": st.floats(),
+            },
+        ),
+    },
+)
+
+
+def toml(value: Any) -> str:
+    """A value as inline TOML."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value)
+
+
+@given(law_files, st.sampled_from([1e-4, 1e-3, 1.0]))
+def test_any_law_file_builds_or_raises_law_error(content: dict[str, Any], T_s: float) -> None:
+    text = "\n".join(f"{key} = {toml(value)}" for key, value in content.items())
+    try:
+        law = build_law(parse_law(text))
+        packed = pack_law(discretise(law, T_s))
+    except LawError as problem:
+        assert problem.where and problem.why
+    else:
+        assert all(element.is_proper for element in law.phi.values())
+        assert packed["n"][0] <= 12
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_a_law_or_a_law_error(text: str) -> None:
+    with pytest.raises(LawError):
+        parse_law(text)
