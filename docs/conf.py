@@ -1,14 +1,18 @@
 """Sphinx configuration. Build: ``sphinx-build -W docs docs/_build``."""
 
+import sys
 from importlib.metadata import version as _version
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "gfmhil"
 author = "gfmhil developers"
 project_copyright = "gfmhil developers"
 version = release = _version("gfmhil")
 
-extensions = ["myst_parser", "sphinx.ext.mathjax"]
-exclude_patterns = ["_build"]
+extensions = ["myst_parser", "sphinx.ext.mathjax", "generated"]
+exclude_patterns = ["_build", "_ext", "examples", "tables"]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
@@ -20,3 +24,4 @@ mathjax_path = "mathjax/tex-svg-full.js"
 html_theme = "furo"
 html_title = f"gfmhil {release}"
 html_static_path = ["_static"]
+html_css_files = ["gfmhil.css"]

@@ -1,0 +1,50 @@
+"""Sphinx extension: fills the generated parts of the pages from the code while they are read.
+
+A line ``<!-- generate: NAME ARGUMENTS -->`` is replaced by what NAME makes. The pages can
+therefore not say anything about laws, keys or messages that the code does not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import law_pages
+import outputs
+import scenario_pages
+
+_LINE = re.compile(r"^<!-- generate: (\S+) ?(.*?) *-->$", re.MULTILINE)
+
+MAKERS: dict[str, Callable[..., str]] = {
+    "law-overview": law_pages.overview,
+    "law-catalogue": law_pages.catalogue,
+    "law-keys": scenario_pages.law_tables,
+    "law-mistakes": outputs.mistakes,
+    "scenario-keys": scenario_pages.scenario_tables,
+    "scenario-mistakes": outputs.scenario_mistakes,
+    "event-keys": scenario_pages.event_tables,
+    "command": outputs.command,
+}
+
+
+def fill(text: str) -> str:
+    """The text with its generated parts."""
+
+    def make(match: re.Match[str]) -> str:
+        name, argument = match.groups()
+        return MAKERS[name](argument) if argument else MAKERS[name]()
+
+    return _LINE.sub(make, text)
+
+
+def _read(app: Any, docname: str, content: list[str]) -> None:
+    if _LINE.search(content[0]):
+        content[0] = fill(content[0])
+        app.env.note_reread()
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Hook into Sphinx."""
+    app.connect("source-read", _read)
+    return {"parallel_read_safe": False, "parallel_write_safe": True}

@@ -1,0 +1,97 @@
+"""The pages' examples work, and what they list by hand is what the code has."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gfm_design.linear import loop_modes
+from gfm_design.operating_point import operating_point
+from gfm_hil.runner import Run, run_scenario
+from gfm_hil.scenario import load_scenario
+from gfm_plant import Plant, make_plant
+from gfm_runtime import discretise, get_law, load_law
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+EXAMPLES = DOCS / "examples"
+REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
+RIG = {"delay": {"samples": 1}, "sensors": {"bandwidth_hz": 300.0}}
+
+
+@pytest.mark.parametrize("name", ["my-law", "my-schedule", "droop-5-integral"])
+@pytest.mark.parametrize("plant", [{}, RIG])
+def test_example_law_is_stable(name: str, plant: dict) -> None:
+    par, _ = make_plant(Plant.model_validate(plant), 1e-4)
+    for stage in load_law(str(EXAMPLES / f"{name}.toml")).laws:
+        law = discretise(stage, 1e-4)
+        assert loop_modes(par, law, operating_point(par, law, REF), REF)[0].sigma < -0.5
+
+
+def test_droop_5_with_row_3_of_vsg_2_is_vsg_2_from_the_measurements() -> None:
+    droop, vsg = get_law(str(EXAMPLES / "droop-5-integral.toml")), get_law("vsg-2")
+    for s in (0.1j, 10j, 1e3j):
+        for i in range(3):
+            for j in range(5):
+                feedback = droop.element("phi", (i, j))(s) + droop.element("psi", (i, j))(s)
+                assert feedback == pytest.approx(vsg.element("phi", (i, j))(s), rel=1e-12)
+
+
+@pytest.fixture(scope="module")
+def example_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    scenario = load_scenario(str(EXAMPLES / "my-scenario.toml"), link__type="inproc")
+    return run_scenario(scenario, tmp_path_factory.mktemp("docs") / "run")
+
+
+def test_example_scenario_completes(example_run: Run) -> None:
+    assert example_run.summary["status"] == "completed"
+
+
+def documented(head: str) -> list[set[str]]:
+    """The names in the first columns of the tables below a heading."""
+    text = (DOCS / "scenarios.md").read_text(encoding="utf-8").split(f"## {head}\n", 1)[1]
+    tables = re.findall(r"(?:^\|.*\n)+", text.split("\n## ", 1)[0], flags=re.MULTILINE)
+    return [
+        {name for line in t.splitlines()[2:] for name in re.findall(r"`(.+?)`", line.split("|")[1])}
+        for t in tables
+    ]
+
+
+def test_summary_keys_are_documented(example_run: Run) -> None:
+    whole, event = documented("summary.json")
+    assert whole == set(example_run.summary)
+    assert event == {key for e in example_run.summary["events"] for key in e}
+
+
+def test_run_folder_is_documented(example_run: Run) -> None:
+    (files,) = documented("The run folder")[:1]
+    assert {path.name for path in example_run.folder.iterdir()} <= {f for f in files if "." in f}
+
+
+def numbers(row: str) -> list[float]:
+    return [float(n) for n in re.findall(r"-?\d+(?:\.\d+)?", row.replace("−", "-"))]
+
+
+def test_committed_eigenvalues_are_current(monkeypatch: pytest.MonkeyPatch) -> None:
+    # the tables with runs of the bench take half a minute: `python docs/make_figures.py`
+    monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
+    import make_figures
+
+    written: dict[str, list[str]] = {}
+
+    def keep(name: str, head: list[str], rows: list[list[str]]) -> None:
+        written[name] = [f"| {' | '.join(row)} |" for row in rows]
+
+    monkeypatch.setattr(make_figures, "write_table", keep)
+    make_figures.ideal_table()
+    make_figures.bandwidth_table()
+    make_figures.q_droop_table()
+    make_figures.couplings_table()
+    for name, rows in written.items():
+        committed = (DOCS / "tables" / f"{name}.md").read_text(encoding="utf-8").splitlines()[2:]
+        assert len(committed) == len(rows)
+        for old, new in zip(committed, rows, strict=True):  # in the last digit they may differ
+            np.testing.assert_allclose(numbers(old), numbers(new), rtol=1e-3, atol=0.02)
