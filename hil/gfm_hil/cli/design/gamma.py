@@ -1,0 +1,56 @@
+"""gfmhil design gamma: gamma of given gains, channel by channel."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from gfm_design.gains import FreeGain, tied
+from gfm_design.hinf import Unstable
+from gfm_design.paper_problem import PaperProblem
+from gfm_hil.cli.design.common import (
+    add_law_options,
+    channels_as_json,
+    print_channels,
+    read_gains,
+)
+from gfm_hil.errors import UserError
+from gfm_runtime import law_file
+
+
+def add(kinds: Any) -> None:
+    """Add the command to the parser."""
+    command = kinds.add_parser("gamma", help="gamma of a law's gains, channel by channel")
+    add_law_options(command)
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Report gamma of given gains; exit code 3 for an unstable loop, which has none."""
+    file, given = law_file(options.law), read_gains(options.gains)
+    unknown = sorted(set(given) - set(file.parameters))
+    if unknown:
+        raise UserError(
+            f"--gains: {unknown} unknown to {file.name}; known: {list(file.parameters)}"
+        )
+    # every parameter may be given here; they are the "free" ones, pinned at these values
+    values = tied(file, given) if given else {}
+    gains = [FreeGain(n, v, -np.inf, np.inf) for n, v in values.items()]
+    problem = PaperProblem(file, tuple(gains))
+    try:
+        channels = problem.channels(np.array([g.start for g in gains]))
+    except Unstable as problem_found:
+        if options.json:
+            print(json.dumps({"law": file.name, "gamma": None, "reason": str(problem_found)}))
+        else:
+            Console().print(f"{file.name}: no gamma, {problem_found}", highlight=False)
+        return 3
+    if options.json:
+        print(json.dumps({"law": file.name, **channels_as_json(channels)}, indent=2))
+    else:
+        print_channels(file.name, channels)
+    return 0
