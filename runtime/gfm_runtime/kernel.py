@@ -72,6 +72,7 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
     )
 
 
+@np.errstate(over="ignore")  # what overflows is refused below
 def pack_law(discrete: DiscreteLaw, real: DTypeLike = np.float64) -> NDArray[Any]:
     """A discrete law as a one-element array of ``law_dtype``.
 

@@ -108,6 +108,7 @@ def _check_series(law: Law) -> None:
                 raise LawError(cell_name(matrix, (i, 2)), why)
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused below
 def _row(law: Law, i: int) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
     """Observer form of row i: A, B_r, B_y, D_r, D_y; its C is (1, 0, ..., 0)."""
     phi = [law.element("phi", (i, j)) for j in range(NY)]
