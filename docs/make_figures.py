@@ -126,7 +126,7 @@ def step_table(name: str, runs: dict[str, Run]) -> None:
         else:
             t = one.summary["duration_s"]
             cells = [f"{one.summary['status']} at {t:.3f} s"] + ["–"] * (len(COLUMNS) - 1)
-        rows.append([label, *cells])
+        rows.append([label.replace("-", "\u2011"), *cells])
     write_table(name, ["", *[title for _, title, _ in COLUMNS]], rows)
 
 
@@ -203,7 +203,7 @@ def ideal_table() -> None:
         for kind, ideal in (("continuous", True), ("100 µs, no delay", False)):
             found = [m for m in modes(law, {}, ideal=ideal) if m.frequency_hz > 1e-3]
             text = ", ".join(f"{signed(m.sigma)} at {m.frequency_hz:.1f} Hz" for m in found[:5])
-            rows.append([law, kind, text])
+            rows.append([law.replace("-", "\u2011"), kind, text])
     write_table("ideal_modes", ["law", "controller", "oscillations [1/s]"], rows)
 
 

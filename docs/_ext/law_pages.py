@@ -24,7 +24,7 @@ _ERRORS = {
     "linear": r"e = Y_{ref} - y",
     "dc-energy": r"e_1 = \tfrac12\bigl(V_{dcref}^2 - v_{dc}^2\bigr),"
     r"\quad e_j = Y_{ref,j} - y_j \text{ otherwise}",
-    "dvoc": r"e_2 = \frac{P_{ref}}{V_{ref}^2} - \frac{p}{V^2},\quad"
+    "dvoc": r"e_2 = \frac{P_{ref}}{V_{ref}^2} - \frac{p}{V^2},\quad "
     r"e_4 = \frac{Q_{ref}}{V_{ref}^2} - \frac{q}{V^2},\quad e_j = Y_{ref,j} - y_j"
     r" \text{ otherwise}",
     "hybrid-angle": r"e_2 = \sin\tfrac12(\delta_{ref} - \delta),\quad e_j = Y_{ref,j} - y_j"
@@ -81,25 +81,25 @@ def factor_formula(spec: ElementSpec) -> str:
         case "P":
             text = k or "1"
         case "I" if spec.k_i is not None:
-            text = rf"\frac{{{formula(spec.k_i)}}}{{s}}"
+            text = rf"\dfrac{{{formula(spec.k_i)}}}{{s}}"
         case "I":
-            text = rf"\frac{{1}}{{{T}\,s}}"
+            text = rf"\dfrac{{1}}{{{T}\,s}}"
         case "D":
             text = rf"{T}\,s" if T else "s"
         case "PI" if spec.k_i is not None:
-            text = rf"{formula(spec.k or 0.0)} + \frac{{{formula(spec.k_i)}}}{{s}}"
+            text = rf"{formula(spec.k or 0.0)} + \dfrac{{{formula(spec.k_i)}}}{{s}}"
         case "PI":
-            text = rf"{k}\Bigl(1 + \frac{{1}}{{{T}\,s}}\Bigr)"
+            text = rf"{k}\Bigl(1 + \dfrac{{1}}{{{T}\,s}}\Bigr)"
         case "PD":
             text = rf"{k}(1 + {T}\,s)"
         case "IF":
             assert spec.T is not None
             top, bottom = _lag(spec.T)
-            text = rf"\frac{{{' '.join(p for p in (k, top) if p) or '1'}}}{{{bottom}}}"
+            text = rf"\dfrac{{{' '.join(p for p in (k, top) if p) or '1'}}}{{{bottom}}}"
         case _:
             assert spec.xi is not None
-            text = rf"\frac{{{k or '1'}}}{{{T}^2 s^2 + 2\,{T}\,{formula(spec.xi)}\,s + 1}}"
-    return text if spec.T_f is None else rf"{text}\,\frac{{1}}{{{formula(spec.T_f)}\,s + 1}}"
+            text = rf"\dfrac{{{k or '1'}}}{{{T}^2 s^2 + 2\,{T}\,{formula(spec.xi)}\,s + 1}}"
+    return text if spec.T_f is None else rf"{text}\,\dfrac{{1}}{{{formula(spec.T_f)}\,s + 1}}"
 
 
 def matrix(file: LawFile, which: str) -> str:
@@ -114,7 +114,7 @@ def matrix(file: LawFile, which: str) -> str:
             row.append(r"\,".join(factor_formula(f) for f in factors) or "0")
         rows.append(" & ".join(row))
     name = r"\Phi(s)" if which == "phi" else r"\Psi(s)"
-    body = r" \\[1.2ex] ".join(rows)
+    body = r" \\[2ex] ".join(rows)
     return rf"{name} = \begin{{bmatrix}} {body} \end{{bmatrix}}"
 
 
@@ -141,7 +141,8 @@ def worst_mode(name: str, rig: bool) -> Mode:
 def _mode_text(mode: Mode) -> str:
     text = f"{mode.sigma:.2f}".replace("-", "−")
     text = f"**+{text}**" if mode.sigma >= 0.0 else text
-    return f"{text} 1/s at {mode.frequency_hz:.4g} Hz"
+    f = mode.frequency_hz
+    return f"{text} 1/s at {f:.3g} Hz" if f < 100 else f"{text} 1/s at {f:.0f} Hz"
 
 
 def _overview() -> list[str]:
