@@ -1,6 +1,7 @@
 """Timing that a noisy machine cannot fool easily: rivals take turns, and the median counts.
 
-A ratio is taken turn by turn, between runs that follow each other at once, before its median is.
+A turn is the quickest of a few short runs, since what else the machine does only adds time. A
+ratio is taken turn by turn, between runs that follow each other at once, before its median is.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+RUNS = 20  # in a turn
 WIDTH = 120  # columns
 
 
@@ -45,6 +47,11 @@ def seconds(work: Callable[[], object]) -> float:
     begin = perf_counter_ns()
     work()
     return (perf_counter_ns() - begin) * 1e-9
+
+
+def quickest(run: Callable[[], float]) -> float:
+    """The least of what ``RUNS`` calls of ``run`` return."""
+    return min(run() for _ in range(RUNS))
 
 
 def take_turns(jobs: Mapping[str, Callable[[], float]], turns: int) -> dict[str, list[float]]:
