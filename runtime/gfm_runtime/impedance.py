@@ -6,7 +6,9 @@ washout, which removes the unknown omega_g and the operating point; K is the rat
 exponentially forgetting sums, K = sum(p_w theta_w)/sum(theta_w^2). With p = V V_g sin(delta)/X the
 reactance follows without knowing delta: X = V V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u. and
 p, like K, that of the operating point, without the swing.
-The estimate moves only while the sums hold enough excitation, and is held otherwise.
+The estimate moves only while the sums hold enough excitation and p follows the angle (squared
+correlation above COHERENT), and is held otherwise: in a transient that comes from the grid p moves
+without the angle and would tell nothing.
 """
 
 from __future__ import annotations
@@ -17,6 +19,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+COHERENT = 0.7
+SETTLED = 5.0  # time constants of the washout; before, it still shows where it was started
 
 impedance_dtype = np.dtype(
     [
@@ -30,8 +35,9 @@ impedance_dtype = np.dtype(
         ("p_slower", "f8"),  # and the second
         ("s_pt", "f8"),
         ("s_tt", "f8"),
+        ("s_pp", "f8"),
         ("omega_slow", "f8"),
-        ("started", "i8"),
+        ("age", "i8"),  # ticks since the start
         ("X", "f8"),  # the estimate, p.u.
     ],
     align=True,
@@ -81,9 +87,9 @@ def make_impedance(
 @njit(cache=True)
 def estimate(est, p, omega_u, V):
     """One tick of the estimator from p, omega_u and V (p.u.); returns X in p.u."""
-    if est.started == 0:
-        est.started = 1
+    if est.age == 0:
         est.p_slow, est.omega_slow = p, omega_u
+    est.age += 1
     a = est.washout * est.T_s
     # twice through the washout, both of them: an angle under a constant omega_g is a ramp
     est.omega_slow += a * (omega_u - est.omega_slow)
@@ -93,7 +99,9 @@ def estimate(est, p, omega_u, V):
     p_fast = p - est.p_slow - est.p_slower
     est.s_pt += est.forget * (p_fast * est.theta - est.s_pt)
     est.s_tt += est.forget * (est.theta * est.theta - est.s_tt)
-    if est.s_tt > est.excitation and est.s_pt > 0.0:
+    est.s_pp += est.forget * (p_fast * p_fast - est.s_pp)
+    coherent = est.s_pt * est.s_pt > COHERENT * est.s_pp * est.s_tt
+    if est.age * a > SETTLED and est.s_tt > est.excitation and est.s_pt > 0.0 and coherent:
         K = est.s_pt / est.s_tt
         est.X = V / math.sqrt(K * K + est.p_slow * est.p_slow)
     return est.X
