@@ -18,7 +18,7 @@ from gfm_plant.integrator import Held, Vector, integrate
 from gfm_plant.model import DELTA, V_DC, rates, terminal
 from gfm_plant.protection import BAD_COMMAND, DIVERGED, protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import MAX_DELAY, PlantRecord
 
 TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip")
 """What `plant_truth` writes, in this order; i = |i_dq|, delta in rad, trip a reason code."""
@@ -40,7 +40,7 @@ def plant_init(
         s.x[i] = x0[i]
     for j in range(3):
         s.u_now[j] = u0[j]
-        for k in range(4):
+        for k in range(MAX_DELAY + 2):
             s.u[k, j] = u0[j]
     p, q, V = terminal(x0[2], x0[3], x0[4], x0[5])
     s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[V_DC], p, q, V
@@ -105,7 +105,8 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
 def _take_command(r: Any, s: Any, u: NDArray[np.float64]) -> None:
     """Put u through the D/A into the delay line."""
     for j in range(3):
-        s.u[3, j], s.u[2, j], s.u[1, j] = s.u[2, j], s.u[1, j], s.u[0, j]
+        for k in range(r.delay + 1, 0, -1):
+            s.u[k, j] = s.u[k - 1, j]
         if math.isfinite(u[j]):
             s.u[0, j] = quantise(u[j], r.dac_lo[j], r.dac_hi[j], r.dac_lsb[j])
         else:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from gfm_plant.parameters import Element, NonNegative, Positive, check_factors
+from gfm_plant.records import MAX_DELAY
 
 Measured = Literal["v_dc", "p", "q", "V"]
 Command = Literal["i_u", "omega_u", "E_u"]
@@ -129,7 +130,7 @@ def _preset(boards: dict[str, Any]) -> BeforeValidator:
 class Delay(Options):
     """Time from the tick that samples y[k] to the moment when u[k] acts, in sampling periods."""
 
-    samples: int = Field(0, ge=0, le=2)
+    samples: int = Field(0, ge=0, le=MAX_DELAY)
     fraction: float = Field(0.0, ge=0, lt=1)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 PlantRecord = NDArray[np.void]
 """Shape (1,) of `plant_par_dtype` or `plant_state_dtype`."""
 
+MAX_DELAY = 5  # samples; a fraction of one may come on top
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 
 plant_par_dtype = np.dtype(
@@ -74,7 +75,7 @@ plant_state_dtype = np.dtype(
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
         ("i_load", "f8", (2,)),  # d and q current of the local load while the breaker is closed
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
-        ("u", "f8", (4, 3)),  # commands behind the D/A, u[k] first
+        ("u", "f8", (MAX_DELAY + 2, 3)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (3,)),  # the command that acts at this instant
         # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
         ("closed", "i8"),

@@ -16,7 +16,7 @@ def commands(n: int, u0: Any) -> Any:
     return u0 + 1e-3 * rng.standard_normal((n, 3))
 
 
-@pytest.mark.parametrize("samples", [0, 1, 2])
+@pytest.mark.parametrize("samples", [0, 1, 2, 5])
 def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) -> None:
     late, prompt = rest(delay={"samples": samples}), rest()
     u = commands(50, late.u)
@@ -28,7 +28,7 @@ def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) 
         assert late.sample()[2] == shifted[k, 1]  # the omega_u that acts
 
 
-@pytest.mark.parametrize("samples", [0, 1, 2])
+@pytest.mark.parametrize("samples", [0, 1, 2, 5])
 @pytest.mark.parametrize("fraction", [0.02, 0.3, 0.5, 0.99])
 def test_fraction_splits_the_period_exactly(
     rest: Callable[..., Any], samples: int, fraction: float

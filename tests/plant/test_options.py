@@ -51,7 +51,7 @@ def test_a_scenario_table() -> None:
         ({"adc": "DS2005"}, "adc", "'DS2005': must be DS2004"),
         ({"adc": {"bits": 16}}, "adc", "bits = 16: range must give at least one channel"),
         ({"adc": {"range": {"p": [1, -1]}}}, "adc.range.p", r"\[1.0, -1.0\]: .*lo < hi"),
-        ({"delay": {"samples": 3}}, "delay.samples", "less than or equal to 2"),
+        ({"delay": {"samples": 6}}, "delay.samples", "less than or equal to 5"),
         ({"delay": {"fraction": 1.0}}, "delay.fraction", "less than 1"),
         ({"protection": {"over_current": {"threshold": 0.0}}}, "threshold", "greater than 0"),
     ],
