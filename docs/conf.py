@@ -4,15 +4,15 @@ import sys
 from importlib.metadata import version as _version
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+sys.path.insert(0, str(Path(__file__).parent))
 
 project = "gfmhil"
 author = "gfmhil developers"
 project_copyright = "gfmhil developers"
 version = release = _version("gfmhil")
 
-extensions = ["myst_parser", "sphinx.ext.mathjax", "generated"]
-exclude_patterns = ["_build", "_ext", "examples", "tables"]
+extensions = ["myst_parser", "sphinx.ext.mathjax", "_ext.generated"]
+exclude_patterns = ["_build", "_ext", "_figures", "examples", "tables"]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3

@@ -10,9 +10,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import law_pages
-import outputs
-import scenario_pages
+from _ext import law_pages, outputs, scenario_pages
 
 _LINE = re.compile(r"^<!-- generate: (\S+) ?(.*?) *-->$", re.MULTILINE)
 

@@ -51,8 +51,8 @@ def _time(value: Number) -> str:
 
 def _latex(node: ast.expr) -> str:
     match node:
-        case ast.Constant(value=number):
-            return r"\omega_b" if abs(float(number) - 100 * np.pi) < 1e-6 else f"{number:g}"
+        case ast.Constant(value=int() | float() as number):
+            return r"\omega_b" if abs(number - 100 * np.pi) < 1e-6 else f"{number:g}"
         case ast.Name(id=name):
             return symbol(name)
         case ast.UnaryOp(operand=operand):

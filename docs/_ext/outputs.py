@@ -29,7 +29,7 @@ def command(line: str, width: int = 88, folder: Path = DOCS) -> str:
         contextlib.redirect_stderr(said),
     ):
         try:
-            code = main(line.split()[1:])
+            code: object = main(line.split()[1:])
         except SystemExit as end:
             code = end.code
     text = "\n".join(part.rstrip() for part in said.getvalue().splitlines())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import types
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -14,11 +14,17 @@ from gfm_plant import options
 from gfm_runtime import lawfile
 from gfm_runtime.signals import group
 
+
+def _table_of(key: str) -> type[BaseModel]:
+    return cast(type[BaseModel], scenario.Scenario.model_fields[key].annotation)
+
+
+_REFERENCE_TABLE = _table_of("references")
 TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("top level", scenario.Scenario),
-    ("[references]", scenario.References),
-    ("[link]", scenario.Link),
-    ("[late_policy]", scenario.LatePolicy),
+    ("[references]", _REFERENCE_TABLE),
+    ("[link]", _table_of("link")),
+    ("[late_policy]", _table_of("late_policy")),
     ("[plant]", options.Plant),
     ("[plant.dc_source]", options.DcSource),
     ("[plant.grid]", options.Grid),
@@ -170,7 +176,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def _meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
-    if model in (scenario.References, events.Reference) and name in _REFERENCES:
+    if model in (_REFERENCE_TABLE, events.Reference) and name in _REFERENCES:
         return _REFERENCES[name]
     owners = [c.__name__ for c in model.__mro__]
     for owner in owners:
@@ -197,7 +203,8 @@ def table(model: type[BaseModel], leave_out: tuple[str, ...] = ()) -> list[str]:
 def scenario_tables() -> str:
     """Every table of a scenario file."""
     lines: list[str] = []
-    for title, model in (*TABLES, TRIP):
+    tables: tuple[tuple[str, type[BaseModel]], ...] = (*TABLES, TRIP)
+    for title, model in tables:
         lines += [f"**{title if title[0] != '[' else f'`{title}`'}**", "", *table(model), ""]
     return "\n".join(lines)
 

@@ -1,0 +1,86 @@
+"""What the figures and tables share: running, eigenvalues, writing."""
+
+from __future__ import annotations
+
+import tempfile
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_design.linear import Mode, ideal_modes, loop_modes
+from gfm_design.operating_point import operating_point
+from gfm_hil.runner import Run, run_scenario
+from gfm_hil.scenario import Scenario, check_scenario, find_scenario
+from gfm_plant import Plant, make_plant
+from gfm_runtime import discretise, get_law
+
+DOCS = Path(__file__).resolve().parents[1]
+FIGURES, TABLES = DOCS / "_static" / "figures", DOCS / "tables"
+LAWS = ("mimo-gfm", "vsg-2", "droop-5")
+T_S = 1e-4
+REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
+RIG: dict[str, Any] = {
+    "delay": {"samples": 1},
+    "sensors": {"bandwidth_hz": 300.0},
+    "dc_source": {"mode": "regulated"},
+}
+GREY = "#888888"
+
+
+def scenario(name: str, **changed: Any) -> Scenario:
+    """A shipped scenario, in process, with keys changed (dotted path, __ for the dot)."""
+    content = tomllib.loads(find_scenario(name).read_text(encoding="utf-8"))
+    content |= {"mode": "lockstep", "link": {"type": "inproc"}}
+    for path, value in changed.items():
+        *parents, last = path.split("__")
+        place = content
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        if value is None:
+            place.pop(last, None)
+        else:
+            place[last] = value
+    return check_scenario(content, name)
+
+
+def run(case: Scenario) -> Run:
+    """Run it; only the signals and the summary are kept."""
+    with tempfile.TemporaryDirectory() as place:
+        return run_scenario(case, Path(place) / "run", figures=False)
+
+
+def modes(law: str, plant: dict[str, Any], ideal: bool = False, **gains: float) -> list[Mode]:
+    """Modes of a law's loop, longest lasting first."""
+    par, _ = make_plant(Plant.model_validate(plant), T_S)
+    discrete = discretise(get_law(law, **gains), T_S)
+    op = operating_point(par, discrete, REF)
+    if ideal:
+        return ideal_modes(par, discrete.law, op, REF)
+    return loop_modes(par, discrete, op, REF)
+
+
+def within(found: Sequence[Mode], low: float, high: float) -> Mode:
+    """The longest lasting mode of a band, Hz."""
+    return next(m for m in found if low < m.frequency_hz < high)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """For a table."""
+    if value is None:
+        return "–"
+    return f"{value:.{digits}f}".replace("-", "−")
+
+
+def signed(value: float) -> str:
+    """A growth rate; what grows is bold."""
+    return f"**+{value:.2f}**" if value >= 0 else f"{value:.2f}".replace("-", "−")
+
+
+def write_table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A Markdown table for the page to include."""
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    lines += [f"| {' | '.join(row)} |" for row in rows]
+    (TABLES / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
