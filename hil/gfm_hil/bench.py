@@ -6,7 +6,7 @@ that nothing but frames has to cross the link.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,8 @@ def make_bench(scenario: Scenario) -> Bench:
         )
     par, st = make_plant(plant, scenario.T_s)
     references = scenario.references.vector()
-    sets = [load_law(name) for name in scenario.laws()]
+    # under the name that events use: a law file has a name of its own, or another law's
+    sets = [replace(load_law(name), name=name) for name in scenario.laws()]
     controller = Controller(sets, scenario.T_s, references, hold=scenario.late_policy.hold)
     try:
         start = operating_point(

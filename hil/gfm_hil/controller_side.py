@@ -65,7 +65,10 @@ def run_controller(
             leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
             break
         if reader.state == STOPPED:
-            timeline.end("interrupted" if reader.reason else "completed", "", tick)
+            if reader.reason:
+                timeline.end("interrupted", "the plant ended before the scenario did", tick)
+            else:
+                timeline.end("completed", "", tick)
             break
         timeline.carry_out(tick)
         c.step(bench.y, bench.u)

@@ -144,7 +144,6 @@ Event = Annotated[
     Field(discriminator="type"),
 ]
 
-ControllerEvent = Reference | LawChange
 CONTROLLER_EVENTS = (Reference, LawChange)
 
 

@@ -46,12 +46,13 @@ def shake_hands(
         message = await_message(link, min(time.monotonic_ns() + _REPEAT_NS, deadline), stopped)
         now = time.monotonic_ns()
         if message is not None and message.startswith(_PREFIX):
-            content = json.loads(message[len(_PREFIX) :])
+            content = _read(message)
             if content["kind"] == "hello":
                 if side == "controller" and not met:  # answer first: both shall see a misfit
                     link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
                 _compare(mine, content)
-                met = True
+                if not met:  # from here on it is there, so that silence means what it always does
+                    met, deadline = True, now + int(scenario.link.peer_timeout_s * 1e9)
                 if side == "plant":
                     start = now + 20_000_000
                     go: dict[str, Any] = {"kind": "start", "t0": start}
@@ -66,10 +67,21 @@ def shake_hands(
             say_at = now + 5_000_000_000
     if stopped():
         raise PeerLost(f"interrupted while waiting for the {other}")
+    if met:
+        raise PeerLost(f"the {other} came but did not start")
     raise PeerLost(
         f"the {other} did not come within {scenario.link.start_timeout_s:g} s "
         f"at {scenario.link.endpoint}"
     )
+
+
+def _read(message: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(message[len(_PREFIX) :])
+        expected = {"hello": ("side", "table", "digest"), "start": ("t0",)}[content["kind"]]
+        return {"kind": content["kind"], **{key: content[key] for key in expected}}
+    except (ValueError, KeyError, TypeError):
+        raise PeerLost(f"the other side speaks another language: {message[:60]!r}") from None
 
 
 def _compare(mine: dict[str, Any], theirs: dict[str, Any]) -> None:

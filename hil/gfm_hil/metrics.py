@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 ROCOF_WINDOW = 0.1  # s; df/dt is the slope over this window
+METRICS = (
+    "p_before", "p_peak", "p_final", "settling_s", "overshoot_pct", "f_nadir_hz", "f_peak_hz",
+    "rocof_hz_s", "v_min", "v_max", "damping_ratio", "oscillation_hz",
+)  # fmt: skip
 _BAND = 0.02  # settling: within 2 % of the step (or 0.02 p.u. where there is no step)
 _NO_STEP = 0.02  # p.u.; a smaller change of p is no step
 _FEW = 20  # samples; a shorter window has no metrics
@@ -27,11 +31,12 @@ def event_metrics(
         p_before, p_peak (the extreme furthest from p_before), p_final, v_min, v_max in p.u.;
         settling_s (2 %), overshoot_pct (of the step); f_nadir_hz, f_peak_hz; rocof_hz_s (largest
         |df/dt| over 100 ms); damping_ratio and oscillation_hz of the dominant oscillation of p.
-        None where a quantity has no meaning, as overshoot without a step.
+        None where a quantity has no meaning, as overshoot without a step, or all of them in a
+        window of a few ticks.
     """
     p = signals["true_p"][start:stop]
     if len(p) < _FEW:
-        return {}
+        return dict.fromkeys(METRICS)
     f = signals["true_omega_u"][start:stop] * f_n
     V = signals["true_V"][start:stop]
     before = float(signals["true_p"][max(start - 1, 0)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from gfm_hil.plant_side import run_plant
 from gfm_hil.realtime import no_collector_pauses, own_processor
 from gfm_hil.recording import Part, record_controller, record_plant
 from gfm_hil.scenario import Scenario
+from gfm_hil.stopping import Interrupt
 from gfm_hil.timeline import Outcome, Timeline
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.assembly import warm_up
@@ -36,20 +36,29 @@ def run_side(
     """
     if scenario.link.endpoint is None:
         raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
-    stop: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: stop.append(n))
+    with Interrupt() as interrupt:
+        return _run(side, scenario, scenario.link.endpoint, folder, notice, interrupt)
+
+
+def _run(
+    side: Side,
+    scenario: Scenario,
+    endpoint: str,
+    folder: Path,
+    notice: Callable[[str], None],
+    interrupt: Interrupt,
+) -> Outcome:
     if scenario.mode == "realtime":
         own_processor(side)
     bench = make_bench(scenario)
-    link = open_link(scenario.link.type, side, scenario.link.endpoint)
+    link = open_link(scenario.link.type, side, endpoint)
     folder.mkdir(parents=True, exist_ok=True)
     part = Part.create(folder, side, scenario.ticks)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
     compile_side(bench, part)
 
     def stopped() -> bool:
-        return bool(stop)
+        return interrupt.came
 
     try:
         no_collector_pauses()
@@ -59,7 +68,7 @@ def run_side(
         faults = {"side": side, "faults": reader.faults}
         (folder / f"link_{side}.json").write_text(json.dumps(faults))
     except PeerLost as problem:
-        timeline.end("interrupted" if stop else "safe", str(problem), 0)
+        timeline.end("interrupted" if stopped() else "safe", str(problem), 0)
     finally:
         link.close()
         timeline.close()

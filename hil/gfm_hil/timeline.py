@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from gfm_hil.bench import Bench
 from gfm_hil.events import CONTROLLER_EVENTS, LawChange, Reference, apply_grid_event
+from gfm_hil.links.base import Side
 from gfm_plant import trip_reason
 from gfm_runtime.controller import BAD_U, BAD_Y, REASONS, SAFE
 from gfm_runtime.signals import U_NAMES, Y_NAMES
@@ -38,7 +39,7 @@ class Timeline:
         sides: which events are ours.
     """
 
-    def __init__(self, bench: Bench, log: Path, sides: tuple[str, ...]) -> None:
+    def __init__(self, bench: Bench, log: Path, sides: tuple[Side, ...]) -> None:
         self._bench, self._sides = bench, sides
         self._log = log.open("a", encoding="utf-8")
         scenario = bench.scenario
@@ -122,7 +123,11 @@ def read_log(*paths: Path) -> list[dict[str, Any]]:
     return sorted(lines, key=lambda line: line["tick"])
 
 
-def worst(lines: list[dict[str, Any]]) -> Outcome | None:
-    """The outcome that counts when both sides wrote one: the most severe."""
+def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
+    """The outcome that counts among those the sides wrote and the one seen from outside: the most
+    severe, and of two such the one seen from outside, which knows why."""
     ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
-    return max(ends, key=lambda o: SEVERITY.index(o.status)) if ends else None
+    found = [outside, *ends] if outside else ends
+    if not found:
+        return Outcome("safe", "both sides ended without a word", 0)
+    return max(found, key=lambda o: SEVERITY.index(o.status))

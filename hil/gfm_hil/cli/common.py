@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -84,7 +85,7 @@ def progress_bar(scenario: Scenario, label: str, quiet: bool) -> Iterator[tuple[
             bar.update(task, completed=ticks, sim=sim + (f", {misses} misses" if misses else ""))
 
         def notice(text: str) -> None:
-            bar.console.print(text, style="dim", highlight=False)
+            bar.console.print(escape(text), style="dim", highlight=False, soft_wrap=True)
 
         yield tell, notice
 
@@ -93,9 +94,9 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     """The short table that ends a run."""
     console = Console()
     colour = "green" if summary["status"] == summary["expected"] else "red"
-    reason = f" — {summary['reason']}" if summary["reason"] else ""
+    reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
     console.print(f"[bold {colour}]{summary['status']}[/]{reason}", highlight=False)
-    laws = " → ".join(summary["laws"])
+    laws = escape(" → ".join(summary["laws"]))
     console.print(
         f"{laws} · {summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
         f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {summary['misses']} misses",
@@ -103,10 +104,10 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     )
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
-        console.print(f"round trip [µs]: {text}".replace("[µs]", "\\[µs]"), highlight=False)
+        console.print(escape(f"round trip [µs]: {text}"), highlight=False)
     if summary["events"]:
         console.print(events_table(summary["events"]))
-    console.print(f"run folder: {folder}", highlight=False, soft_wrap=True)
+    console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
 
 
 def events_table(events: list[dict[str, Any]]) -> Table:
@@ -114,11 +115,11 @@ def events_table(events: list[dict[str, Any]]) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     for event in events:
-        table.add_column(f"{event['label']} @ {event['t']:g} s", justify="right")
+        table.add_column(escape(f"{event['label']} @ {event['t']:g} s"), justify="right")
     for name, title in EVENT_COLUMNS[2:]:
         values = [e.get(name) for e in events]
         if any(v is not None for v in values):
-            table.add_row(title.replace("[", "\\["), *[cell(v) for v in values])
+            table.add_row(escape(title), *[cell(v) for v in values])
     return table
 
 

@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gfm_hil.cli.common import (
@@ -20,7 +21,8 @@ from gfm_hil.cli.common import (
 from gfm_hil.errors import UserError
 from gfm_hil.figures import draw_comparison
 from gfm_hil.report import EVENT_COLUMNS, cell
-from gfm_hil.runner import Run, run_scenario
+from gfm_hil.run_folder import Run, check_free
+from gfm_hil.runner import run_scenario
 from gfm_hil.scenario import find_scenario
 
 
@@ -43,14 +45,18 @@ def call(options: argparse.Namespace) -> int:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
     scenarios = {name: resolve(options, law=name) for name in dict.fromkeys(names)}
     folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
+    check_free(folder, base.ticks * len(scenarios))
     runs: dict[str, Run] = {}
     for name, scenario in scenarios.items():
         with progress_bar(scenario, name, options.quiet) as (progress, notice):
             place = folder / name.removesuffix(".toml").replace("/", "_")
             runs[name] = run_scenario(scenario, place, progress, notice)
-    events = next(iter(runs.values())).summary["events"]
-    signals = {name: run.signals for name, run in runs.items()}
-    draw_comparison(folder / "comparison.png", base, signals, events)
+        if runs[name].summary["status"] == "interrupted":
+            break
+    events = max((run.summary["events"] for run in runs.values()), key=len)
+    signals = {name: run.signals for name, run in runs.items() if "true_p" in run.signals}
+    if signals:
+        draw_comparison(folder / "comparison.png", base, signals, events)
     summaries = {name: run.summary for name, run in runs.items()}
     (folder / "comparison.json").write_text(json.dumps(summaries, indent=2) + "\n", "utf-8")
     if options.json:
@@ -66,13 +72,13 @@ def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     for name in summaries:
-        table.add_column(name, justify="right")
+        table.add_column(escape(name), justify="right")
     table.add_row("status", *[s["status"] for s in summaries.values()])
     for k, event in enumerate(events):
-        table.add_row(f"[bold]{event['label']} @ {event['t']:g} s[/]")
+        table.add_row(f"[bold]{escape(event['label'])} @ {event['t']:g} s[/]")
         for key, title in EVENT_COLUMNS[2:]:
             values = [s["events"][k].get(key) if k < len(s["events"]) else None
                       for s in summaries.values()]  # fmt: skip
             if any(v is not None for v in values):
-                table.add_row("  " + title.replace("[", "\\["), *[cell(v) for v in values])
+                table.add_row("  " + escape(title), *[cell(v) for v in values])
     console.print(table)

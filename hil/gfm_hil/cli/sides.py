@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from typing import Any
 
 from gfm_hil.bench import make_bench
 from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import Side
-from gfm_hil.runner import finish
+from gfm_hil.run_folder import check_free, finish
 from gfm_hil.side import run_side
+from gfm_hil.stopping import end_with_parent
 from gfm_hil.toml_out import scenario_toml
 
 
@@ -37,16 +39,21 @@ def call(options: argparse.Namespace) -> int:
     if scenario.link.type != "zmq":
         raise UserError(f"link.type = {scenario.link.type!r}: a side alone needs a link: zmq")
     folder = new_folder(options.out, side)
+    if options.part:  # of `gfmhil run`, which puts the parts together
+        end_with_parent()
+        run_side(side, scenario, folder)
+        return 0
+    check_free(folder, scenario.ticks)
 
     def notice(text: str) -> None:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
-    outcome = run_side(side, scenario, folder, notice)
-    if options.part:  # a part of `gfmhil run`, which puts the parts together
-        return 0
+    began = time.monotonic()
+    run_side(side, scenario, folder, notice)
+    wall_s = time.monotonic() - began
     (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
-    run = finish(scenario, folder, make_bench(scenario).controller.labels, 0.0)
+    run = finish(scenario, folder, make_bench(scenario).controller.labels, wall_s)
     if not options.quiet:
         print_summary(run.summary, folder)
-    return exit_code({**run.summary, "status": outcome.status})
+    return exit_code(run.summary)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal, Protocol
 
 Side = Literal["controller", "plant"]
+SIDES: tuple[Side, ...] = ("controller", "plant")
 
 
 class Link(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 
 import zmq
 
@@ -27,6 +28,8 @@ class ZmqLink:
     def __init__(self, side: Side, endpoint: str) -> None:
         if not endpoint.startswith(("ipc://", "tcp://")):
             raise UserError(f"link.endpoint = {endpoint!r}: must be ipc://path or tcp://host:port")
+        if side == "controller" and endpoint.startswith("ipc://"):
+            _refuse_if_served(endpoint)
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
         self._socket.set(zmq.SNDHWM, _ROOM)
@@ -40,7 +43,7 @@ class ZmqLink:
             self.close()
             verb = "bound" if side == "controller" else "connected to"
             raise UserError(
-                f"link.endpoint = {endpoint!r}: cannot be {verb}: {problem.strerror}"
+                f"link.endpoint = {endpoint!r}: cannot be {verb}: {zmq.strerror(problem.errno)}"
             ) from None
 
     def send(self, message: bytes) -> bool:
@@ -65,3 +68,14 @@ class ZmqLink:
         """Free the endpoint; the last words get a moment to leave."""
         self._socket.close(linger=_LAST_WORDS)
         self._context.term()
+
+
+def _refuse_if_served(endpoint: str) -> None:
+    """See that nobody listens there: libzmq would take the file over and leave them deaf.
+
+    Raises:
+        UserError: somebody does.
+    """
+    with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
+        probe.connect(endpoint.removeprefix("ipc://"))
+        raise UserError(f"link.endpoint = {endpoint!r}: cannot be bound: occupied by another run")

@@ -1,0 +1,135 @@
+"""Distributions, and the numbers of one run: a function of (campaign seed, run number) alone.
+
+Every parameter takes one uniform number, which its distribution turns into a value by its
+quantile function. The numbers are the raw output of Philox, keyed by the run's own child of the
+campaign's seed sequence, so that they depend neither on other runs nor on NumPy's version.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+_LEAST = 1e-9  # of a normal's probability that must lie within its bounds
+
+
+class Model(BaseModel):
+    """Base of all that a campaign file holds: unknown keys, wrong types and NaN are errors."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class _Drawn(Model):
+    path: str = Field(description="dotted path in the scenario, e.g. plant.factors.L_g")
+    also: list[str] = Field([], description="further paths that get the same value")
+    label: str | None = Field(None, description="of the figure's axis, the path if none")
+
+    def paths(self) -> list[str]:
+        """Every path that the value goes to."""
+        return [self.path, *self.also]
+
+
+class _Between(_Drawn):
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> _Between:
+        if not self.low < self.high:
+            raise ValueError(f"low = {self.low:g}, high = {self.high:g}: low must be below high")
+        return self
+
+    def ends(self) -> list[Any]:
+        """The extreme values."""
+        return [self.low, self.high]
+
+    def _within(self, value: float) -> float:
+        return min(max(value, self.low), self.high)  # rounding must not leave the range
+
+
+class Uniform(_Between):
+    """Every value in [low, high] alike."""
+
+    type: Literal["uniform"]
+
+    def quantile(self, u: float) -> float:
+        """The value below which a share u, 0 <= u < 1, of all draws lies."""
+        return self._within(self.low * (1 - u) + self.high * u)
+
+
+class LogUniform(_Between):
+    """Every decade of [low, high] alike; for factors, inductances and the like."""
+
+    type: Literal["loguniform"]
+
+    @model_validator(mode="after")
+    def _positive(self) -> LogUniform:
+        if self.low <= 0:
+            raise ValueError(f"low = {self.low:g}: must be > 0 for a logarithm")
+        return self
+
+    def quantile(self, u: float) -> float:
+        """As ``Uniform.quantile``."""
+        return self._within(math.exp(math.log(self.low) * (1 - u) + math.log(self.high) * u))
+
+
+class Normal(_Between):
+    """Normal with mean and sigma, cut off at low and high."""
+
+    type: Literal["normal"]
+    mean: float
+    sigma: float = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _reaches(self) -> Normal:
+        a, b = self._shares()
+        if not b - a > _LEAST:
+            raise ValueError(
+                f"low = {self.low:g}, high = {self.high:g}: holds next to nothing of mean = "
+                f"{self.mean:g}, sigma = {self.sigma:g}"
+            )
+        return self
+
+    def _shares(self) -> tuple[float, float]:
+        bell = NormalDist(self.mean, self.sigma)
+        return bell.cdf(self.low), bell.cdf(self.high)
+
+    def quantile(self, u: float) -> float:
+        """As ``Uniform.quantile``."""
+        a, b = self._shares()
+        share = min(max(a * (1 - u) + b * u, 1e-300), 1 - 2**-53)  # 0 and 1 lie at infinity
+        return self._within(NormalDist(self.mean, self.sigma).inv_cdf(share))
+
+
+class Choice(_Drawn):
+    """One of some values, all alike; they may be numbers, words or true and false."""
+
+    type: Literal["choice"]
+    values: list[bool | int | float | str] = Field(min_length=1)
+
+    def ends(self) -> list[Any]:
+        """All values."""
+        return list(self.values)
+
+    def quantile(self, u: float) -> Any:
+        """The value at share u, 0 <= u < 1, in the order of the file."""
+        return self.values[int(u * len(self.values))]
+
+
+Distribution = Annotated[Uniform | LogUniform | Normal | Choice, Field(discriminator="type")]
+
+
+def draw(seed: int, run: int, distributions: Sequence[Distribution]) -> tuple[int, list[Any]]:
+    """The seed of a run's noise, 1 <= seed < 2**63, and one value a distribution."""
+    raw = np.random.Philox(np.random.SeedSequence(seed, spawn_key=(run,))).random_raw(
+        1 + len(distributions)
+    )
+    noise = (int(raw[0]) >> 1) or 1  # 0 would leave the scenario's own seed
+    return noise, [
+        d.quantile((int(r) >> 11) * 2.0**-53) for d, r in zip(distributions, raw[1:], strict=True)
+    ]

@@ -1,0 +1,155 @@
+"""Both sides as processes of their own: started, watched to their end, never left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from gfm_hil.bench import make_bench
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.recording import Part
+from gfm_hil.scenario import Scenario
+from gfm_hil.side import compile_side
+from gfm_hil.stopping import Interrupt
+from gfm_hil.timeline import Outcome
+
+#: told (ticks done, misses so far); may be called a few times a second
+Progress = Callable[[int, int], None]
+
+_LOOK_S = 0.05
+_GRACE_S = 2.0  # how long a side may take to end once it should, beyond link.peer_timeout_s
+
+
+@dataclass
+class Processes:
+    """One run's two processes.
+
+    Args:
+        scenario: checked; its resolved form lies in ``folder``/scenario.toml.
+        folder: where both record.
+        progress, notice: as for ``run_scenario``.
+        interrupt: set when the operator wants it to end.
+    """
+
+    scenario: Scenario
+    folder: Path
+    progress: Progress
+    notice: Callable[[str], None]
+    interrupt: Interrupt
+
+    def run(self) -> tuple[float, Outcome | None]:
+        """Start both, watch them to their end.
+
+        Returns:
+            When the first tick was run (``time.monotonic``), and how it ended for a side that did
+            not live to say so itself.
+
+        Raises:
+            UserError: a side refused to start, as for an endpoint that is occupied.
+        """
+        self._compile_once()
+        if self.interrupt.came:
+            return time.monotonic(), self._interrupted
+        with contextlib.ExitStack() as stack:
+            endpoint = self.scenario.link.endpoint
+            if endpoint is None:  # a Unix socket's path may hold 107 bytes, so not the run folder
+                place = stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-"))
+                endpoint = f"ipc://{place}/link"
+            self.notice("starting controller and plant …")
+            self._sides = {side: self._start(side, endpoint) for side in SIDES}
+            try:
+                began = self._watch()
+            finally:
+                for process in self._sides.values():
+                    if process.poll() is None:
+                        process.kill()
+                        process.wait()
+        return began, self._judge()
+
+    @property
+    def _interrupted(self) -> Outcome:
+        return Outcome("interrupted", "stopped by the operator", 0)
+
+    def _compile_once(self) -> None:
+        """Fill numba's cache here, so that two processes do not compile the same at a time."""
+        self.notice("compiling the kernels (once a machine) …")
+        bench = make_bench(self.scenario)
+        with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
+            for side in SIDES:
+                compile_side(bench, Part.create(Path(place), side, 1))
+
+    def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
+        # -P: a file of the operator's folder must not stand in for a module
+        command = [sys.executable, "-P", "-m", "gfm_hil", side, str(self.folder / "scenario.toml")]
+        command += ["--endpoint", endpoint, "--out", str(self.folder), "--part", "--quiet"]
+        with self._log(side).open("wb") as log:
+            # own session: Ctrl-C reaches the sides through us, once
+            return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+
+    def _log(self, side: Side) -> Path:
+        return self.folder / f"{side}.log"
+
+    def _watch(self) -> float:
+        """Wait until both have ended; a side that outlives its time is told to stop, then killed.
+
+        A side ends by itself when the other one says goodbye or falls silent, but not while it
+        still waits for its handshake.
+        """
+        part, began = None, time.monotonic()
+        stop_at = kill_at = float("inf")
+        ended: list[Side] = []
+        told = False
+        while len(ended) < len(self._sides):
+            time.sleep(_LOOK_S)
+            now = time.monotonic()
+            part = part or Part.open(self.folder, "plant")
+            if part is not None:
+                if int(part.progress[0]) == 0:
+                    began = now
+                self.progress(int(part.progress[0]), int(part.progress[1]))
+            for side, process in self._sides.items():
+                if side not in ended and process.poll() is not None:
+                    ended.append(side)
+                    if self._crash(side) and not self.interrupt.came:
+                        self.notice(self._crash(side))
+                    wait = self.scenario.link.peer_timeout_s + _GRACE_S
+                    stop_at = min(stop_at, now + wait if process.returncode <= 0 else now)
+            if not told and (self.interrupt.came or now >= stop_at):
+                self._send(signal.SIGINT)
+                told, kill_at = True, now + _GRACE_S
+            if now >= kill_at:
+                self._send(signal.SIGKILL)
+        return began
+
+    def _send(self, number: signal.Signals) -> None:
+        for process in self._sides.values():
+            if process.poll() is None:
+                process.send_signal(number)
+
+    def _crash(self, side: Side) -> str:
+        """How a side ended if not by itself."""
+        code = self._sides[side].returncode
+        if code < 0:
+            return f"the {side} was ended by {signal.Signals(-code).name}"
+        return f"the {side} failed, see {self._log(side)}" if code not in (0, 2) else ""
+
+    def _judge(self) -> Outcome | None:
+        said = {side: self._log(side).read_text("utf-8").strip() for side in SIDES}
+        refused = [said[s] for s, process in self._sides.items() if process.returncode == 2]
+        if refused:
+            raise UserError("\n".join(text.removeprefix("gfmhil: ") for text in refused))
+        for side, text in said.items():
+            if not text:
+                self._log(side).unlink()
+        crashes = [self._crash(side) for side in SIDES if self._crash(side)]
+        if crashes and self.interrupt.came:
+            return self._interrupted
+        return Outcome("safe", "; ".join(crashes), 0) if crashes else None

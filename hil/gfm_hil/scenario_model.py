@@ -1,0 +1,143 @@
+"""What a scenario consists of, as pydantic models: all that can be said without trying it out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from gfm_hil.events import (
+    Breaker,
+    Event,
+    LawChange,
+    check_reference,
+)
+from gfm_plant import Plant, load_converter
+from gfm_runtime import law_file
+from gfm_runtime.signals import REF_NAMES, table_hash
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Link(_Model):
+    """How the two sides exchange frames."""
+
+    type: Literal["zmq", "inproc"] = Field(
+        "zmq", description="zmq: two processes; inproc: one compiled loop, lockstep only"
+    )
+    endpoint: str | None = Field(
+        None, description="ipc://… or tcp://host:port; a fresh ipc endpoint if none"
+    )
+    peer_timeout_s: float = Field(
+        0.5, gt=0, le=60, description="silence after which the other side counts as gone"
+    )
+    start_timeout_s: float = Field(60.0, gt=0, description="how long to wait for it at the start")
+
+    @model_validator(mode="after")
+    def _an_endpoint(self) -> Link:
+        if self.endpoint is None:
+            return self
+        found = re.fullmatch(r"ipc://.+|tcp://[^/\s]+:(\d{1,5})", self.endpoint)
+        if found is None or int(found[1] or 0) > 65535:
+            raise ValueError(f"endpoint = {self.endpoint!r}: must be ipc://path or tcp://host:port")
+        return self
+
+
+class References(_Model):
+    """Y_ref at the start, p.u."""
+
+    V_dcref: float = 1.0
+    P_ref: float = 0.5
+    omega_g: float = 1.0
+    Q_ref: float = 0.0
+    V_ref: float = 1.0
+
+    @model_validator(mode="after")
+    def _in_range(self) -> References:
+        for name in REF_NAMES:
+            check_reference(name, getattr(self, name))
+        return self
+
+    def vector(self) -> list[float]:
+        """In the order of the signal table."""
+        return [getattr(self, name) for name in REF_NAMES]
+
+
+class LatePolicy(_Model):
+    """Real time: what to do about frames that are not there at their deadline."""
+
+    hold: int = Field(200, ge=0, description="ticks in a row to hold the last value, then SAFE")
+
+
+class Scenario(_Model):
+    """One experiment."""
+
+    title: str
+    description: str = ""
+    duration: float = Field(gt=0, le=86400, description="s")
+    T_s: float = Field(1e-4, ge=1e-6, le=0.1, description="sampling time, s")
+    mode: Literal["lockstep", "realtime"] = "lockstep"
+    law: str = Field("mimo-gfm", description="catalogue name or path of a law file")
+    seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
+    expect: Literal["completed", "tripped", "safe"] = Field(
+        "completed", description="status with which the run counts as passed (exit code 0)"
+    )
+    compare: list[str] = Field(default_factory=list, description="laws that `compare` puts beside")
+    references: References = References()
+    link: Link = Link()
+    late_policy: LatePolicy = LatePolicy()
+    plant: Plant = Plant()
+    events: list[Event] = Field(default_factory=list)
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks of the run."""
+        return round(self.duration / self.T_s)
+
+    def laws(self) -> list[str]:
+        """Names of every law that the run uses, the first one first, each once."""
+        changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
+        return list(dict.fromkeys([self.law, *changes]))
+
+    def sorted_events(self) -> list[Event]:
+        """Events in order of their tick; those of one tick in the order of the file."""
+        return sorted(self.events, key=lambda e: e.at(self.T_s))
+
+    def digest(self) -> str:
+        """Hash over what both sides must agree on: scenario, signal table, and what is in the
+        law and converter files, wherever each machine keeps them."""
+        about = {"link", "title", "description", "expect", "compare"}
+        content = self.model_dump(exclude={*about, "law", "events"})
+        content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
+        names = self.laws()
+        events = [
+            {**e.model_dump(), **({"law": names.index(e.law)} if isinstance(e, LawChange) else {})}
+            for e in self.sorted_events()
+        ]
+        laws = [law_file(name).model_dump() for name in names]
+        text = json.dumps([content, events, laws, table_hash()], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Scenario:
+        problems = []
+        if self.ticks < 1:
+            problems.append(f"duration = {self.duration:g} s: not one tick of T_s = {self.T_s:g} s")
+        for k, event in enumerate(self.events):
+            if event.at(self.T_s) >= self.ticks:
+                problems.append(
+                    f"events.{k}: at {event.at(self.T_s) * self.T_s:g} s, but the run ends at "
+                    f"{self.duration:g} s"
+                )
+            if isinstance(event, Breaker) and self.plant.grid.load_R is None:
+                problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
+        if self.mode == "realtime" and self.link.type == "inproc":
+            problems.append("link.type = 'inproc': runs in lockstep only; use zmq for real time")
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self

@@ -1,0 +1,47 @@
+"""Being stopped: Ctrl-C and its kin as a flag, and ending together with the process above."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import signal
+import sys
+from typing import Any
+
+_SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
+
+
+class Interrupt:
+    """Context in which Ctrl-C, SIGTERM and a closed terminal set ``came`` and nothing else.
+
+    A second signal raises KeyboardInterrupt: whoever insists need not wait for an orderly end.
+    """
+
+    def __init__(self) -> None:
+        self.came = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Interrupt:
+        with contextlib.suppress(ValueError):  # not in the main thread: nothing to catch
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                before = signal.getsignal(number)
+                if number == signal.SIGHUP and before == signal.SIG_IGN:
+                    continue  # nohup means it
+                signal.signal(number, self._note)
+                self._before[number] = before
+        return self
+
+    def _note(self, number: int, frame: Any) -> None:
+        if self.came:
+            raise KeyboardInterrupt
+        self.came = True
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+
+
+def end_with_parent() -> None:
+    """Have Linux send us SIGTERM when the parent is gone, even if it was killed."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
