@@ -160,7 +160,7 @@ def control(ctl, laws, states, est, y, u):
             )
             c.active, c.changes = k, c.changes + 1
     step(laws[c.active], states[c.active], c.ref, c.y, c.u)
-    for i in range(NU):
+    for i in (1, 0, 2):  # omega_u first: column 3 takes it to the others
         if not math.isfinite(c.u[i]):
             _go_safe(c, BAD_U, i)
             return

@@ -6,12 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from hypothesis import settings
+from numba import njit
 from numpy.typing import NDArray
 from scipy import signal
 
 from gfm_runtime import DiscreteLaw, Law, law_names, load_law, pack_law, state_dtype, step
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.signals import NU, NY, REF_NAMES
+
+repeatable = settings(derandomize=True)  # the same examples in every run
 
 Vector = NDArray[np.float64]
 
@@ -83,6 +87,13 @@ def mapped(law: Law, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
     return r, y
 
 
+@njit
+def drive(law, state, ref, y, u, ticks):
+    """That many ticks with the same inputs; ``u`` is that of the last one."""
+    for _ in range(ticks):
+        step(law[0], state[0], ref, y, u)
+
+
 @dataclass
 class Running:
     """A law in the kernel."""
@@ -97,6 +108,12 @@ class Running:
     def step(self, ref: Vector, y: Vector) -> Vector:
         u = np.zeros(NU)
         step(self.law[0], self.state[0], ref, y, u)
+        return u
+
+    def settle(self, ticks: int, ref: Vector = REF, y: Vector = REF) -> Vector:
+        """u after that many ticks with the same inputs."""
+        u = np.zeros(NU)
+        drive(self.law, self.state, ref, y, u, ticks)
         return u
 
     def run(self, refs: Vector, ys: Vector) -> Vector:

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from gfm_runtime.elements import IF, INTEGRATOR, PD, PI, ZERO, D, Element, I, O, P, over, union
 from gfm_runtime.errors import LawError
 
+from .support import repeatable
+
 POINTS = (0.3 + 0j, 2j, 100j * math.pi, -0.4 + 7j, 1e4 + 1e3j)
 
 FORMULAE: list[tuple[Element, Callable[[complex], complex]]] = [
@@ -118,6 +120,7 @@ any_element = st.one_of(
 )
 
 
+@repeatable
 @given(any_element, any_element, any_element)
 def test_sums_and_products(a: Element, b: Element, c: Element) -> None:
     for s in (0.7 + 2j, 9j):
@@ -132,6 +135,7 @@ def test_sums_and_products(a: Element, b: Element, c: Element) -> None:
     assert (a + b).den == (b + a).den
 
 
+@repeatable
 @given(any_element, any_element)
 def test_orders_never_exceed_their_parts(a: Element, b: Element) -> None:
     for c in (a * b, a + b):
@@ -141,6 +145,7 @@ def test_orders_never_exceed_their_parts(a: Element, b: Element) -> None:
     assert (a * ZERO).is_zero
 
 
+@repeatable
 @given(gains, times, gains, times)
 def test_lead_and_lag_of_one_time_cancel(k: float, T: float, k_2: float, T_2: float) -> None:
     assert (PD(k, T) * IF(k_2, T)).den == ()
@@ -149,6 +154,7 @@ def test_lead_and_lag_of_one_time_cancel(k: float, T: float, k_2: float, T_2: fl
     assert both.den == () and both(3j) == pytest.approx(PD(k * k_2, T_2)(3j), rel=1e-9)
 
 
+@repeatable
 @given(any_element, any_element)
 def test_negation(a: Element, b: Element) -> None:
     assume(not (a + -b).is_zero)

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from gfm_runtime.errors import LawError
 from gfm_runtime.expressions import evaluate
 
+from .support import repeatable
+
 NUMBERS = {"H": 8.36, "D_p": 0.01, "k": -2.5}
 
 texts = st.recursive(
@@ -28,6 +30,7 @@ texts = st.recursive(
 )
 
 
+@repeatable
 @given(texts)
 def test_as_python_does_it(text: str) -> None:
     """Python on floats: integers of a law file are floats as well."""
@@ -106,6 +109,7 @@ def test_anything_else_is_refused(text: str | float, why: str) -> None:
     assert why in caught.value.why
 
 
+@repeatable
 @given(st.text(max_size=20))
 def test_any_text_gives_a_number_or_a_law_error(text: str) -> None:
     with contextlib.suppress(LawError):

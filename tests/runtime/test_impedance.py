@@ -15,7 +15,7 @@ OMEGA_B = 100 * math.pi
 
 
 @njit
-def feed(est, p, omega_u, V):  # type: ignore[no-untyped-def]
+def feed(est, p, omega_u, V):
     """All samples; returns the estimate after each."""
     out = np.empty(len(p))
     for k in range(len(p)):

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numba import njit
-from numba.core.runtime import _nrt_python, rtsys
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
+from numba.core.runtime.nrt import rtsys
 from numpy.typing import NDArray
 
 from gfm_runtime import Law, LawError, Limits, discretise, get_law, law_dtype, state_dtype, step
@@ -16,21 +17,14 @@ from gfm_runtime.kernel import N_MAX
 from gfm_runtime.law import cell_name
 from gfm_runtime.signals import NU, NY, U_NAMES
 
-from .support import LAWS, REF, Running, Vector, wander
+from .support import LAWS, REF, Running, Vector, drive, wander
 
 T_S = 1e-4
 f32 = np.float32
 
 
 @njit
-def drive(law, state, ref, y, u, ticks):  # type: ignore[no-untyped-def]
-    """That many ticks with the same inputs."""
-    for _ in range(ticks):
-        step(law[0], state[0], ref, y, u)
-
-
-@njit
-def ticks_at(law, state, ref, y, u, i, limit, most):  # type: ignore[no-untyped-def]
+def ticks_at(law, state, ref, y, u, i, limit, most):
     """Ticks until u_i is no longer at its limit, ``most`` if it still is."""
     for k in range(most):
         step(law[0], state[0], ref, y, u)

@@ -23,6 +23,8 @@ from gfm_runtime import (
 from gfm_runtime.elements import IF, PD, PI, D, Element, I, O, P
 from gfm_runtime.kernel import pack_law
 
+from .support import repeatable
+
 CUSTOM = """
 name = "custom-1"
 title = "all that a law file can say"
@@ -343,6 +345,7 @@ def toml(value: Any) -> str:
     return repr(value) if isinstance(value, float) else json.dumps(value)
 
 
+@repeatable
 @given(law_files, st.sampled_from([1e-4, 1e-3, 1.0]))
 def test_any_law_file_builds_or_raises_law_error(content: dict[str, Any], T_s: float) -> None:
     text = "\n".join(f"{key} = {toml(value)}" for key, value in content.items())
@@ -356,6 +359,7 @@ def test_any_law_file_builds_or_raises_law_error(content: dict[str, Any], T_s: f
         assert packed["n"][0] <= 12
 
 
+@repeatable
 @given(st.text(max_size=60))
 def test_any_text_is_a_law_or_a_law_error(text: str) -> None:
     with pytest.raises(LawError):

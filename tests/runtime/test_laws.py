@@ -226,16 +226,10 @@ def answer(name: str, column: int, on_reference: bool, ticks: int = 4000) -> np.
     lag = {"T": 0.2} if name == "droop-5" else {"k_22": 5.0}
     loop = Running.of(discretise(get_law(name, D_p=0.01, **lag), 1e-4))
     ref, y = REF.copy(), REF.copy()
-    settle_at_rest(loop, ref, y)
+    loop.settle(60_000)  # the washout of droop-5 forgets the start
     (ref if on_reference else y)[column] += 1.0
     loop.unlimited()
     return np.array([loop.step(ref, y)[1] for _ in range(ticks)]) - 1.0
-
-
-def settle_at_rest(loop: Running, ref: np.ndarray, y: np.ndarray) -> None:
-    """Long enough that the washout of droop-5 has forgotten the start."""
-    for _ in range(60_000):
-        loop.step(ref, y)
 
 
 def test_droop_5_is_vsg_2_from_p_and_not_from_p_ref() -> None:

@@ -1,6 +1,7 @@
 """The signal table."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -44,7 +45,7 @@ def test_each_row_makes_sense(signal: signals.Signal) -> None:
 
 @pytest.mark.parametrize("change", [{"scale": 1e-3}, {"high": 9.0}, {"unit": "V"}, {"name": "x"}])
 def test_hash_changes_with_the_table(
-    change: dict[str, float], monkeypatch: pytest.MonkeyPatch
+    change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = table_hash()
     assert len(before) == 8 and before == table_hash()
