@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,6 @@ from gfm_runtime.controller import (
     BAD_U,
     BAD_Y,
     INIT,
-    MAX_STAGES,
     OK,
     READY,
     REASONS,
@@ -335,93 +332,3 @@ def test_warm_up_changes_nothing(real: type) -> None:
     before = [a.tobytes() for a in (c.ctl, c.laws, c.states, c.est)]
     warm_up(c)
     assert [a.tobytes() for a in (c.ctl, c.laws, c.states, c.est)] == before
-
-
-# --- gain scheduling ---
-
-
-def scheduled(dwell_s: float = 0.0, hysteresis: float = 0.1) -> Controller:
-    """Three stages up to 0.1, up to 0.3 and beyond; starts in the first."""
-    s = load_law("mimo-gfm-scheduled")
-    assert s.schedule is not None
-    stage = s.schedule.stages[0]
-    schedule = s.schedule.model_copy(
-        update={
-            "stages": [stage.model_copy(update={"X": X}) for X in (0.1, 0.3, 1.0)],
-            "hysteresis": hysteresis,
-            "dwell_s": dwell_s,
-            "X_0": 0.05,
-        }
-    )
-    first, second = s.laws[:2]
-    stages = LawSet("three", (first, second, replace(second, name="third")), schedule)
-    c = Controller([stages, load_law("vsg-2")], T_S, list(REF))
-    c.start(np.zeros(3), np.array([0.0, 1.0, 1.0]))
-    return c
-
-
-def at(c: Controller, X: float, ticks: int = 2) -> str:
-    """Label of the stage once the estimate says X; it is held, since nothing swings."""
-    c.est["X"] = X
-    run(c, ticks, np.zeros(3))
-    return c.active
-
-
-def test_stages_follow_the_estimate_with_hysteresis() -> None:
-    c = scheduled()
-    walk = [
-        (0.05, 0), (0.105, 0), (0.109, 0), (0.111, 1), (0.1, 1), (0.091, 1), (0.089, 0),
-        (0.5, 2), (0.28, 2), (0.26, 1), (0.01, 0), (50.0, 2), (0.2, 1),
-    ]  # fmt: skip
-    for X, stage in walk:
-        assert at(c, X) == f"three[{stage}]", X
-        assert c.ctl["bump"][0] <= 1e-12
-
-
-def test_a_stage_stays_for_its_dwell() -> None:
-    c, u = scheduled(dwell_s=20 * T_S), np.zeros(3)
-    c.est["X"] = 0.5
-    stages = []
-    for k in range(100):
-        if k == 30:
-            c.est["X"] = 0.05
-        c.step(REF, u)
-        stages.append(c.active)
-    assert stages[:20] == ["three[0]"] * 20
-    first = stages.index("three[2]")
-    assert first == 20
-    assert stages[first : first + 21] == ["three[2]"] * 21
-    assert stages[41:] == ["three[0]"] * 59
-
-
-def test_the_first_stage_is_that_of_x_0() -> None:
-    s = load_law("mimo-gfm-scheduled")
-    assert s.schedule is not None
-    for X_0, stage in ((s.schedule.stages[0].X, 0), (s.schedule.stages[0].X * 1.01, 1)):
-        schedule = s.schedule.model_copy(update={"X_0": X_0})
-        c = Controller([LawSet(s.name, s.laws, schedule)], T_S, list(REF))
-        assert c.active == f"{s.name}[{stage}]"
-        assert c.est["X"][0] == X_0
-
-
-def test_leaving_a_scheduled_law_ends_its_schedule() -> None:
-    c = scheduled()
-    c.select("vsg-2")
-    assert at(c, 0.5, 10) == "vsg-2"
-    c.select("three")
-    run(c, 2, np.zeros(3))
-    assert c.active == "three[0]" and c.est["X"][0] == 0.05, "the estimate starts again"
-
-
-def test_the_estimator_is_restarted_in_place() -> None:
-    """A compiled loop may hold the record."""
-    c = scheduled()
-    held = c.est
-    c.select("three")
-    assert c.est is held
-
-
-def test_too_many_stages() -> None:
-    s = load_law("mimo-gfm-scheduled")
-    with pytest.raises(LawError, match=f"9 stages; the controller holds {MAX_STAGES}"):
-        Controller([LawSet("many", (s.laws[0],) * 9, s.schedule)], T_S, list(REF))

@@ -106,7 +106,7 @@ def test_trend_survives_the_change_itself() -> None:
 @pytest.mark.parametrize("T_off", [0.05, 0.2])
 def test_offset_of_stateless_rows_decays(T_off: float) -> None:
     """matching-2 has no states: what it cannot absorb is exp(-t/T_off)."""
-    law = replace(get_law("matching-2"), limits=Limits(T_off=T_off))
+    law = replace(get_law("matching-2", k_dc=-1.0, k_31=-2.0), limits=Limits(T_off=T_off))
     before = running("vsg-2", seed=1)
     before.state["x"][0, :3] += [0.2, 1e-3, 0.02]
     ref, y = REF.copy(), REF + np.array([0.01, 0.02, 0.0, 0.01, 0.01])
