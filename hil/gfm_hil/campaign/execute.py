@@ -112,7 +112,9 @@ def cluster(address: str, campaign: Campaign) -> Iterator[tuple[Executor, int]]:
     try:
         from distributed import Client
     except ImportError:
-        raise UserError("--dask: needs the package distributed: pip install 'gfmhil[dask]'") from None
+        raise UserError(
+            "--dask: needs the package distributed: pip install 'gfmhil[dask]'"
+        ) from None
     try:
         client: Any = Client(address, timeout="10s")
     except (OSError, ValueError) as problem:
@@ -121,4 +123,10 @@ def cluster(address: str, campaign: Campaign) -> Iterator[tuple[Executor, int]]:
         threads = sum(client.nthreads().values())
         if not threads:
             raise UserError(f"--dask {address}: the cluster has no workers")
+        mine = campaign.digest()
+        for worker, theirs in client.run(campaign.digest, on_error="return").items():
+            if theirs != mine:
+                raise UserError(
+                    f"--dask {address}: {worker} has another gfmhil, law or converter: {theirs!r}"
+                )
         yield client.get_executor(pure=False), threads

@@ -41,7 +41,7 @@ class CampaignFile(Model):
     runs: int = Field(gt=0, le=10**7, description="number of draws")
     seed: int = Field(0, ge=0, lt=2**63)
     ripple_max: float = Field(
-        0.05, gt=0, description="p.u.; peak to peak of p over the last 0.2 s of a stable run"
+        0.2, gt=0, description="p.u.; peak to peak of p over the last 0.2 s of a stable run"
     )
     figure: Axes = Axes()
     set: dict[str, Any] = Field({}, description="dotted path = value, the same in every run")
@@ -58,7 +58,6 @@ class Campaign:
         file: what it says.
         base: the scenario with ``set`` put in, as plain data.
         laws: name in the file to what ``load_law`` takes.
-        digest: over all that decides a record: draws, scenario, contents of laws, version.
     """
 
     name: str
@@ -66,7 +65,16 @@ class Campaign:
     file: CampaignFile
     base: dict[str, Any]
     laws: dict[str, str]
-    digest: str
+
+    def digest(self) -> str:
+        """Hash over all that decides a record: draws, scenario, contents of laws, version."""
+        decides = self.file.model_dump(include={"seed", "set", "draw", "laws"})
+        scenarios = [
+            Scenario.model_validate({**self.base, "law": law}).digest()
+            for law in self.laws.values()
+        ]
+        text = json.dumps([decides, scenarios, version("gfmhil")], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def content(self, run: int, law: str) -> tuple[dict[str, Any], dict[str, Any]]:
         """Scenario of a run as plain data, and the values drawn for it by their paths."""
@@ -119,14 +127,9 @@ def load_campaign(name: str) -> Campaign:
     for target, value in file.set.items():
         put(content, target, value)
     laws = {law: _beside(path, law) for law in file.laws}
-    scenarios = [
+    for label, law in laws.items():
         check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
-        for label, law in laws.items()
-    ]
-    decides = file.model_dump(include={"seed", "set", "draw"})
-    parts = [decides, file.laws, [s.digest() for s in scenarios], version("gfmhil")]
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-    campaign = Campaign(path.stem, text, file, content, laws, digest)
+    campaign = Campaign(path.stem, text, file, content, laws)
     _check_ends(path, campaign)
     _check_runs(path, campaign)
     return campaign

@@ -38,7 +38,7 @@ class Store:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "campaign.toml").write_text(campaign.text, encoding="utf-8")
-            self._write([{"digest": campaign.digest, "version": version("gfmhil")}])
+            self._write([{"digest": campaign.digest(), "version": version("gfmhil")}])
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}; choose another --out") from None
 
@@ -56,7 +56,7 @@ class Store:
                 f"{self._path}: made by gfmhil {made_by}, this is {version('gfmhil')}; "
                 "choose another --out"
             )
-        if digest != campaign.digest:
+        if digest != campaign.digest():
             raise UserError(
                 f"{self._path}: belongs to another campaign: the file, its scenario or a law has "
                 f"changed since (see campaign.toml there); choose another --out"

@@ -1,0 +1,142 @@
+"""gfmhil campaign: one scenario many times with drawn parameters, on all cores or a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from gfm_hil.campaign.alone import run_alone
+from gfm_hil.campaign.axes import find_axes
+from gfm_hil.campaign.execute import WorkerLost, cluster, execute, processes
+from gfm_hil.campaign.figure import draw_map
+from gfm_hil.campaign.result import VERDICTS, summary, verdict
+from gfm_hil.campaign.spec import Campaign, load_campaign
+from gfm_hil.campaign.store import Store
+from gfm_hil.campaign.tables import print_campaign, print_record
+from gfm_hil.campaign.worker import Record, compile_once
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder
+from gfm_hil.errors import UserError
+from gfm_hil.stopping import Interrupt
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser("campaign", help="run a scenario many times with drawn values")
+    command.add_argument("file", help="campaign file, or the name of a shipped one")
+    command.add_argument("--out", help="folder; runs/<campaign>-<time> by default")
+    command.add_argument("--resume", action="store_true", help="run what --out has not got yet")
+    command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
+    command.add_argument("--dask", metavar="ADDRESS", help="run on a cluster, e.g. tcp://host:8786")
+    command.add_argument("--x", metavar="PATH", help="drawn path of the figure, or a sum a+b")
+    command.add_argument("--y", metavar="PATH", help="the same; the first two drawn by default")
+    command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
+    command.add_argument("--json", action="store_true", help="print campaign.json, nothing else")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry the command out; 0 if every run ran, whatever became of it."""
+    if options.workers is not None and not 1 <= options.workers <= 1024:
+        raise UserError(f"--workers {options.workers}: must lie in [1, 1024]")
+    if options.workers is not None and options.dask:
+        raise UserError("--workers, --dask: the cluster knows its workers; give one of them")
+    if options.resume and (not options.out or options.only is not None):
+        raise UserError("--resume: goes with --out, the folder to go on with, and without --only")
+    campaign = load_campaign(options.file)
+    axes = find_axes(campaign, options.x, options.y)
+    if options.only is not None:
+        return _only(options, campaign)
+    store_at = new_folder(options.out, campaign.name)
+    with contextlib.ExitStack() as stack:
+        executor, workers = None, options.workers or len(os.sched_getaffinity(0))
+        if options.dask:  # before anything is written
+            executor, workers = stack.enter_context(cluster(options.dask, campaign))
+        store = Store(store_at, campaign, options.resume)
+        jobs = store.missing(campaign)
+        began, lost = time.monotonic(), None
+        with Interrupt() as interrupt, _bar(campaign, store, options.quiet) as tell:
+            if jobs and executor is None:
+                compile_once(campaign)
+                executor = stack.enter_context(processes(workers))
+
+            def keep(records: list[Record]) -> None:
+                store.append(records)
+                tell(records)
+
+            if jobs and executor is not None:
+                try:
+                    execute(campaign, jobs, executor, workers, keep, lambda: interrupt.came)
+                except WorkerLost as problem:
+                    lost = problem
+    records = store.sorted(campaign)
+    result = summary(campaign, records)
+    result["workers"] = options.dask or workers
+    result["wall_s"] = time.monotonic() - began
+    if records:
+        draw_map(store_at / "map.png", campaign, records, *axes)
+    (store_at / "campaign.json").write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+    if options.json:
+        print(json.dumps(result, indent=2))
+    else:
+        print_campaign(result, axes, store_at)
+    if result["missing"]:
+        again = f"go on with: gfmhil campaign {options.file} --out {store_at} --resume"
+        why = f"{lost}; " if lost else "interrupted; "
+        print(f"gfmhil: {why}{result['missing']} runs are missing; {again}", file=sys.stderr)
+        return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
+    return 0
+
+
+def _only(options: argparse.Namespace, campaign: Campaign) -> int:
+    """One run of every law, in a worker: there its arithmetic is that of the campaign."""
+    if not 0 <= options.only < campaign.file.runs:
+        raise UserError(f"--only {options.only}: must lie in [0, {campaign.file.runs - 1}]")
+    folder = new_folder(options.out, f"{campaign.name}-{options.only}")
+    records = []
+    with processes(1) as pool:
+        for law in campaign.file.laws:
+            place = folder / law.removesuffix(".toml").replace("/", "_")
+            records.append(pool.submit(run_alone, campaign, options.only, law, place).result())
+            if not options.json:
+                print_record(records[-1], place)
+    if options.json:
+        print(json.dumps(records, indent=2))
+    return 0
+
+
+@contextlib.contextmanager
+def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
+    """A bar with what became of the runs, and the time left; yields what tells it of records."""
+    counts = dict.fromkeys(VERDICTS, 0)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[found]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True, quiet=quiet),
+        transient=True,
+        refresh_per_second=4,
+    ) as bar:
+        total = campaign.file.runs * len(campaign.file.laws)
+        task = bar.add_task(campaign.name, total=total, found="starting …")
+
+        def tell(records: list[Record]) -> None:
+            for record in records:
+                counts[verdict(record, campaign.file.ripple_max)] += 1
+            found = ", ".join(f"{n} {v.replace('-', ' ')}" for v, n in counts.items() if n)
+            bar.update(task, advance=len(records), found=found)
+
+        if store.records:
+            tell(store.sorted(campaign))
+        yield tell
