@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from gfm_hil.cli import compare, design, laws, run, scenarios, sides
+from gfm_hil.cli import campaign, compare, design, laws, run, scenarios, sides
 from gfm_hil.errors import UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
@@ -25,7 +25,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"gfmhil {version('gfmhil')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (run, compare, laws, design, scenarios, sides):
+    for module in (run, compare, campaign, laws, design, scenarios, sides):
         module.add(commands)
     return top
 
