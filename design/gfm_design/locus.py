@@ -45,8 +45,7 @@ class Locus:
         z = np.exp(1j * omega * self.T_s)
         eye = np.eye(len(self.A))
         states = np.linalg.solve(z[:, None, None] * eye - self.A, self.B.astype(complex))
-        H: Response = self.C @ states + 0.5 * np.eye(len(self.channels))
-        return H
+        return np.asarray(self.C @ states + 0.5 * np.eye(len(self.channels)), complex)
 
     def sampled(self) -> tuple[Matrix, Response]:
         """(omega, H(omega)) from 0 to the Nyquist frequency, as fine as the locus needs."""

@@ -1,0 +1,78 @@
+"""Two figures of margins: the stable region over the line, and sigma over the added delay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from gfm_design.case import Case
+from gfm_design.region import Region
+from gfm_design.sampled import outermost
+from gfm_hil.figures import COLOURS
+
+_GREY = "#888888"
+_SPAN = 100.0  # 1/s; colours of sigma end there
+_DELAYS = 300
+
+
+def draw_region(path: Path, case: Case, label: str, region: Region) -> None:
+    """sigma in colour, its zero as a line, the printed and the scenario's line as points."""
+    figure = Figure(figsize=(6.6, 5.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.set_facecolor("#dddddd")
+    # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
+    shown = np.arcsinh(region.sigma) / np.arcsinh(_SPAN)
+    mesh = axes.pcolormesh(
+        region.L_g, region.R_g, shown, cmap="RdBu_r", vmin=-1, vmax=1, shading="nearest"
+    )
+    finite = np.nan_to_num(shown, nan=1.0)
+    if finite.min() < 0.0 < finite.max():
+        axes.contour(region.L_g, region.R_g, finite, levels=[0.0], colors="k", linewidths=1.2)
+    axes.plot(1.0, 1.0, "o", color="k", ms=6, mfc="none")
+    axes.plot(case.factor("L_g"), max(case.factor("R_g"), region.R_g[0]), "k*", ms=9)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("L_g over its printed value")
+    axes.set_ylabel("R_g over its printed value")
+    axes.set_title(f"{label}: stable where σ < 0", loc="left", fontsize=10)
+    ticks = np.array([-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0])
+    bar = figure.colorbar(mesh, ax=axes, ticks=list(np.arcsinh(ticks) / np.arcsinh(_SPAN)))
+    bar.ax.set_yticklabels([f"{t:g}" for t in ticks])
+    bar.set_label("largest σ [1/s]")
+    marks = [
+        Line2D([], [], color="k", marker="o", mfc="none", ls="", label="printed"),
+        Line2D([], [], color="k", marker="*", ms=9, ls="", label="scenario"),
+    ]
+    if np.isnan(region.sigma).any():
+        marks.append(Line2D([], [], color="#dddddd", marker="s", ls="", label="no operating point"))
+    axes.legend(handles=marks, fontsize=8, loc="upper left")
+    figure.savefig(path, dpi=110)
+
+
+def draw_delay(path: Path, case: Case, label: str, margin: float) -> None:
+    """The largest sigma over the added delay of all of u; ``margin`` in s, inf if none found."""
+    loop = case.loop()
+    end = 1.5 * margin if np.isfinite(margin) else 20 * loop.T_s
+    delays = np.linspace(0.0, end, _DELAYS)
+    radii = [abs(outermost(loop.closed(loop.with_delay(float(d))))) for d in delays]
+    figure = Figure(figsize=(6.6, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.plot(1e6 * delays, np.log(radii) / loop.T_s, color=COLOURS[0], lw=1.4)
+    axes.axhline(0.0, color=_GREY, lw=0.8)
+    if np.isfinite(margin):
+        axes.axvline(1e6 * margin, color=COLOURS[1], lw=1.0, ls=(0, (4, 3)))
+        axes.annotate(
+            f"{1e6 * margin:.4g} µs", (1e6 * margin, 0.0), (-4, 6), textcoords="offset points",
+            ha="right", color=COLOURS[1], fontsize=9,
+        )  # fmt: skip
+    axes.set_xlabel(f"delay on top of the loop's {1e6 * loop.delay:g} µs [µs]")
+    axes.set_ylabel("largest σ [1/s]")
+    axes.set_title(f"{label}: the loop over its delay", loc="left", fontsize=10)
+    axes.grid(True, color="#e4e4e4", lw=0.6)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,179 @@
+"""Margins as plain data and as tables; what has no limit is null, and "—" in a table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gfm_design.disk import DiskMargin
+from gfm_design.linear import Mode
+from gfm_design.margins import ChannelMargins, Margins
+from gfm_design.region import Region
+from gfm_design.tolerance import End, GridStrength, Range
+from gfm_hil.loop_delay import LoopDelay
+
+
+def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, Any]:
+    """All margins; ``set_s`` is the loop delay that they are on top of, s."""
+    loop = m.loop
+    out: dict[str, Any] = {
+        "mode": mode_as_json(loop.worst),
+        "loop_delay_us": round(1e6 * set_s, 6),
+        "delay_us": _number(1e6 * loop.delay.seconds),
+        "delay_hz": _number(loop.delay.frequency_hz),
+        "delay_looked_at_us": 1e6 * loop.longest,
+        "u": {c.name: _channel(c) for c in loop.u},
+        "y": {c.name: _channel(c) for c in loop.y},
+        "disk": {"u": _disk(loop.disk_u), "y": _disk(loop.disk_y)},
+        "elements": {name: _range(r) if r else None for name, r in m.elements.items()},
+        "grid": _grid(m.grid),
+    }
+    if measured is not None:
+        margin = 1e6 * loop.delay.seconds
+        out["run"] = {
+            **asdict(measured),
+            "allowed_us": _number(measured.set_us + margin),
+            "fits": measured.fits(margin),
+            "verdict": measured.words(margin),
+        }
+    return out
+
+
+def mode_as_json(mode: Mode) -> dict[str, Any]:
+    """One mode."""
+    return {"sigma": mode.sigma, "frequency_hz": mode.frequency_hz, "ratio": mode.ratio}
+
+
+def region_as_json(region: Region) -> dict[str, Any]:
+    """The map: sigma [1/s] by R_g, then L_g; null without an operating point."""
+    rows = [[_number(float(v)) for v in row] for row in region.sigma]
+    return {"L_g": list(region.L_g), "R_g": list(region.R_g), "sigma": rows}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _channel(c: ChannelMargins) -> dict[str, Any]:
+    out = {name: _number(value) for name, value in asdict(c.gain_phase).items()}
+    out |= {"delay_us": _number(1e6 * c.delay.seconds), "delay_hz": _number(c.delay.frequency_hz)}
+    return {**out, "confirmed": c.confirmed}
+
+
+def _disk(d: DiskMargin) -> dict[str, Any]:
+    return {
+        "alpha": d.alpha,
+        "frequency_hz": d.frequency_hz,
+        "gain": [_number(v) for v in d.gain],
+        "phase_deg": d.phase_deg,
+        "alpha_unstructured": d.full,
+    }
+
+
+def _end(end: End) -> dict[str, Any]:
+    lost = mode_as_json(end.lost) if end.lost else ("no operating point" if end.bounded else None)
+    return {"percent": 100 * (end.factor - 1), "factor": end.factor, "lost": lost}
+
+
+def _range(r: Range) -> dict[str, Any]:
+    return {"low": _end(r.low), "high": _end(r.high)}
+
+
+def _grid(g: GridStrength) -> dict[str, Any]:
+    return {
+        "scr": g.now,
+        "x_over_r": _number(g.x_over_r),
+        "strongest_scr": g.strongest,
+        "strongest_is_limit": g.range.low.bounded,
+        "weakest_scr": g.weakest,
+        "weakest_is_limit": g.range.high.bounded,
+        **_range(g.range),
+    }
+
+
+def print_margins(
+    console: Console, law: str, scenario: str, m: Margins, set_s: float, run: LoopDelay | None
+) -> None:
+    """Everything on a terminal."""
+    loop = m.loop
+    console.print(
+        f"[bold]{law}[/] · {scenario}\n"
+        f"least damped: sigma = {loop.worst.sigma:.4g} 1/s at {loop.worst.frequency_hz:.4g} Hz"
+    )
+    more = (
+        f"more than {1e6 * loop.longest:g} µs"
+        if math.isinf(loop.delay.seconds)
+        else f"{1e6 * loop.delay.seconds:.4g} µs, then {loop.delay.frequency_hz:.4g} Hz is lost"
+    )
+    console.print(f"[bold]delay margin[/] on top of {1e6 * set_s:g} µs: {more}\n")
+    console.print(_loops_table(loop.u, loop.y))
+    for name, disk in (("u", loop.disk_u), ("y", loop.disk_y)):
+        low, high = disk.gain
+        console.print(
+            f"disk margin at {name}, all at once: α ≥ {disk.alpha:.4g} at "
+            f"{disk.frequency_hz:.4g} Hz (gains {low:.3g} … {high:.3g}, ±{disk.phase_deg:.3g}°; "
+            f"unstructured {disk.full:.3g})"
+        )
+    console.print(_elements_table(m))
+    g = m.grid
+    strongest = f"{g.strongest:.4g}{_why(g.range.low)}"
+    weakest = f"{g.weakest:.4g}{_why(g.range.high)}"
+    console.print(
+        f"grid at X/R = {g.x_over_r:.3g}: SCR {g.now:.4g}; strongest {strongest}, weakest {weakest}"
+    )
+    if run is not None:
+        console.print(f"\n[bold]this run[/] {run.words(1e6 * loop.delay.seconds)}")
+        if run.round_trip_us:
+            text = ", ".join(f"{k} {v:g}" for k, v in run.round_trip_us.items())
+            console.print(f"y\\[k] sent to u\\[k] received, µs: {text} (T_s = {run.T_s_us:g})")
+        if run.acting_us:
+            text = ", ".join(f"{k} {v:g}" for k, v in run.acting_us.items())
+            console.print(f"y\\[k] sampled to u\\[k] acting, holds included, µs: {text}")
+
+
+def _loops_table(u: tuple[ChannelMargins, ...], y: tuple[ChannelMargins, ...]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for head in ("loop at", "gain ↓ @ Hz", "gain ↑ @ Hz", "phase @ Hz", "delay µs @ Hz", "disk α"):
+        table.add_column(head, justify="left" if head == "loop at" else "right")
+    for c in (*u, *y):
+        g = c.gain_phase
+        table.add_row(
+            c.name + ("" if c.confirmed else " (not confirmed)"),
+            _at(g.gain_low, g.gain_low_hz, "×") if g.gain_low else "—",
+            _at(g.gain_high, g.gain_high_hz, "×"),
+            _at(g.phase_deg, g.phase_hz, "", "°"),
+            _delay(1e6 * c.delay.seconds, c.delay.frequency_hz),
+            f"{g.disk:.3g}",
+        )
+    return table
+
+
+def _at(value: float, hz: float, before: str = "", after: str = "") -> str:
+    return f"{before}{value:.3g}{after} @ {hz:.3g}" if math.isfinite(value) else "—"
+
+
+def _delay(us: float, hz: float) -> str:
+    return f"{us:.4g} @ {hz:.3g}" if math.isfinite(us) else "—"
+
+
+def _elements_table(m: Margins) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for head in ("element", "down to", "up to"):
+        table.add_column(head, justify="left" if head == "element" else "right")
+    for name, r in m.elements.items():
+        ends = (r.low, r.high) if r else ()
+        cells = [f"{100 * (e.factor - 1):+.4g} %{_why(e)}" for e in ends] or ["is 0", "is 0"]
+        table.add_row(name, *cells)
+    return table
+
+
+def _why(end: End) -> str:
+    if not end.bounded:
+        return " (no limit)"
+    if end.lost is None:
+        return " (no operating point)"
+    return f" ({end.lost.frequency_hz:.4g} Hz)" if end.lost.frequency_hz else " (a real mode)"

@@ -1,0 +1,104 @@
+"""gfmhil design margins: what a law's sampled loop stands, and whether a run stayed within it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from gfm_design.case import Case
+from gfm_design.margins import UnstableLoop, margins
+from gfm_design.region import POINTS, Region, stable_region
+from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.cli.design.margin_figures import draw_delay, draw_region
+from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
+from gfm_hil.errors import UserError
+from gfm_hil.loop_delay import check_run, read_loop_delay
+from gfm_hil.scenario import Scenario, load_scenario
+from gfm_runtime import load_law
+from gfm_runtime.assembly import Controller
+
+
+def add(kinds: Any) -> None:
+    """Add the command to the parser."""
+    command = kinds.add_parser(
+        "margins", help="gain, phase, delay and disk margins, parameter ranges, stable grids"
+    )
+    command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
+    where = command.add_mutually_exclusive_group(required=True)
+    where.add_argument("--scenario", help="scenario file, or the name of a shipped one")
+    where.add_argument("--run", type=Path, metavar="DIR", help="run folder: its scenario and delay")
+    command.add_argument(
+        "--figures", type=Path, metavar="DIR", help="draw region.png and delay.png into DIR"
+    )
+    command.add_argument("--json", action="store_true", help="as JSON")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Report the margins; exit code 3 for an unstable loop, which has none."""
+    if options.run is not None:
+        check_run(options.run)
+        scenario = load_scenario(str(options.run / "scenario.toml"), law=options.law)
+    else:
+        scenario = load_scenario(options.scenario, law=options.law)
+    case, label = make_case(scenario)
+    console = Console(highlight=False)
+    try:
+        found = margins(case)
+    except UnstableLoop as problem:
+        if options.json:
+            content = {"law": label, "scenario": scenario.title, "stable": False}
+            content |= {"mode": mode_as_json(problem.mode), "reason": str(problem)}
+            print(json.dumps(content, indent=2))
+        else:
+            console.print(f"{label}: no margins, {problem}")
+        return EXIT_OTHERWISE
+    margin = found.loop.delay.seconds
+    set_s = case.loop().delay
+    measured = (
+        read_loop_delay(options.run, set_s, scenario.T_s, margin)
+        if options.run is not None
+        else None
+    )
+    region = _draw(options.figures, case, label, margin) if options.figures else None
+    if options.json:
+        content = {"law": label, "scenario": scenario.title, "stable": True}
+        content |= as_json(found, set_s, measured)
+        if region is not None:
+            content["region"] = region_as_json(region)
+        print(json.dumps(content, indent=2))
+    else:
+        print_margins(console, label, scenario.title, found, set_s, measured)
+        if options.figures:
+            console.print(f"figures: {options.figures}", soft_wrap=True)
+    return 0
+
+
+def make_case(scenario: Scenario) -> tuple[Case, str]:
+    """The scenario's first law at its start, of a scheduled law the stage in force; its label.
+
+    Raises:
+        UserError: the law closes no loop at the start.
+    """
+    references = scenario.references.vector()
+    controller = Controller([load_law(scenario.law)], scenario.T_s, references)
+    return Case(scenario.plant, controller.active_law, np.asarray(references)), controller.active
+
+
+def _draw(folder: Path, case: Case, label: str, margin: float) -> Region:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise UserError(f"--figures {folder}: {problem.strerror}") from None
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("stable region", total=POINTS)
+        region = stable_region(case, progress=lambda rows: bar.update(task, completed=rows))
+    draw_region(folder / "region.png", case, label, region)
+    draw_delay(folder / "delay.png", case, label, margin)
+    return region
