@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,8 @@ def _counts(laws: dict[str, Any]) -> Table:
 def _marks(marks: dict[str, float]) -> str:
     """Three quantiles, with as many digits as tell them apart."""
     values = [marks[name] for name in ("p5", "p50", "p95")]
-    width = max(abs(v) for v in values)
-    spread = (values[-1] - values[0]) or width or 1.0
-    digits = min(max(2 - math.floor(math.log10(spread)), 0), 6)
+    gaps = [b - a for a, b in pairwise(values) if b > a]
+    digits = min(max(1 - math.floor(math.log10(min(gaps, default=1.0))), 0), 4)
     return " / ".join(f"{v:.{digits}f}" for v in values)
 
 

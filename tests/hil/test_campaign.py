@@ -1,0 +1,435 @@
+"""Campaigns: draws, determinism over workers, resuming, single runs, and wrong input."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from gfm_hil.campaign import worker
+from gfm_hil.campaign.axes import find_axes
+from gfm_hil.campaign.draw import Choice, LogUniform, Normal, Uniform, draw
+from gfm_hil.campaign.execute import WorkerLost, execute, processes
+from gfm_hil.campaign.figure import draw_map
+from gfm_hil.campaign.result import summary
+from gfm_hil.campaign.spec import Campaign, load_campaign
+from gfm_hil.campaign.store import Store
+from gfm_hil.campaign.worker import Record, run_chunk
+from gfm_hil.cli.main import main
+from gfm_hil.errors import UserError
+
+TEXT = """\
+title = "a small one"
+scenario = "rig_pref_step"
+laws = ["mimo-gfm", "vsg-2"]
+runs = 10
+seed = 3
+
+[set]
+duration = 0.3
+"events.0.t" = 0.1
+
+[[draw]]
+path = "plant.factors.L_g"
+type = "loguniform"
+low = 0.5
+high = 10.0
+
+[[draw]]
+path = "plant.factors.R_f"
+type = "uniform"
+low = 0.0
+high = 1.0
+
+[[draw]]
+path = "plant.sensors.noise_std.p"
+also = ["plant.sensors.noise_std.q"]
+type = "normal"
+mean = 1e-3
+sigma = 1e-3
+low = 0.0
+high = 5e-3
+
+[[draw]]
+path = "plant.delay.samples"
+type = "choice"
+values = [1, 2]
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a campaign file: TEXT with some of its words replaced."""
+
+    def write(**changed: str) -> Path:
+        text = TEXT
+        for old, new in changed.items():
+            assert old in text
+            text = text.replace(old, new, 1)
+        path = tmp_path / "small.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a whole campaign, run by two workers, its file beside it."""
+    folder = tmp_path_factory.mktemp("campaign")
+    (folder / "small.toml").write_text(TEXT, encoding="utf-8")
+    arguments = ["campaign", str(folder / "small.toml"), "--out", str(folder / "two")]
+    assert main([*arguments, "--workers", "2", "--quiet"]) == 0
+    return folder
+
+
+def stored(folder: Path) -> list[str]:
+    """The store's lines by run number and law."""
+    head, *lines = (folder / "runs.jsonl").read_text(encoding="utf-8").splitlines()
+    return [head, *sorted(lines, key=lambda s: (json.loads(s)["run"], json.loads(s)["law"]))]
+
+
+@pytest.mark.slow
+def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
+    arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "one")]
+    assert main([*arguments, "--workers", "1", "--quiet"]) == 0
+    lines = stored(whole / "two")
+    assert len(lines) == 21
+    assert stored(whole / "one") == lines
+
+
+@pytest.mark.slow
+def test_a_resumed_campaign_equals_an_uninterrupted_one(whole: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "resumed"
+    shutil.copytree(whole / "two", folder)
+    lines = (folder / "runs.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = lines[:1] + lines[8:14] + [lines[15][:50]]  # as if the power had failed in a line
+    (folder / "runs.jsonl").write_text("".join(kept), encoding="utf-8")
+    arguments = ["campaign", str(whole / "small.toml"), "--out", str(folder)]
+    assert main([*arguments, "--resume", "--workers", "1", "--quiet"]) == 0
+    assert stored(folder) == stored(whole / "two")
+
+
+def test_what_is_complete_is_not_run_again(whole: Path) -> None:
+    before = (whole / "two" / "runs.jsonl").stat()
+    arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "two")]
+    assert main([*arguments, "--resume", "--quiet"]) == 0
+    assert (whole / "two" / "runs.jsonl").stat().st_mtime_ns == before.st_mtime_ns
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"seed = 3": "seed = 4"}, "belongs to another campaign"),
+        ({"high = 1.0": "high = 1.1"}, "belongs to another campaign"),
+        ({"duration = 0.3": "duration = 0.4"}, "belongs to another campaign"),
+    ],
+)
+def test_a_changed_file_is_refused(
+    file: Callable[..., Path],
+    whole: Path,
+    capsys: pytest.CaptureFixture[str],
+    changed: dict[str, str],
+    words: str,
+) -> None:
+    arguments = ["campaign", str(file(**changed)), "--out", str(whole / "two")]
+    before = (whole / "two" / "runs.jsonl").read_bytes()
+    assert main([*arguments, "--resume"]) == 2
+    assert words in capsys.readouterr().err
+    assert main(arguments) == 2
+    assert "in use" in capsys.readouterr().err
+    assert (whole / "two" / "runs.jsonl").read_bytes() == before
+
+
+def test_more_runs_go_on_with_the_same_draws(file: Callable[..., Path], whole: Path) -> None:
+    more = load_campaign(str(file(**{"runs = 10": "runs = 11"})))
+    store = Store(whole / "two", more, resume=True)
+    assert store.missing(more) == [(10, "mimo-gfm"), (10, "vsg-2")]
+
+
+def test_folder_of_a_campaign(whole: Path) -> None:
+    names = {path.name for path in (whole / "two").iterdir()}
+    assert names == {"campaign.toml", "campaign.json", "runs.jsonl", "map.png"}
+    assert (whole / "two" / "campaign.toml").read_text(encoding="utf-8") == TEXT
+    result = json.loads((whole / "two" / "campaign.json").read_text(encoding="utf-8"))
+    assert result["done"] == 20
+    assert result["missing"] == 0
+    for found in result["laws"].values():
+        assert sum(found["counts"].values()) == found["runs"] == 10
+        assert len(found["worst"]) == 5
+
+
+@pytest.mark.slow
+def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> None:
+    arguments = ["campaign", str(whole / "small.toml"), "--only", "5"]
+    assert main([*arguments, "--out", str(tmp_path / "alone")]) == 0
+    records = [json.loads(line) for line in stored(whole / "two")[1:]]
+    for law in ("mimo-gfm", "vsg-2"):
+        folder = tmp_path / "alone" / law
+        assert (folder / "report.html").is_file()
+        record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
+        assert record in records
+        result = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        assert result["status"] == record["status"]
+
+
+@pytest.mark.slow
+def test_dask_gives_the_same_bits(whole: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as local:
+        arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "dask")]
+        assert main([*arguments, "--dask", local.scheduler_address, "--quiet"]) == 0
+    assert stored(whole / "dask") == stored(whole / "two")
+
+
+def test_dask_without_the_package_says_so(
+    file: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    out = tmp_path / "out"
+    assert main(["campaign", str(file()), "--out", str(out), "--dask", "tcp://127.0.0.1:9"]) == 2
+    assert "pip install 'gfmhil[dask]'" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]) -> None:
+    campaign = load_campaign(str(file(**{"runs = 10": "runs = 2000"})))
+    jobs = [(run, "mimo-gfm") for run in range(2000)]
+    kept: list[Record] = []
+
+    def keep(records: list[Record]) -> None:
+        kept.extend(records)
+        for process in multiprocessing.active_children():
+            os.kill(process.pid or 0, signal.SIGKILL)
+
+    with processes(1) as pool, pytest.raises(WorkerLost, match="a worker process died"):
+        execute(campaign, jobs, pool, 1, keep, lambda: False)
+    assert [r["run"] for r in kept] == list(range(len(kept)))
+    assert kept
+
+
+def test_an_error_in_a_run_names_the_run(
+    file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise ZeroDivisionError("as if there were a mistake")
+
+    monkeypatch.setattr(worker, "simulate", fail)
+    campaign = load_campaign(str(file()))
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(WorkerLost, match="run 7, vsg-2: ZeroDivisionError: as if"),
+    ):
+        execute(campaign, [(7, "vsg-2")], pool, 1, lambda records: None, lambda: False)
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_there(file: Callable[..., Path], tmp_path: Path) -> None:
+    path, out = file(**{"runs = 10": "runs = 2000"}), tmp_path / "out"
+    command = [sys.executable, "-m", "gfm_hil", "campaign", str(path), "--out", str(out)]
+    with subprocess.Popen(
+        [*command, "--workers", "1", "--quiet"], stderr=subprocess.PIPE, text=True
+    ) as process:
+        while not (out / "runs.jsonl").is_file() or len(stored(out)) < 2:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "runs are missing; go on with: gfmhil campaign" in said
+    done = len(stored(out)) - 1
+    result = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
+    assert result["done"] == done
+    assert result["missing"] == 4000 - done
+
+
+def test_no_steady_state_is_a_result(file: Callable[..., Path], tmp_path: Path) -> None:
+    # lines so long that P_ref cannot be carried
+    path = file(**{"low = 0.5\nhigh = 10.0": "low = 150.0\nhigh = 160.0"})
+    campaign = load_campaign(str(path))
+    records = run_chunk(campaign, [(0, "mimo-gfm")])
+    assert records[0]["status"] == "no-steady-state"
+    assert "the line of" in records[0]["reason"]
+    result = summary(campaign, records)
+    assert result["laws"]["mimo-gfm"]["counts"]["no-steady-state"] == 1
+    draw_map(tmp_path / "map.png", campaign, records, *find_axes(campaign, None, None))
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+def test_shipped_campaign_is_valid() -> None:
+    campaign = load_campaign("rig_mimo_gfm")
+    assert campaign.file.laws == ["mimo-gfm", "vsg-2"]
+    assert pickle_size(campaign) < 20_000  # it goes along with every task
+
+
+def pickle_size(campaign: Campaign) -> int:
+    return len(multiprocessing.reduction.ForkingPickler.dumps(campaign))
+
+
+# --- draws -------------------------------------------------------------------------------------
+
+numbers = st.floats(-1e12, 1e12)
+shares = st.floats(0, 1, exclude_max=True)
+
+
+def bounded(low: float, high: float) -> tuple[float, float]:
+    return (low, high) if low < high else (high, low)
+
+
+@given(numbers, numbers, shares)
+def test_uniform_stays_within_its_bounds(a: float, b: float, u: float) -> None:
+    low, high = bounded(a, b)
+    if low < high:
+        value = Uniform(type="uniform", path="x", low=low, high=high).quantile(u)
+        assert low <= value <= high
+
+
+@given(st.floats(1e-12, 1e12), st.floats(1e-12, 1e12), shares)
+def test_loguniform_stays_within_its_bounds(a: float, b: float, u: float) -> None:
+    low, high = bounded(a, b)
+    if low < high:
+        value = LogUniform(type="loguniform", path="x", low=low, high=high).quantile(u)
+        assert low <= value <= high
+
+
+@given(numbers, st.floats(1e-6, 1e6), st.floats(-6, 6), st.floats(-6, 6), shares)
+def test_normal_stays_within_its_bounds(
+    mean: float, sigma: float, a: float, b: float, u: float
+) -> None:
+    low, high = (mean + sigma * limit for limit in bounded(a, b))
+    try:
+        normal = Normal(type="normal", path="x", mean=mean, sigma=sigma, low=low, high=high)
+    except ValidationError:
+        return  # nothing between the bounds, and it says so
+    assert low <= normal.quantile(u) <= high
+
+
+@given(st.lists(st.integers() | st.text(), min_size=1), shares)
+def test_choice_is_one_of_its_values(values: list[Any], u: float) -> None:
+    assert Choice(type="choice", path="x", values=values).quantile(u) in values
+
+
+@given(shares, shares)
+def test_quantiles_rise(u: float, v: float) -> None:
+    low, high = bounded(u, v)
+    normal = Normal(type="normal", path="x", mean=1.0, sigma=0.1, low=0.7, high=1.2)
+    assert normal.quantile(low) <= normal.quantile(high)
+
+
+def test_draws_have_the_distribution() -> None:
+    kinds = [
+        Uniform(type="uniform", path="a", low=2.0, high=4.0),
+        LogUniform(type="loguniform", path="b", low=0.1, high=10.0),
+        Normal(type="normal", path="c", mean=1.0, sigma=0.1, low=0.0, high=2.0),
+        Choice(type="choice", path="d", values=[1, 2]),
+    ]
+    drawn = np.array([draw(5, run, kinds)[1] for run in range(4000)])
+    assert np.mean(drawn[:, 0]) == pytest.approx(3.0, abs=0.05)
+    assert np.mean(np.log(drawn[:, 1])) == pytest.approx(0.0, abs=0.1)
+    assert np.std(drawn[:, 2]) == pytest.approx(0.1, rel=0.05)
+    assert np.mean(drawn[:, 3]) == pytest.approx(1.5, abs=0.05)
+    assert np.abs(np.corrcoef(drawn.T) - np.eye(4)).max() < 0.06
+
+
+def test_a_run_depends_on_seed_and_number_only() -> None:
+    kinds = [Uniform(type="uniform", path="a", low=0.0, high=1.0)]
+    children = np.random.SeedSequence(9).spawn(4)
+    for run in (3, 0):
+        raw = np.random.Philox(children[run]).random_raw(2)
+        seed, (value,) = draw(9, run, kinds)
+        assert seed == int(raw[0]) >> 1
+        assert math.isclose(value, int(raw[1]) / 2**64, abs_tol=1e-15)
+
+
+# --- wrong input -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"plant.factors.R_f": "plants.factors.R_f"}, "draw.1: path 'plants.factors.R_f': the"),
+        ({"plant.factors.R_f": "plant.factors.R_x"}, "plant.factors.R_x"),
+        ({"plant.factors.R_f": "plant.substep"}, "plant.substep = 0.0: unknown key"),
+        ({"plant.factors.R_f": "events.1.P_ref"}, "'events' holds 1 entries, counted from 0"),
+        ({"plant.factors.R_f": "plant.factors.L_g"}, "draw.1: 'plant.factors.L_g' is given twice"),
+        ({"plant.factors.R_f": "seed"}, "'seed' is the campaign's own"),
+        ({"plant.factors.R_f": "plant.delay.samples"}, "plant.delay.samples"),
+        ({"low = 0.0\nhigh = 1.0": "low = 1.0\nhigh = 1.0"}, "low must be below high"),
+        ({"low = 0.5": "low = 0.0"}, "must be > 0 for a logarithm"),
+        ({"high = 1.0": "high = nan"}, "draw.1.uniform.high"),
+        ({"low = 0.0\nhigh = 1.0": "low = -1.0\nhigh = 1.0"}, "draw.1, plant.factors.R_f = -1.0"),
+        ({"sigma = 1e-3": "sigma = -1e-3"}, "sigma = -0.001"),
+        ({"mean = 1e-3": "mean = 1.0"}, "holds next to nothing of mean = 1"),
+        ({"values = [1, 2]": "values = []"}, "draw.3.choice.values"),
+        ({"values = [1, 2]": "values = [1, 9999]"}, "draw.3, plant.delay.samples = 9999"),
+        ({'type = "uniform"': 'type = "gamma"'}, "'gamma'"),
+        ({"runs = 10": "runs = 0"}, "runs = 0"),
+        ({"runs = 10": 'runs = "10"'}, "runs = '10'"),
+        ({"runs = 10": "runs = 10\nworker = 3"}, "worker: unknown key"),
+        ({'title = "a small one"\n': ""}, "title: missing"),
+        ({'"vsg-2"]': '"vsg-2000"]'}, "vsg-2000"),
+        ({'"vsg-2"]': '"mimo-gfm"]'}, "each once"),
+        ({'"rig_pref_step"': '"rig"'}, "scenario rig: no such file"),
+        ({"duration = 0.3": "duration = 0.0"}, "duration"),
+        ({'"events.0.t" = 0.1': '"events.0.t" = 0.9'}, "events.0: at 0.9 s"),
+        ({"[set]": "[set"}, "small.toml: "),
+    ],
+)
+def test_wrong_files(
+    file: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    changed: dict[str, str],
+    words: str,
+) -> None:
+    out = tmp_path / "out"
+    assert main(["campaign", str(file(**changed)), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert "Traceback" not in said
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--workers", "0"], "--workers 0: must lie in"),
+        (["--workers", "2", "--dask", "tcp://a:1"], "give one of them"),
+        (["--resume"], "goes with --out"),
+        (["--only", "10", "--out", "x"], "--only 10: must lie in [0, 9]"),
+        (["--x", "plant.factors.C_f"], "'plant.factors.C_f' is not drawn"),
+        (["--x", "plant.factors.R_f", "--y", "plant.factors.R_f"], "both are"),
+    ],
+)
+def test_wrong_options(
+    file: Callable[..., Path], capsys: pytest.CaptureFixture[str], options: list[str], words: str
+) -> None:
+    assert main(["campaign", str(file()), *options]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_unknown_campaign_names_those_that_ship() -> None:
+    with pytest.raises(UserError, match=r"no such file; shipped are .*'rig_mimo_gfm'"):
+        load_campaign("rig")
