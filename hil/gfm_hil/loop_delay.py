@@ -73,8 +73,8 @@ class LoopDelay:
                 f"{allowed:.4g} us"
             )
         return (
-            f"does not fit: {held}, so u acted up to {worst:g} us after its sample; the law allows "
-            f"{allowed:.4g} us, exceeded in {self.beyond} ticks"
+            f"does not fit: {held}, so u may have acted {worst:g} us after its sample; the law "
+            f"allows {allowed:.4g} us, exceeded in {self.beyond} ticks"
         )
 
 

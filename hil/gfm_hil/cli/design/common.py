@@ -1,23 +1,27 @@
-"""What the design commands share: gains on the command line, channels as JSON and as a table."""
+"""What the design commands share: gains and weights from outside, channels as JSON and a table."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gfm_design.performance import Channel
+from gfm_design.performance import PAPER_WEIGHTS, Channel, Weight
+from gfm_design.weights_file import read_weights
 from gfm_hil.errors import UserError
 from gfm_hil.report import cell
 
 
 def add_law_options(command: argparse.ArgumentParser) -> None:
-    """The law, its gains, and JSON."""
+    """The law, its gains, the weights, and JSON."""
     command.add_argument("--law", required=True, help="catalogue name or law file")
     command.add_argument("--gains", help="k=v,…: other values (tune: other starts)")
+    command.add_argument("--weights", help="TOML file of weights; the paper's six by default")
     command.add_argument("--json", action="store_true", help="as JSON")
 
 
@@ -25,21 +29,48 @@ def read_gains(text: str | None) -> dict[str, float]:
     """``k_22=5,k_34=1`` as a dict.
 
     Raises:
-        UserError: an entry that is not NAME=NUMBER.
+        UserError: an entry that is not NAME=NUMBER, or a name given twice.
     """
-    found = {}
-    for entry in text.split(",") if text else []:
-        name, _, value = entry.partition("=")
+    found: dict[str, float] = {}
+    for entry in text.split(",") if text is not None else []:
+        name, _, value = (part.strip() for part in entry.partition("="))
         try:
-            found[name.strip()] = float(value)
+            number = float(value)
         except ValueError:
-            raise UserError(f"--gains {entry!r}: must be NAME=NUMBER, e.g. k_22=5.98") from None
+            number = np.nan
+        if not name or not np.isfinite(number):
+            raise UserError(f"--gains {entry!r}: must be NAME=NUMBER, e.g. k_22=5.98")
+        if name in found:
+            raise UserError(f"--gains: {name} is given twice")
+        found[name] = number
     return found
 
 
+def weights_of(options: argparse.Namespace) -> tuple[Weight, ...]:
+    """The weights asked for.
+
+    Raises:
+        UserError: the file cannot be read or a weight in it cannot be.
+    """
+    if options.weights is None:
+        return PAPER_WEIGHTS
+    try:
+        return read_weights(Path(options.weights))
+    except (OSError, ValueError) as problem:
+        raise UserError(f"--weights {options.weights}: {problem}") from None
+
+
 def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
-    """gamma and its channels as plain data."""
-    rows = [{"i": c.i, "j": c.j, "norm": c.norm, "omega_rad_s": c.omega} for c in channels]
+    """gamma and its channels as plain data; a peak that is only a limit has no frequency."""
+    rows = [
+        {
+            "i": c.i,
+            "j": c.j,
+            "norm": c.norm,
+            "omega_rad_s": c.omega if np.isfinite(c.omega) else None,
+        }
+        for c in channels
+    ]
     return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 

@@ -81,11 +81,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def make_case(scenario: Scenario) -> tuple[Case, str]:
-    """The scenario's first law at its start, of a scheduled law the stage in force; its label.
-
-    Raises:
-        UserError: the law closes no loop at the start.
-    """
+    """The scenario's first law at its start, of a scheduled law the stage in force; its label."""
     references = scenario.references.vector()
     controller = Controller([load_law(scenario.law)], scenario.T_s, references)
     return Case(scenario.plant, controller.active_law, np.asarray(references)), controller.active
@@ -98,7 +94,7 @@ def _draw(folder: Path, case: Case, label: str, margin: float) -> Region:
         raise UserError(f"--figures {folder}: {problem.strerror}") from None
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("stable region", total=POINTS)
-        region = stable_region(case, progress=lambda rows: bar.update(task, completed=rows))
+        region = stable_region(case, POINTS, lambda rows: bar.update(task, completed=rows))
     draw_region(folder / "region.png", case, label, region)
     draw_delay(folder / "delay.png", case, label, margin)
     return region

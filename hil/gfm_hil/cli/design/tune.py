@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gfm_design.gains import free_gains
-from gfm_design.paper_problem import PaperProblem
+from gfm_design.paper_problem import PAPER_START, PaperProblem
 from gfm_design.synthesis import NotStabilised, tune
 from gfm_hil.cli.design.common import (
     add_law_options,
@@ -30,7 +30,8 @@ def add(kinds: Any) -> None:
     command = kinds.add_parser("tune", help="choose the free gains for the least gamma")
     add_law_options(command)
     command.add_argument("--seed", type=int, default=0, help="of the search")
-    command.add_argument("--evaluations", type=int, default=12000, help="how long to search")
+    command.add_argument("--evaluations", type=int, default=16000, help="of each start")
+    command.add_argument("--starts", type=int, default=1, help="the given start and random ones")
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
     command.add_argument("--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -41,7 +42,8 @@ def call(options: argparse.Namespace) -> int:
     """Tune a law's free gains; exit code 3 if no stabilising ones are found."""
     file = law_file(options.law)
     only = options.only.split(",") if options.only else None
-    gains = free_gains(file, read_gains(options.gains), only)
+    start = PAPER_START.get(file.name, {}) | read_gains(options.gains)
+    gains = free_gains(file, start, only)
     problem = PaperProblem(file, gains)
     with Progress(
         TextColumn("{task.description}"),
@@ -57,6 +59,7 @@ def call(options: argparse.Namespace) -> int:
                 gains,
                 options.seed,
                 options.evaluations,
+                options.starts,
                 lambda done, best: bar.update(task, completed=done, best=f"{best:.4g}"),
             )
         except NotStabilised as none:

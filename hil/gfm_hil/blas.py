@@ -1,0 +1,12 @@
+"""One thread for linear algebra, set before NumPy is first imported.
+
+The matrices here are small: more threads only wait for each other, spinning on processors that the
+loop needs. Whoever sets the variable knows better.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")

@@ -1,0 +1,68 @@
+"""Scenarios made in a line, run in this process, and the command as a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gfm_hil.run_folder import Run
+from gfm_hil.runner import run_scenario
+from gfm_hil.scenario import Scenario, check_scenario
+from gfm_runtime import get_law
+
+Make = Callable[..., Scenario]
+RunIt = Callable[..., Run]
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+def home_plant(law: str) -> dict[str, Any]:
+    """``plant`` with the grid that a law's defaults are meant for."""
+    grid = get_law(law).home_grid
+    return {"factors": {"L_g": grid.L_g, "R_g": grid.R_g}}
+
+
+@pytest.fixture
+def make() -> Make:
+    """A checked scenario of a tenth of a second in process, with whatever is given instead."""
+
+    def build(**content: Any) -> Scenario:
+        base = {"title": "test", "duration": 0.1, "link": {"type": "inproc"}}
+        return check_scenario({**base, **content}, "test")
+
+    return build
+
+
+@pytest.fixture
+def run(make: Make, tmp_path: Path) -> RunIt:
+    """Run such a scenario without figures."""
+    count = iter(range(100))
+
+    def call(**content: Any) -> Run:
+        return run_scenario(make(**content), tmp_path / f"run{next(count)}", figures=False)
+
+    return call
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Start:
+    """Start ``gfmhil …`` in the test's own folder; whatever still runs at the end is killed."""
+    started = []
+
+    def call(*arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "gfm_hil", *arguments],
+            cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield call
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
