@@ -18,7 +18,7 @@ from gfm_runtime.signals import NU, NY
 
 Matrix = NDArray[np.float64]
 
-_LONGEST_S, _MOST_SAMPLES = 0.01, 300  # what a loop stands beyond these is not looked at
+_LONGEST_S, _SAMPLES = 0.01, (50, 300)  # how far it is looked at: s, and at least, at most
 _STEP, _RATIO = 0.25, 1.02  # samples; from one point of the scan to the next
 
 
@@ -33,7 +33,8 @@ class DelayMargin:
 
 def longest(T_s: float) -> float:
     """The largest added delay that is looked at, s."""
-    return min(_LONGEST_S, _MOST_SAMPLES * T_s)
+    least, most = _SAMPLES
+    return float(np.clip(_LONGEST_S, least * T_s, most * T_s))
 
 
 def overall_delay(loop: SampledLoop) -> DelayMargin:
