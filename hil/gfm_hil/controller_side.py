@@ -12,7 +12,6 @@ from collections.abc import Callable
 from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
-from gfm_hil.realtime import sleep_until
 from gfm_hil.recording import Part, record_controller
 from gfm_hil.timeline import Timeline
 from gfm_hil.waiting import await_message
@@ -26,7 +25,6 @@ def run_controller(
     timeline: Timeline,
     t0_ns: int,
     stopped: Callable[[], bool],
-    priority: bool = False,
 ) -> FrameReader:
     """Run the controller's side of a scenario after the handshake; returns its frame counters."""
     scenario, c = bench.scenario, bench.controller
@@ -37,7 +35,6 @@ def run_controller(
     signals, times, progress = part.signals, part.times, part.progress
     done, tick = 0, 0  # ticks processed; the tick of the newest frame
     heard = time.monotonic_ns()
-    earliest = heard + patience_ns  # when tick 0 would have come on the quickest way seen so far
 
     def leave(status: str, reason: str, state: int, code: int) -> None:
         timeline.end(status, reason, tick)  # type: ignore[arg-type]
@@ -45,11 +42,7 @@ def run_controller(
 
     while timeline.running:
         wait_ns = T_ns if realtime else patience_ns
-        frame = link.receive()
-        if frame is None:
-            if priority and realtime and done:  # nothing is due before the next frame can be here
-                sleep_until(earliest + (tick + 1) * T_ns)
-            frame = await_message(link, time.monotonic_ns() + wait_ns, stopped)
+        frame = await_message(link, time.monotonic_ns() + wait_ns, stopped)
         now = time.monotonic_ns()
         if stopped():
             leave("interrupted", "stopped by the operator", STOPPED, 0)
@@ -68,7 +61,6 @@ def run_controller(
             tick = reader.unpack(frame, bench.y)
         except FrameError:
             continue  # counted; in lockstep the plant repeats nothing and both will time out
-        earliest = min(earliest, now - tick * T_ns)
         if reader.state == SAFE:
             leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
             break

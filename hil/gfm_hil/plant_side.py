@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
-from gfm_hil.realtime import sleep_until
 from gfm_hil.recording import Part, record_plant
 from gfm_hil.timeline import Timeline
 from gfm_hil.waiting import await_message
@@ -32,7 +31,6 @@ class _Plant:
     part: Part
     timeline: Timeline
     stopped: Callable[[], bool]
-    priority: bool
 
     def __post_init__(self) -> None:
         self.reader, self.writer = FrameReader("u"), FrameWriter("y")
@@ -102,8 +100,6 @@ class _Plant:
         self.misses += newest != tick
         self.part.progress[1] = self.misses
         self.advance(tick)
-        if self.priority:
-            sleep_until(until)
         while time.monotonic_ns() < until:
             os.sched_yield()
         if self.late * self.T_ns >= self.patience_ns:
@@ -119,10 +115,9 @@ def run_plant(
     timeline: Timeline,
     t0_ns: int,
     stopped: Callable[[], bool],
-    priority: bool = False,
 ) -> FrameReader:
     """Run the plant's side of a scenario after the handshake; returns its frame counters."""
-    p = _Plant(bench, link, part, timeline, stopped, priority)
+    p = _Plant(bench, link, part, timeline, stopped)
     ticks, realtime = bench.scenario.ticks, bench.scenario.mode == "realtime"
     if realtime:
         while time.monotonic_ns() < t0_ns:

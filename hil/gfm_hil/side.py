@@ -13,7 +13,7 @@ from gfm_hil.handshake import shake_hands
 from gfm_hil.links import open_link
 from gfm_hil.links.base import Side
 from gfm_hil.plant_side import run_plant
-from gfm_hil.realtime import no_collector_pauses, own_processor, take_priority
+from gfm_hil.realtime import go_first, no_collector_pauses, own_processor
 from gfm_hil.recording import Part, record_controller, record_plant
 from gfm_hil.scenario import Scenario
 from gfm_hil.stopping import Interrupt
@@ -49,16 +49,16 @@ def _run(
     interrupt: Interrupt,
 ) -> Outcome:
     bench = make_bench(scenario)
-    priority = False
+    first = False
     if scenario.mode == "realtime":  # before the link starts threads, which inherit both
         own_processor(side)
-        priority = take_priority()
+        first = go_first()
     link = open_link(scenario.link.type, side, endpoint)
     folder.mkdir(parents=True, exist_ok=True)
     part = Part.create(folder, side, scenario.ticks)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
     if scenario.mode == "realtime":
-        timeline.write(0, "scheduling", side=side, policy="FIFO" if priority else "normal")
+        timeline.write(0, "scheduling", side=side, priority="highest" if first else "as given")
     compile_side(bench, part)
 
     def stopped() -> bool:
@@ -68,7 +68,7 @@ def _run(
         no_collector_pauses()
         t0_ns = shake_hands(side, link, scenario, stopped, notice)
         run = run_controller if side == "controller" else run_plant
-        reader = run(bench, link, part, timeline, t0_ns, stopped, priority)
+        reader = run(bench, link, part, timeline, t0_ns, stopped)
         faults = {"side": side, "faults": reader.faults}
         (folder / f"link_{side}.json").write_text(json.dumps(faults))
     except PeerLost as problem:
