@@ -10,29 +10,45 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
 
-from gfm_hil.cli import campaign, compare, design, laws, run, scenarios, sides
 from gfm_hil.errors import UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
 
 
-def parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+#: the module of each command; only the one that is called is imported, so that a side of a run
+#: starts without the design tools
+MODULES = {
+    "run": "run",
+    "compare": "compare",
+    "campaign": "campaign",
+    "laws": "laws",
+    "design": "design",
+    "scenarios": "scenarios",
+    "controller": "sides",
+    "plant": "sides",
+}
+
+
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The parser of one command; of all of them if it is None or unknown."""
     top = argparse.ArgumentParser(
         prog="gfmhil", description="Hardware-in-the-loop bench for grid-forming converter control."
     )
     top.add_argument("--version", action="version", version=f"gfmhil {version('gfmhil')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (run, compare, campaign, laws, design, scenarios, sides):
-        module.add(commands)
+    wanted = [MODULES[command]] if command in MODULES else dict.fromkeys(MODULES.values())
+    for module in wanted:
+        import_module(f"gfm_hil.cli.{module}").add(commands)
     return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    options = parser().parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    options = parser(given[0] if given else None).parse_args(given)
     try:
         return int(options.call(options))
     except (UserError, LawError, NoEquilibrium) as problem:
