@@ -1,0 +1,346 @@
+"""Both sides over a real ZeroMQ link, in two threads of this process."""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.bench import make_bench
+from gfm_hil.controller_side import run_controller
+from gfm_hil.errors import PeerLost, UserError
+from gfm_hil.frames import FrameReader, FrameWriter
+from gfm_hil.handshake import shake_hands
+from gfm_hil.links import Link, open_link
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.zeromq import ZmqLink
+from gfm_hil.plant_side import run_plant
+from gfm_hil.recording import Part, merge
+from gfm_hil.scenario import Scenario
+from gfm_hil.side import compile_side
+from gfm_hil.timeline import Timeline, read_log, worst
+from gfm_runtime import law_names
+from gfm_runtime.controller import RUNNING, SAFE
+
+from .conftest import home_plant
+
+PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
+RIG = {
+    "delay": {"samples": 1, "fraction": 0.3},
+    "adc": "DS2004",
+    "dac": "DS2101",
+    "sensors": {"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-4, "V": 1e-4}},
+}
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """A fresh ipc endpoint; its path must be short, which a test's own folder need not be."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
+        yield f"ipc://{folder}/link"
+
+
+def in_threads(call: Callable[[Side], Any]) -> dict[Side, Any]:
+    """The same call for both sides at a time: what each returns, or its exception."""
+    found: dict[Side, Any] = {}
+
+    def one(side: Side) -> None:
+        try:
+            found[side] = call(side)
+        except Exception as problem:
+            found[side] = problem
+
+    threads = [threading.Thread(target=one, args=(side,), daemon=True) for side in SIDES]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return found
+
+
+def both_sides(
+    scenario: Scenario,
+    folder: Path,
+    endpoint: str,
+    touch: Callable[[Side, Link], Link] = lambda side, link: link,
+) -> dict[str, np.ndarray]:
+    """Run a scenario over ZeroMQ; returns the signals and leaves the logs in ``folder``."""
+    benches = {side: make_bench(scenario) for side in SIDES}
+    parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
+    for side in SIDES:
+        compile_side(benches[side], parts[side])
+
+    def call(side: Side) -> None:
+        link = open_link("zmq", side, endpoint)
+        timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
+        try:
+            t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None)
+            run = run_controller if side == "controller" else run_plant
+            run(benches[side], touch(side, link), parts[side], timeline, t0, lambda: False)
+        finally:
+            link.close()
+            timeline.close()
+
+    for problem in in_threads(call).values():
+        if problem is not None:
+            raise problem
+    return merge(folder, scenario.T_s, benches["controller"].controller.labels)
+
+
+def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    """Bit for bit, NaN included."""
+    assert set(one) == set(other)
+    for name in one:
+        assert one[name].tobytes() == other[name].tobytes(), name
+
+
+@pytest.mark.parametrize("law", law_names())
+def test_lockstep_over_zeromq_is_bit_for_bit_in_process(law, make, run, tmp_path, endpoint):
+    content = {
+        "law": law,
+        "duration": 0.03,
+        "seed": 7,
+        "link": PATIENT,
+        "plant": {**RIG, **home_plant(law)},
+        "events": [
+            {"tick": 50, "type": "reference", "P_ref": 0.55},
+            {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},
+        ],
+    }
+    apart = both_sides(make(**content), tmp_path, endpoint)
+    together = run(**content)
+    assert np.ptp(apart["true_p"]) > 0
+    assert_same(apart, together.signals)
+
+
+def test_a_change_of_law_and_every_grid_event_likewise(make, run, tmp_path, endpoint):
+    content = {
+        "law": "mimo-gfm",
+        "duration": 0.08,
+        "link": PATIENT,
+        "plant": {"factors": {"L_g": 10.0, "R_g": 10.0}, "grid": {"load_R": 36.1, "load_L": 1e-3}},
+        "events": [
+            {"tick": 50, "type": "law", "law": "vsg-2"},
+            {"tick": 60, "type": "reference", "P_ref": 0.6, "ramp_s": 0.01},
+            {"tick": 200, "type": "grid-voltage", "V_g": 0.98, "duration": 0.005},
+            {"tick": 300, "type": "grid-phase-jump", "degrees": 0.5},
+            {"tick": 400, "type": "grid-impedance", "L_g": 9.0, "R_g": 9.0},
+            {"tick": 500, "type": "grid-breaker", "closed": False},
+            {"tick": 600, "type": "grid-breaker", "closed": True},
+            {"tick": 700, "type": "law", "law": "droop-1"},
+        ],
+    }
+    apart = both_sides(make(**content), tmp_path, endpoint)
+    together = run(**content)
+    assert len(np.unique(apart["law"])) == 3
+    assert_same(apart, together.signals)
+
+
+@pytest.mark.parametrize(
+    ("plant", "status"),
+    [
+        ({"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}}, "tripped"),
+        ({"protection": {"over_current": {"enabled": False}}}, "safe"),
+    ],
+)
+def test_a_run_that_ends_early_ends_alike(plant, status, make, run, tmp_path, endpoint):
+    content = {
+        "duration": 1.0,
+        "link": PATIENT,
+        "plant": plant,
+        "events": [{"tick": 30, "type": "grid-phase-jump", "degrees": 120.0}],
+    }
+    apart = both_sides(make(**content), tmp_path, endpoint)
+    together = run(**content)
+    outcome = worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None)
+    assert together.summary["status"] == outcome.status == status
+    assert together.summary["reason"] == outcome.reason
+    assert_same(apart, together.signals)
+
+
+class Tampering:
+    """A link whose messages go through ``change`` on their way out; None drops one."""
+
+    def __init__(self, link: Link, change: Callable[[int, bytes], bytes | None]) -> None:
+        self._link, self._change, self._count = link, change, 0
+
+    def send(self, message: bytes) -> bool:
+        changed = self._change(self._count, message)
+        self._count += 1
+        return changed is None or self._link.send(changed)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+
+def test_a_frame_lost_in_lockstep_is_silence_and_silence_ends_the_run(make, tmp_path, endpoint):
+    def touch(side: Side, link: Link) -> Any:
+        if side == "plant":
+            return Tampering(link, lambda k, m: None if k == 20 else m)
+        return link
+
+    scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
+    signals = both_sides(scenario, tmp_path, endpoint, touch)
+    outcome = worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None)
+    assert outcome.status == "safe"
+    assert "gone" in outcome.reason
+    assert len(signals["tick"]) in (20, 21)  # the plant may still hear the controller give up
+
+
+def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint):
+    def touch(side: Side, link: Link) -> Any:
+        if side == "controller":
+            return Tampering(link, lambda k, m: m if k < 20 else m[:30] + b"\xff\xff" + m[32:])
+        return link
+
+    scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
+    signals = both_sides(scenario, tmp_path, endpoint, touch)
+    assert worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None).status == "safe"
+    assert len(signals["tick"]) == 20
+    assert np.ptp(signals["u_omega_u"]) <= 1e-9
+
+
+def test_a_repeated_frame_is_used_once(make, run, tmp_path, endpoint):
+    def touch(side: Side, link: Link) -> Any:
+        class Twice(Tampering):
+            def send(self, message: bytes) -> bool:
+                return self._link.send(message) and self._link.send(message)
+
+        return Twice(link, lambda k, m: m)
+
+    content = {"duration": 0.02, "link": PATIENT, "law": "vsg-2"}
+    apart = both_sides(make(**content), tmp_path, endpoint, touch)
+    assert_same(apart, run(**content).signals)
+
+
+def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
+    """Shake hands with a scenario each."""
+
+    def call(side: Side) -> int:
+        link = ZmqLink(side, endpoint)
+        try:
+            return shake_hands(side, link, scenarios[side], lambda: False, lambda text: None)
+        finally:
+            link.close()
+
+    return in_threads(call)
+
+
+def test_both_sides_agree_on_the_start(make, endpoint):
+    scenario = make(link=PATIENT)
+    found = meet(dict.fromkeys(SIDES, scenario), endpoint)
+    assert found["controller"] == found["plant"] > 0
+
+
+def test_a_misfit_of_scenarios_is_refused_on_both_sides(make, endpoint):
+    found = meet({"controller": make(link=PATIENT), "plant": make(link=PATIENT, seed=3)}, endpoint)
+    assert isinstance(found["controller"], PeerLost)
+    assert isinstance(found["plant"], PeerLost)
+    assert "the plant runs another scenario or law file" in str(found["controller"])
+    assert "the controller runs another scenario or law file" in str(found["plant"])
+
+
+@pytest.mark.parametrize(
+    "message", [b"GFMHIL {}", b"GFMHIL nonsense", b'GFMHIL {"kind": "start"}', b"GFMHIL []"]
+)
+def test_a_stranger_is_refused_in_words(message, make, endpoint):
+    link, stranger = ZmqLink("controller", endpoint), ZmqLink("plant", endpoint)
+    try:
+        stranger.send(message)
+        with pytest.raises(PeerLost, match="another language"):
+            shake_hands("controller", link, make(link=PATIENT), lambda: False, print)
+    finally:
+        stranger.close()
+        link.close()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_nobody_comes(side, make, endpoint):
+    said: list[str] = []
+    link = ZmqLink(side, endpoint)
+    scenario = make(link={**PATIENT, "start_timeout_s": 0.8, "endpoint": endpoint})
+    other = {"controller": "plant", "plant": "controller"}[side]
+    try:
+        with pytest.raises(PeerLost, match=f"the {other} did not come within 0.8 s"):
+            shake_hands(side, link, scenario, lambda: False, said.append)
+    finally:
+        link.close()
+    assert said == [f"waiting for the {other} at {endpoint} …"]
+
+
+def test_an_interrupt_ends_the_waiting(make, endpoint):
+    link = ZmqLink("plant", endpoint)
+    try:
+        with pytest.raises(PeerLost, match="interrupted while waiting for the controller"):
+            shake_hands("plant", link, make(link=PATIENT), lambda: True, print)
+    finally:
+        link.close()
+
+
+def test_an_ipc_endpoint_that_lives_is_not_taken_over(endpoint):
+    first = ZmqLink("controller", endpoint)
+    plant = ZmqLink("plant", endpoint)
+    try:
+        with pytest.raises(UserError, match="occupied"):
+            ZmqLink("controller", endpoint)
+        plant.send(FrameWriter("y").pack(0, RUNNING, 0, np.ones(5)))
+        assert first.wait(30)
+        assert FrameReader("y").unpack(first.receive(), np.zeros(5)) == 0  # still in business
+    finally:
+        plant.close()
+        first.close()
+
+
+def test_an_ipc_endpoint_that_a_killed_run_left_is_used_again(endpoint):
+    path = endpoint.removeprefix("ipc://")
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(path)
+    assert Path(path).exists()
+    ZmqLink("controller", endpoint).close()
+
+
+def test_a_tcp_port_that_is_taken():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(UserError) as found:
+            ZmqLink("controller", endpoint)
+    assert (
+        str(found.value) == f"link.endpoint = {endpoint!r}: cannot be bound: Address already in use"
+    )
+
+
+@pytest.mark.parametrize("endpoint", ["udp://127.0.0.1:1", "", "tcp://nowhere"])
+def test_an_endpoint_that_is_none(endpoint):
+    with pytest.raises(UserError, match=r"link\.endpoint = "):
+        ZmqLink("controller", endpoint)
+
+
+def test_an_unknown_link_names_the_known():
+    with pytest.raises(UserError, match=r"'pigeon': must be one of \['zmq'"):
+        open_link("pigeon", "plant", "ipc://x")
+
+
+def test_a_link_never_blocks_nor_queues_without_bound(endpoint):
+    link = ZmqLink("plant", endpoint)  # nobody there
+    try:
+        sent = [link.send(b"x" * 60) for _ in range(1000)]
+        assert not all(sent)
+        assert link.receive() is None
+        assert not link.wait(0.001)
+    finally:
+        link.close()
+
+
+def test_the_safe_state_travels_in_the_frame():
+    message = FrameWriter("u").pack(9, SAFE, 1, np.ones(3))
+    reader = FrameReader("u")
+    reader.unpack(message, np.zeros(3))
+    assert (reader.state, reader.reason, reader.tick) == (SAFE, 1, 9)

@@ -1,0 +1,256 @@
+"""Two real processes: they start, meet, run, and end together however one of them is ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.links.base import SIDES
+from gfm_hil.recording import Part
+from gfm_hil.toml_out import toml_text
+
+LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
+PATIENCE_S = 90.0
+
+
+def write(folder: Path, **content: Any) -> str:
+    """A scenario file in ``folder``; returns its path."""
+    path = folder / "scenario.toml"
+    path.write_text(toml_text({"title": "test", "duration": 0.1, **content}))
+    return str(path)
+
+
+def free_endpoint() -> str:
+    """A tcp endpoint that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
+    """Poll until ``what()`` is true; give up when the process has ended or patience has."""
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        found = what()
+        if found:
+            return found
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    raise AssertionError("waited in vain")
+
+
+def has_run(folder: Path, ticks: int) -> bool:
+    """The plant has recorded that many ticks."""
+    part = Part.open(folder, "plant")
+    return part is not None and int(part.progress[0]) >= ticks
+
+
+def sides_of(folder: Path) -> dict[str, int]:
+    """Process ids of the sides that record into ``folder``."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes().decode().split("\0")
+                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+            except OSError:
+                continue
+            if str(folder) in words and state != "Z":
+                found.update({side: int(entry.name) for side in SIDES if side in words})
+    return found
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a process that is about to end."""
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert "Traceback" not in err
+    return process.returncode, out, err
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """The content of summary.json."""
+    return json.loads((folder / "summary.json").read_text())
+
+
+def signals(folder: Path) -> dict[str, np.ndarray]:
+    """The content of signals.npz."""
+    with np.load(folder / "signals.npz") as file:
+        return dict(file)
+
+
+def assert_same(one: Path, other: Path) -> None:
+    """Two runs recorded the same, bit for bit."""
+    a, b = signals(one), signals(other)
+    assert set(a) == set(b)
+    for name in a:
+        assert a[name].tobytes() == b[name].tobytes(), name
+
+
+def test_two_processes_in_lockstep_are_bit_for_bit_one(start, tmp_path):
+    scenario = write(
+        tmp_path,
+        seed=3,
+        duration=0.1,
+        law="mimo-gfm",
+        plant={
+            "delay": {"samples": 1},
+            "adc": "DS2004",
+            "sensors": {"bandwidth_hz": 300.0, "noise_std": {"p": 1e-4}},
+        },
+        events=[
+            {"t": 0.02, "type": "reference", "P_ref": 0.6},
+            {"t": 0.05, "type": "law", "law": "vsg-2"},
+            {"t": 0.07, "type": "grid-frequency", "f_hz": 49.95},
+        ],
+        link={"peer_timeout_s": 20.0},
+    )
+    apart = start("run", scenario, "--out", "apart", "--json", "--quiet", "--no-figures")
+    code, out, err = end(apart)
+    assert (code, err) == (0, "")
+    assert json.loads(out) == summary(tmp_path / "apart")
+    assert json.loads(out)["link"] == "zmq"
+    code, out, _ = end(start("run", scenario, "--link", "inproc", "--out", "together", "--json",
+                             "--no-figures"))  # fmt: skip
+    assert (code, json.loads(out)["link"]) == (0, "inproc")
+    assert_same(tmp_path / "apart", tmp_path / "together")
+    left = {path.name for path in (tmp_path / "apart").iterdir()}
+    assert left == {"scenario.toml", "signals.npz", "timing.npz", "events.jsonl", "summary.json"}
+
+
+def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
+    scenario = write(
+        tmp_path,
+        law="vsg-2",
+        duration=0.1,
+        events=[{"t": 0.05, "type": "reference", "P_ref": 0.6}],
+        link={"peer_timeout_s": 20.0, "endpoint": free_endpoint()},
+    )
+    processes = {side: start(side, scenario, "--out", side) for side in reversed(SIDES)}
+    for side, process in processes.items():
+        code, out, _ = end(process)
+        assert code == 0, out
+        assert "completed" in out
+        found = summary(tmp_path / side)
+        assert (found["status"], found["ticks"], found["laws"]) == ("completed", 1000, ["vsg-2"])
+        assert not (tmp_path / side / "parts").exists()
+    plant, controller = signals(tmp_path / "plant"), signals(tmp_path / "controller")
+    assert "true_p" in plant and "true_p" not in controller
+    assert controller["ref_P_ref"][-1] == 0.6
+    end(start("run", scenario, "--link", "inproc", "--out", "together", "--no-figures"))
+    together = signals(tmp_path / "together")
+    for name in plant.keys() - {"laws"}:
+        assert plant[name].tobytes() == together[name].tobytes(), name
+
+
+def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
+    """At rest, so that no lateness of a loaded machine can make the plant do anything."""
+    scenario = write(
+        tmp_path,
+        law="vsg-2",
+        mode="realtime",
+        duration=0.3,
+        late_policy={"hold": 1_000_000},
+        link={"peer_timeout_s": 60.0},
+    )
+    code, out, _ = end(start("run", scenario, "--out", "run", "--json"))
+    found = json.loads(out)
+    assert code == 0, found
+    assert (found["status"], found["mode"], found["ticks"]) == ("completed", "realtime", 3000)
+    assert (tmp_path / "run" / "timing.png").stat().st_size > 10_000
+    with np.load(tmp_path / "run" / "timing.npz") as file:
+        timing = dict(file)
+    due, sent, received = (timing[f"plant_{n}"] for n in ("scheduled", "sent", "received"))
+    assert (np.diff(due) == 100_000).all()  # absolute deadlines: no drift whatever happened
+    assert (timing["plant_woke"] >= due).all()
+    there = received >= 0
+    assert found["misses"] == (~there).sum()
+    assert (received[there] > sent[there]).all()
+    assert set(found["round_trip_us"]) == {"p50", "p99", "p99.9", "max"}
+    seen = timing["controller_received"] >= 0
+    assert (timing["controller_sent"][seen] >= timing["controller_computed"][seen]).all()
+
+
+def test_ctrl_c_ends_both_and_keeps_the_data(start, tmp_path):
+    scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
+    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+    wait_for(lambda: has_run(folder, 200), process)
+    assert set(sides_of(folder)) == set(SIDES)
+    process.send_signal(signal.SIGINT)
+    code, out, _ = end(process)
+    found = json.loads(out)
+    assert code == 130
+    assert found["status"] == "interrupted"
+    assert found["reason"] in ("stopped by the operator", "the controller was stopped")
+    assert sides_of(folder) == {}
+    recorded = signals(folder)
+    assert len(recorded["t"]) == found["ticks"] >= 200
+    assert not np.isnan(recorded["true_p"]).any()
+    assert not (folder / "parts").exists()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_side_that_is_killed_is_reported_and_what_both_recorded_is_kept(side, start, tmp_path):
+    scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
+    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+    wait_for(lambda: has_run(folder, 200), process)
+    os.kill(sides_of(folder)[side], signal.SIGKILL)
+    code, out, err = end(process)
+    found = json.loads(out)
+    assert code == 3
+    assert (found["status"], found["reason"]) == ("safe", f"the {side} was ended by SIGKILL")
+    assert found["reason"] in err
+    recorded = signals(folder)
+    assert len(recorded["t"]) == found["ticks"] >= 200
+    for name in ("true_p", "u_omega_u", "ref_P_ref"):
+        assert not np.isnan(recorded[name][:200]).any()
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    other = "plant" if side == "controller" else "controller"
+    assert [e["side"] for e in events if e["event"] == "end"] == [other]
+    assert sides_of(folder) == {}
+
+
+def test_without_the_command_that_started_them_both_sides_end_too(start, tmp_path):
+    scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
+    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+    wait_for(lambda: has_run(folder, 200), process)
+    process.kill()
+    process.communicate()
+    end_at = time.monotonic() + PATIENCE_S
+    while sides_of(folder) and time.monotonic() < end_at:
+        time.sleep(0.02)
+    assert sides_of(folder) == {}
+    for side in SIDES:
+        part = Part.open(folder, side)
+        assert not np.isnan(part.signals[:200]).any()
+
+
+def test_a_plant_that_never_comes(start, tmp_path):
+    endpoint = free_endpoint()
+    scenario = write(tmp_path, link={"start_timeout_s": 1.2, "endpoint": endpoint})
+    code, out, err = end(start("controller", scenario, "--out", "alone"))
+    assert code == 3
+    assert f"waiting for the plant at {endpoint} …" in err
+    assert f"the plant did not come within 1.2 s at {endpoint}" in " ".join(out.split())
+    assert summary(tmp_path / "alone")["status"] == "safe"
+
+
+def test_a_port_that_is_taken_is_one_line_and_leaves_nothing(start, tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        scenario = write(tmp_path, link={"endpoint": endpoint})
+        code, out, err = end(start("run", scenario, "--out", "run", "--quiet"))
+        assert (code, out) == (2, "")
+        expected = f"gfmhil: link.endpoint = '{endpoint}': cannot be bound: Address already in use"
+        assert err.strip() == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["scenario.toml"]
