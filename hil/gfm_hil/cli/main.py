@@ -17,7 +17,6 @@ from gfm_hil.errors import UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
 
-
 #: the module of each command; only the one that is called is imported, so that a side of a run
 #: starts without the design tools
 MODULES = {
