@@ -61,7 +61,7 @@ def hinf_norm(
         return Norm(gain, 2 / T_s * float(np.arctan(omega)))
     if len(poles) and poles.real.max() >= 0.0:
         raise Unstable(complex(poles[np.argmax(poles.real)]), False)
-    A, B, C = _balance(A, B, C)
+    A, B, C = balance(A, B, C)
     # every pole is a candidate for the peak; resonances sit near |pole|
     best = Norm(_sigma(D), np.inf)
     for omega in {0.0, *np.abs(poles), *np.abs(poles.imag)}:
@@ -120,7 +120,7 @@ def _to_continuous(
     )
 
 
-def _balance(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+def balance(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     """Scale the states by powers of two until rows and columns are of one size.
 
     Poles from 1e-4 to 1e5 rad/s stand side by side in a weighted loop.

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_design.encoding import Encoding
 from gfm_design.gains import FreeGain, GainedLaw
-from gfm_design.linear import linearise_plant
+from gfm_design.linear import LinearPlant, hold, linearise_law, linearise_plant
 from gfm_design.operating_point import operating_point
 from gfm_design.performance import (
     PAPER_WEIGHTS,
@@ -18,16 +21,29 @@ from gfm_design.performance import (
     channel_norms,
     performance_loop,
 )
+from gfm_design.polish import polish
 from gfm_design.screen import Screen
 from gfm_design.synthesis import UNSTABLE, unstable_cost
 from gfm_plant import Plant, make_plant
 from gfm_runtime.discretise import discretise
 from gfm_runtime.errors import LawError
 from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.signals import NU
 
 Vector = NDArray[np.float64]
 
 REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # Table III
+
+#: Section IV-A's initial K, by law: what ``tune`` starts from if not told otherwise
+PAPER_START: dict[str, dict[str, float]] = {
+    "mimo-gfm": {
+        "k_pdc": 90.0,
+        "k_idc": 400.0,
+        **dict.fromkeys(("k_12", "k_14", "k_15", "k_21", "k_24", "k_31", "k_32"), 0.0),
+        "k_22": 20.0,
+        "k_34": 1.0,
+    }
+}
 
 
 @dataclass
@@ -58,20 +74,81 @@ class PaperProblem:
         op = operating_point(self._par, law, ref, self.plant.grid.omega_g, self.plant.grid.V_g)
         self._linear = linearise_plant(self._par, op, self.plant.grid.omega_g, self.plant.grid.V_g)
         dc_control = self.plant.dc_source.mode == "controlled"
-        self.law = GainedLaw(self.file, self.gains, op, ref, dc_control)
+        self._rest = op, ref, dc_control
+        self.law = GainedLaw(self.file, self.gains, *self._rest)
+        self._slopes = self._affine_loop() if self.law.is_affine else None
+
+    def _affine_loop(self) -> list[tuple[Vector, Vector]]:
+        """T(s)'s matrices at gains of zero, and what each gain adds: they are affine too."""
+        base = self.loop(np.zeros(len(self.gains)))
+        ones = [self.loop(row) for row in np.eye(len(self.gains))]
+        return [(m, np.array([one[k] - m for one in ones])) for k, m in enumerate(base)]
+
+    @property
+    def linear(self) -> LinearPlant:
+        """The plant around its operating point."""
+        return self._linear
 
     def loop(self, values: Vector) -> StateSpace:
         """T(s) at these gains."""
         return performance_loop(self._linear, self.law(values))
 
     def __call__(self, values: Vector) -> float:
-        """Cost: gamma to a few 1e-4, or what an unstable loop costs."""
+        """Cost: a close lower bound of gamma, or what an unstable loop costs."""
+        return float(self.many(values[None, :])[0])
+
+    def many(self, values: Vector) -> Vector:
+        """Costs of several sets of gains, one a row."""
+        costs = np.full(len(values), 1.99 * UNSTABLE)
+        for rows, loops in self._stacks(values):
+            gammas, abscissae = self._screen(loops)
+            costs[rows] = np.where(np.isfinite(gammas), gammas, unstable_cost(abscissae))
+        return costs
+
+    def _stacks(self, values: Vector) -> Iterator[tuple[list[int], StateSpace]]:
+        """Loops of equal order stacked on axis 0, and which rows of ``values`` they belong to."""
+        if self._slopes is not None:
+            A, B, C, D = (m + np.tensordot(values, s, 1) for m, s in self._slopes)
+            yield [*range(len(values))], (A, B, C, D)
+            return
+        by_order: dict[int, list[tuple[int, StateSpace]]] = {}
+        for k, row in enumerate(values):
+            with suppress(LawError):  # such gains make no law
+                loop = self.loop(row)
+                if all(np.isfinite(m).all() for m in loop):  # a gain of zero may cost a state
+                    by_order.setdefault(len(loop[0]), []).append((k, loop))
+        for same in by_order.values():
+            A, B, C, D = (np.stack([loop[m] for _, loop in same]) for m in range(4))
+            yield [k for k, _ in same], (A, B, C, D)
+
+    def polish(self, code: Encoding, point: Vector) -> Vector:
+        """A lower gamma nearby, by its active peaks."""
         try:
-            gamma, abscissa = self._screen(self.loop(values))
+            return polish(
+                lambda x: self.loop(code.values(x)), self.weights, point, code.low, code.high
+            )
         except (LawError, np.linalg.LinAlgError):
-            return 2 * UNSTABLE
-        return gamma if np.isfinite(gamma) else unstable_cost(abscissa)
+            return point
+
+    def worst_mode(self, values: Vector) -> complex:
+        """The eigenvalue of the loop furthest right, 1/s and rad/s."""
+        poles = np.linalg.eigvals(self.loop(values)[0])
+        return complex(poles[np.argmax(poles.real)])
 
     def channels(self, values: Vector) -> tuple[Channel, ...]:
         """Every channel's norm, guaranteed. Raises ``Unstable``."""
         return channel_norms(self.loop(values), self.weights)
+
+    def sampled_channels(self, values: Vector) -> tuple[Channel, ...]:
+        """As ``channels`` of the loop at T_s: law by Tustin, u and w held over each tick, no delay.
+
+        Raises:
+            Unstable: the sampled loop is not stable.
+        """
+        file_law = build_law(self.file, self.law.named(values))
+        law = discretise(file_law, self.T_s)
+        reaction = linearise_law(file_law, law, *self._rest)
+        plant, inputs = self._linear, np.hstack([self._linear.B, self._linear.B_d])
+        A, B = hold(plant.A, inputs, self.T_s)
+        sampled = LinearPlant(A, B[:, :NU], B[:, NU:], plant.C)
+        return channel_norms(performance_loop(sampled, reaction), self.weights, self.T_s)

@@ -46,6 +46,8 @@ class Weight:
                 f"{name}: improper, its numerator has degree {len(self.num) - 1} and its "
                 f"denominator {len(self.den) - 1}; a weight must be proper"
             )
+        if not self.num or not self.den:
+            raise ValueError(f"{name}: needs a numerator and a denominator")
         if not np.isfinite([*self.num, *self.den]).all() or self.den[0] == 0.0:
             raise ValueError(f"{name}: coefficients must be finite, den[0] not 0")
         if len(self.den) > 1 and np.roots(self.den).real.max() >= 0.0:
@@ -55,8 +57,8 @@ class Weight:
         """Value at the complex frequencies s [rad/s]."""
         return np.polyval(self.num, s) / np.polyval(self.den, s)
 
-    def state_space(self) -> StateSpace:
-        """Controllable canonical form."""
+    def state_space(self, T_s: float | None = None) -> StateSpace:
+        """Controllable canonical form; by Tustin if a sampling time T_s [s] is given."""
         den = np.asarray(self.den) / self.den[0]
         num = np.zeros(len(den))
         num[len(den) - len(self.num) :] = np.asarray(self.num) / self.den[0]
@@ -65,7 +67,12 @@ class Weight:
         if n:
             A[0], B[0, 0] = -den[1:], 1.0
             A[1:, :-1] = np.eye(n - 1)
-        return A, B, (num[1:] - num[0] * den[1:])[None, :], np.array([[num[0]]])
+        C, D = (num[1:] - num[0] * den[1:])[None, :], np.array([[num[0]]])
+        if T_s is None:
+            return A, B, C, D
+        step = np.linalg.inv(np.eye(n) - T_s / 2 * A)
+        to_x = T_s * step @ B  # s = (2/T_s) (z-1)/(z+1)
+        return step @ (np.eye(n) + T_s / 2 * A), to_x, C @ step, D + C @ to_x / 2
 
 
 def _lead(T_1: float, T_2: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -100,9 +107,10 @@ class Channel:
 
 
 def performance_loop(plant: LinearPlant, law: LinearLaw, D_q: float = D_Q) -> StateSpace:
-    """State space of T(s), from w (2) to z (4), of the continuous closed loop.
+    """State space of T(s), or T(z), from w (2) to z (4) of the closed loop.
 
-    ``plant`` must be the ideal one (no sensors): z speaks of true quantities.
+    Plant and law are both continuous, or both the steps of one tick. ``plant`` must be the ideal
+    one (no sensors): z speaks of true quantities.
     """
     n, m = len(plant.A), len(law.A)
     by_p_ref = law.D_r[:, [_P_REF]]
@@ -124,11 +132,11 @@ def performance_loop(plant: LinearPlant, law: LinearLaw, D_q: float = D_Q) -> St
     return A, B, C, D
 
 
-def channel_system(loop: StateSpace, weight: Weight) -> StateSpace:
-    """State space of W_ij T_ij."""
+def channel_system(loop: StateSpace, weight: Weight, T_s: float | None = None) -> StateSpace:
+    """State space of W_ij T_ij; ``T_s`` [s] for a sampled loop."""
     A, B, C, D = loop
     b, c, d = B[:, [weight.j - 1]], C[[weight.i - 1]], D[[weight.i - 1], weight.j - 1][None, :]
-    Aw, Bw, Cw, Dw = weight.state_space()
+    Aw, Bw, Cw, Dw = weight.state_space(T_s)
     return (
         np.block([[A, np.zeros((len(A), len(Aw)))], [Bw @ c, Aw]]),
         np.vstack([b, Bw @ d]),
@@ -138,15 +146,20 @@ def channel_system(loop: StateSpace, weight: Weight) -> StateSpace:
 
 
 def channel_norms(
-    loop: StateSpace, weights: tuple[Weight, ...] = PAPER_WEIGHTS
+    loop: StateSpace, weights: tuple[Weight, ...] = PAPER_WEIGHTS, T_s: float | None = None
 ) -> tuple[Channel, ...]:
     """The norm of every weighted channel, with the guarantee of ``hinf_norm``.
+
+    Args:
+        loop: T, continuous or, with a sampling time T_s [s], from tick to tick.
+        weights: W_ij(s); a sampled loop has them by Tustin.
+        T_s: of a sampled loop.
 
     Raises:
         Unstable: the loop is not stable; it has no gamma.
     """
     channels = []
     for weight in weights:
-        norm: Norm = hinf_norm(*channel_system(loop, weight))
+        norm: Norm = hinf_norm(*channel_system(loop, weight, T_s), T_s=T_s)
         channels.append(Channel(weight.i, weight.j, norm.gain, norm.omega))
     return tuple(channels)

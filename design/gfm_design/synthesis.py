@@ -3,8 +3,7 @@
 The problem is neither smooth nor convex: the peak jumps between channels and resonances, and the
 stable set has a hard edge. CMA-ES (N. Hansen, "The CMA evolution strategy", 2016) ranks points and
 asks for no gradient, so both are no trouble to it; it is what did best among the optimisers tried.
-Gains that cannot change sign are searched by their logarithm. Each other gain is scaled by the
-change that moves the cost by half, found from the start, so that one step size fits all.
+What it comes to is handed to a polish, if there is one, which follows the active peaks.
 
 An unstable point costs more than any stable one, by its spectral abscissa: the search first
 stabilises, then improves.
@@ -15,21 +14,33 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_design.encoding import Encoding
 from gfm_design.gains import FreeGain
 
 Vector = NDArray[np.float64]
 
-#: what is to be made least; inf-free: an unusable point costs ``UNSTABLE`` and more
-Cost = Callable[[Vector], float]
+UNSTABLE = 1e6  # what an unusable point costs at least
+_STEP = 0.5  # CMA-ES's first step, in the coordinates of ``Encoding``
+_POPULATION = 32
+_SAMPLES = 400  # random points, of which the best is the start of a further run
 
-UNSTABLE = 1e6
-_SPREAD_LOG = 0.5  # a gain by its logarithm starts with a spread of e^0.5
-_STEP = 0.5  # CMA-ES's first step, in these scales
-_POPULATION = 16
+
+class Problem(Protocol):
+    """What is to be made least."""
+
+    def __call__(self, values: Vector) -> float:
+        """Cost of one set of gains, finite; ``UNSTABLE`` and more if they are of no use."""
+
+    def many(self, values: Vector) -> Vector:
+        """Costs of several, one a row."""
+
+    def polish(self, code: Encoding, point: Vector) -> Vector:
+        """A better point nearby, in the search's coordinates; may be the point itself."""
 
 
 @dataclass(frozen=True)
@@ -51,108 +62,107 @@ class Tuned:
 
 
 class NotStabilised(ArithmeticError):
-    """No usable gains were found; the message says how far the best ones came."""
+    """No usable gains were found. ``values`` are the best ones tried."""
+
+    def __init__(self, values: Vector, evaluations: int, cost: float) -> None:
+        self.values = values
+        super().__init__(
+            f"no stabilising gains within the bounds after {evaluations} tries; "
+            f"the best still grow by {cost % UNSTABLE:.3g} 1/s"
+        )
 
 
-def unstable_cost(abscissa: float) -> float:
-    """Cost of a point whose largest growth is ``abscissa`` [1/s] >= 0."""
-    return UNSTABLE * (1.0 + min(abscissa, 1e6) / 1e6) + abscissa
+def unstable_cost(abscissa: Vector) -> Vector:
+    """Cost of points whose largest growth is ``abscissa`` [1/s] >= 0."""
+    # growth in the digits below UNSTABLE, so that it can be read off a cost
+    return UNSTABLE + np.clip(abscissa, 0.0, 0.99 * UNSTABLE)
 
 
 def tune(
-    cost: Cost,
+    problem: Problem,
     gains: Sequence[FreeGain],
     seed: int = 0,
-    evaluations: int = 6000,
+    evaluations: int = 12000,
+    starts: int = 2,
     progress: Callable[[int, float], None] = lambda done, best: None,
 ) -> Tuned:
     """Search the free gains within their bounds for the least cost; the same for a seed.
 
     Args:
-        cost: of the gains' values, in their order.
+        problem: the cost.
         gains: with starts and bounds.
         seed: of the search.
-        evaluations: how many costs may be asked for.
+        evaluations: how many costs each start may ask for.
+        starts: searches; the first from the gains' own start, the others from the best of some
+            random points within the bounds.
         progress: told the evaluations done and the best cost so far.
 
     Raises:
         NotStabilised: not one point with a cost below ``UNSTABLE``.
         ModuleNotFoundError: the package cma is missing (extra ``design``).
     """
+    begin, done = time.perf_counter(), 0
+    code = Encoding(gains)
+    random = np.random.default_rng(seed)
+    best, best_cost = code.start, problem(code.values(code.start))
+    for run in range(starts):
+        point = code.start
+        if run > 0:
+            points = random.uniform(code.low, code.high, (_SAMPLES, len(gains)))
+            point = points[np.argmin(problem.many(code.values(points)))]
+
+        def tell(asked: int, cost: float, told: int = done, so_far: float = best_cost) -> None:
+            progress(told + asked, min(so_far, cost))
+
+        run_seed = int(random.integers(1, 2**31))
+        found, asked = _search(problem, code, point, run_seed, evaluations, tell)
+        done += asked
+        if problem(code.values(found)) < UNSTABLE:
+            found = problem.polish(code, found)
+        cost = problem(code.values(found))
+        if cost < best_cost:
+            best, best_cost = found, cost
+    values = code.values(best)
+    if best_cost >= UNSTABLE:
+        raise NotStabilised(values, done, best_cost)
+    return Tuned(values, best_cost, done, time.perf_counter() - begin, seed)
+
+
+def _search(
+    problem: Problem,
+    code: Encoding,
+    start: Vector,
+    seed: int,
+    evaluations: int,
+    tell: Callable[[int, float], None],
+) -> tuple[Vector, int]:
+    """The best point of one run of CMA-ES, and how many costs it asked for."""
     try:
         import cma
     except ModuleNotFoundError:
         raise ModuleNotFoundError("synthesis needs cma: pip install 'gfmhil[design]'") from None
-    begin = time.perf_counter()
-    code = Encoding(cost, gains)
+    # cma has no one-dimensional form: a coordinate that does nothing makes up the second
+    idle = 1 if len(start) == 1 else 0
     search = cma.CMAEvolutionStrategy(
-        np.zeros(len(gains)),
+        np.r_[start, np.zeros(idle)],
         _STEP,
         {
-            "seed": seed + 1,  # cma takes 0 as "from the clock"
+            "seed": seed,
             "verbose": -9,
             "popsize": _POPULATION,
             "maxfevals": evaluations,
-            "tolfun": 1e-7,
+            "tolfun": 1e-5,
+            "bounds": [[*code.low, *[-1.0] * idle], [*code.high, *[1.0] * idle]],
         },
     )
-    best, best_cost = code.values(np.zeros(len(gains))), np.inf
+    best, best_cost = start, np.inf
     while not search.stop():
-        points = search.ask()
-        costs = []
-        for point in points:
-            values = code.values(point)
-            costs.append(cost(values) + code.outside(point))
-            if costs[-1] < best_cost:
-                best, best_cost = values, costs[-1]
-        search.tell(points, costs)
-        progress(search.result.evaluations, best_cost)
-    if best_cost >= UNSTABLE:
-        raise NotStabilised(
-            f"no stabilising gains within the bounds after {search.result.evaluations} tries; "
-            f"the best still grow by {best_cost % UNSTABLE:.3g} 1/s"
-        )
-    return Tuned(best, best_cost, int(search.result.evaluations), time.perf_counter() - begin, seed)
-
-
-class Encoding:
-    """Between the gains and the search's coordinates, in which the start is 0."""
-
-    def __init__(self, cost: Cost, gains: Sequence[FreeGain]) -> None:
-        self._gains = gains
-        self._start = np.array([g.start for g in gains])
-        self._low = np.array([g.low for g in gains])
-        self._high = np.array([g.high for g in gains])
-        self._by_ratio = np.array([g.by_ratio for g in gains])
-        here = cost(self._start)
-        self._scale = np.array(
-            [_SPREAD_LOG if g.by_ratio else self._reach(cost, here, k) for k, g in enumerate(gains)]
-        )
-
-    def values(self, point: Vector) -> Vector:
-        """The gains at a point, moved into their bounds."""
-        moved = self._start + point * self._scale
-        ratio = self._start * np.exp(np.where(self._by_ratio, point * self._scale, 0.0))
-        return np.clip(np.where(self._by_ratio, ratio, moved), self._low, self._high)
-
-    def outside(self, point: Vector) -> float:
-        """A small cost for coordinates beyond the bounds, so that the search turns back."""
-        moved = self._start + point * self._scale
-        ratio = self._start * np.exp(np.where(self._by_ratio, point * self._scale, 0.0))
-        wanted = np.where(self._by_ratio, ratio, moved)
-        beyond = np.abs(wanted - np.clip(wanted, self._low, self._high))
-        return float(np.sum(beyond / (self._high - self._low)))
-
-    def _reach(self, cost: Cost, here: float, k: int) -> float:
-        """The change of gain k that moves the cost by half, or makes the loop unstable."""
-        size = self._high[k] - self._low[k]
-        for _ in range(40):
-            changed = 0.0
-            for sign in (1.0, -1.0):
-                values = self._start.copy()
-                values[k] = np.clip(values[k] + sign * size, self._low[k], self._high[k])
-                changed = max(changed, abs(cost(values) - here))
-            if changed <= 0.5 * abs(here):
-                break
-            size /= 2
-        return float(size)
+        asked = search.ask()
+        points = np.array(asked)[:, : len(start)]
+        costs = problem.many(code.values(points))
+        k = int(np.argmin(costs))
+        if costs[k] < best_cost:
+            best, best_cost = points[k], float(costs[k])
+        search.tell(asked, list(costs))
+        tell(int(search.result.evaluations), best_cost)
+    return best, int(search.result.evaluations)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,24 @@ def weights_of(options: argparse.Namespace) -> tuple[Weight, ...]:
         return read_weights(Path(options.weights))
     except (OSError, ValueError) as problem:
         raise UserError(f"--weights {options.weights}: {problem}") from None
+
+
+def singular_is_users(
+    call: Callable[[argparse.Namespace], int],
+) -> Callable[[argparse.Namespace], int]:
+    """A command that says in one line that its problem is singular."""
+
+    @functools.wraps(call)
+    def checked(options: argparse.Namespace) -> int:
+        try:
+            return call(options)
+        except np.linalg.LinAlgError as problem:
+            raise UserError(
+                f"{options.law}: the problem is singular ({problem}); a gain may be 0 or far "
+                "out of range"
+            ) from None
+
+    return checked
 
 
 def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:

@@ -12,11 +12,14 @@ from rich.console import Console
 from gfm_design.gains import FreeGain, tied
 from gfm_design.hinf import Unstable
 from gfm_design.paper_problem import PaperProblem
+from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
     print_channels,
     read_gains,
+    singular_is_users,
+    weights_of,
 )
 from gfm_hil.errors import UserError
 from gfm_runtime import law_file
@@ -26,9 +29,15 @@ def add(kinds: Any) -> None:
     """Add the command to the parser."""
     command = kinds.add_parser("gamma", help="gamma of a law's gains, channel by channel")
     add_law_options(command)
+    command.add_argument(
+        "--discrete",
+        action="store_true",
+        help="of the loop sampled at 10 kHz: law and weights by Tustin, no delay",
+    )
     command.set_defaults(call=call)
 
 
+@singular_is_users
 def call(options: argparse.Namespace) -> int:
     """Report gamma of given gains; exit code 3 for an unstable loop, which has none."""
     file, given = law_file(options.law), read_gains(options.gains)
@@ -40,15 +49,16 @@ def call(options: argparse.Namespace) -> int:
     # every parameter may be given here; they are the "free" ones, pinned at these values
     values = tied(file, given) if given else {}
     gains = [FreeGain(n, v, -np.inf, np.inf) for n, v in values.items()]
-    problem = PaperProblem(file, tuple(gains))
+    problem = PaperProblem(file, tuple(gains), weights=weights_of(options))
+    channels_of = problem.sampled_channels if options.discrete else problem.channels
     try:
-        channels = problem.channels(np.array([g.start for g in gains]))
-    except Unstable as problem_found:
+        channels = channels_of(np.array([g.start for g in gains]))
+    except Unstable as found:
         if options.json:
-            print(json.dumps({"law": file.name, "gamma": None, "reason": str(problem_found)}))
+            print(json.dumps({"law": file.name, "gamma": None, "reason": str(found)}))
         else:
-            Console().print(f"{file.name}: no gamma, {problem_found}", highlight=False)
-        return 3
+            Console().print(f"{file.name}: no gamma, {found}", highlight=False)
+        return EXIT_OTHERWISE
     if options.json:
         print(json.dumps({"law": file.name, **channels_as_json(channels)}, indent=2))
     else:

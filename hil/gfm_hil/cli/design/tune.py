@@ -7,17 +7,23 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from gfm_design.full_order import Missing, full_order
 from gfm_design.gains import free_gains
+from gfm_design.hinf import Unstable
 from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.synthesis import NotStabilised, tune
+from gfm_design.synthesis import NotStabilised, Tuned, tune
+from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
     print_channels,
     read_gains,
+    singular_is_users,
+    weights_of,
 )
 from gfm_hil.errors import UserError
 from gfm_hil.toml_out import toml_text
@@ -30,21 +36,78 @@ def add(kinds: Any) -> None:
     command = kinds.add_parser("tune", help="choose the free gains for the least gamma")
     add_law_options(command)
     command.add_argument("--seed", type=int, default=0, help="of the search")
-    command.add_argument("--evaluations", type=int, default=16000, help="of each start")
-    command.add_argument("--starts", type=int, default=1, help="the given start and random ones")
+    command.add_argument("--evaluations", type=int, default=12000, help="of each start")
+    command.add_argument("--starts", type=int, default=2, help="the given start and random ones")
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
+    command.add_argument("--full-order", action="store_true", help="a bound from below besides")
     command.add_argument("--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.set_defaults(call=call)
 
 
+@singular_is_users
 def call(options: argparse.Namespace) -> int:
     """Tune a law's free gains; exit code 3 if no stabilising ones are found."""
+    for name in ("evaluations", "starts"):
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name} {getattr(options, name)}: must be at least 1")
+    if options.seed < 0:
+        raise UserError(f"--seed {options.seed}: must not be negative")
     file = law_file(options.law)
     only = options.only.split(",") if options.only else None
-    start = PAPER_START.get(file.name, {}) | read_gains(options.gains)
-    gains = free_gains(file, start, only)
-    problem = PaperProblem(file, gains)
+    paper = PAPER_START.get(file.name, {})
+    gains = free_gains(
+        file,
+        {n: v for n, v in paper.items() if only is None or n in only} | read_gains(options.gains),
+        only,
+    )
+    problem = PaperProblem(file, gains, weights=weights_of(options))
+    try:
+        found = _searched(problem, options)
+    except NotStabilised as none:
+        mode = problem.worst_mode(none.values)
+        reason = f"{none}; in the way: the mode at {abs(mode.imag) / (2 * np.pi):.4g} Hz"
+        if options.json:
+            print(json.dumps({"law": file.name, "gamma": None, "reason": reason}))
+        else:
+            Console(stderr=True).print(f"{file.name}: {reason}", highlight=False, soft_wrap=True)
+        return EXIT_OTHERWISE
+    except ModuleNotFoundError as missing:
+        raise UserError(str(missing)) from None
+    named = problem.law.named(found.values)
+    problem.move_to(named)
+    try:
+        channels = problem.channels(found.values)
+    except Unstable as lost:
+        raise UserError(f"{file.name}: at the operating point of the tuned gains {lost}") from None
+    result = {
+        "law": file.name,
+        **channels_as_json(channels),
+        "gamma_full_order": None,
+        "gains": named,
+        "seconds": found.seconds,
+        "evaluations": found.evaluations,
+        "seed": found.seed,
+    }
+    said = _bound(problem, result) if options.full_order else ""
+    if options.out:
+        write_law(Path(options.out), file, named, result)
+    if options.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    print_channels(file.name, channels)
+    lines = [
+        ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
+        f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
+        + (f"; law file: {options.out}" if options.out else ""),
+        said,
+    ]
+    Console(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
+    return 0
+
+
+def _searched(problem: PaperProblem, options: argparse.Namespace) -> Tuned:
+    """The search, with a bar on stderr."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -52,47 +115,31 @@ def call(options: argparse.Namespace) -> int:
         console=Console(stderr=True, quiet=options.quiet),
         transient=True,
     ) as bar:
-        task = bar.add_task(f"tuning {file.name}", total=options.evaluations, best="–")
-        try:
-            found = tune(
-                problem,
-                gains,
-                options.seed,
-                options.evaluations,
-                options.starts,
-                lambda done, best: bar.update(task, completed=done, best=f"{best:.4g}"),
-            )
-        except NotStabilised as none:
-            Console(stderr=True).print(f"{file.name}: {none}", highlight=False)
-            return 3
-        except ModuleNotFoundError as missing:
-            raise UserError(str(missing)) from None
-    named = problem.law.named(found.values)
-    problem.move_to(named)
-    channels = problem.channels(found.values)
-    result = {
-        "law": file.name,
-        **channels_as_json(channels),
-        "gains": named,
-        "seconds": found.seconds,
-        "evaluations": found.evaluations,
-        "seed": found.seed,
-    }
-    if options.out:
-        write_law(Path(options.out), file, named, result)
-    if options.json:
-        print(json.dumps(result, indent=2))
-    else:
-        print_channels(file.name, channels)
-        Console().print(
-            ", ".join(f"{n} = {v:.6g}" for n, v in named.items()), highlight=False, soft_wrap=True
+        total = options.evaluations * options.starts
+        task = bar.add_task(f"tuning {problem.file.name}", total=total, best="–")
+        return tune(
+            problem,
+            problem.gains,
+            options.seed,
+            options.evaluations,
+            options.starts,
+            lambda done, best: bar.update(task, completed=done, best=f"{best:.4g}"),
         )
-        Console().print(
-            f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
-            + (f"; law file: {options.out}" if options.out else ""),
-            highlight=False,
-        )
-    return 0
+
+
+def _bound(problem: PaperProblem, result: dict[str, Any]) -> str:
+    """The full-order bound into the result; what to say of it."""
+    try:
+        found = full_order(problem.linear, problem.weights)
+    except Missing as missing:
+        Console(stderr=True).print(str(missing), highlight=False, soft_wrap=True)
+        return ""
+    if found is None:
+        return "full order: the solver came to no result in time"
+    result["gamma_full_order"] = found.bound
+    result["full_order_columns"] = list(found.columns)
+    columns = ", ".join("not solved" if c is None else f"{c:.4g}" for c in found.columns)
+    return f"no controller at all goes below {found.bound:.4g}; stack of P_ref, of ω_g: {columns}"
 
 
 def write_law(path: Path, file: LawFile, gains: dict[str, float], result: dict[str, Any]) -> None:
