@@ -1,0 +1,97 @@
+"""gfmhil design deploy: gains that hold in the box of real loops, as a law file."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from gfm_design.box import Box
+from gfm_design.deployable import Round, deploy
+from gfm_design.gains import free_gains, tied
+from gfm_design.paper_problem import PaperProblem
+from gfm_design.robust import Wanted
+from gfm_design.synthesis import NotStabilised
+from gfm_hil.cli.design.box import delay_margin
+from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
+from gfm_hil.errors import UserError
+from gfm_hil.toml_out import toml_text
+from gfm_runtime import law_file
+from gfm_runtime.lawfile import LawFile
+
+
+def add(kinds: Any) -> None:
+    """Add the command to the parser."""
+    command = kinds.add_parser("deploy", help="choose the free gains to hold in the box")
+    add_law_options(command)
+    command.add_argument("--seed", type=int, default=0, help="of the search")
+    command.add_argument("--rounds", type=int, default=6, help="how often corners may join")
+    command.add_argument("--evaluations", type=int, default=2500, help="of each round")
+    command.add_argument("--out", required=True, help="write the law to this file")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Tune a law for the box; exit code 3 if no stabilising gains are found."""
+    file = law_file(options.law)
+    gains = free_gains(file, read_gains(options.gains))
+    console = Console(stderr=True, highlight=False)
+
+    def tell(found: Round) -> None:
+        console.print(
+            f"{found.seconds:.0f} s: γ {found.gamma:.4f}, sigma {found.sigma:+.3f} 1/s, "
+            f"overshoot {100 * found.overshoot:.1f} %, over {found.points} corners"
+        )
+
+    try:
+        found = deploy(
+            file, gains, Box(), Wanted(), options.seed, options.rounds, options.evaluations, tell
+        )
+    except NotStabilised as none:
+        console.print(f"{file.name}: {none}")
+        return 3
+    except ModuleNotFoundError as missing:
+        raise UserError(str(missing)) from None
+    channels = PaperProblem(file, gains).channels(found.values)
+    # seven digits: what the search resolves, and what a reader can compare
+    values = [float(f"{v:.7g}") for v in found.values]
+    named = tied(file, dict(zip([g.name for g in gains], values, strict=True)))
+    result = channels_as_json(channels) | {"seed": options.seed, "seconds": found.seconds}
+    _write(Path(options.out), file, named, result)
+    print_channels(Path(options.out).stem, channels)
+    return 0
+
+
+def _write(path: Path, file: LawFile, gains: dict[str, float], result: dict[str, Any]) -> None:
+    """The law file and, as comments, what its gains were tuned for."""
+    content = file.model_dump(mode="json", exclude_none=True)
+    content |= {
+        "name": path.stem,
+        "title": "the paper's MIMO-GFM, gains that hold in the real loop",
+        "source": "Eq. (36); gains by gfmhil design deploy, see the comments of the file\n",
+    }
+    for name, value in gains.items():
+        content["parameters"][name] |= {
+            "value": value,
+            "source": f"gfmhil design deploy, seed {result['seed']}",
+        }
+    box = {n: list(np.unique(v)) for n, v in asdict(Box()).items()}
+    notes = [
+        f"gamma = {result['gamma']:.4f} of the paper's problem (Section III-B), P_ref = 0.5:",
+        "  " + ", ".join(f"W_{c['i']}{c['j']} {c['norm']:.4f}" for c in result["channels"]),
+        f"seed {result['seed']}, {result['seconds']:.0f} s, started from {file.name}",
+        f"asked of every loop: {Wanted()}",
+        "the box, sensors of 300 Hz, T_s = 100 us, delay in samples:",
+        *(f"  {name} {' '.join(map(str, values))}" for name, values in box.items()),
+    ]
+    text = "".join(f"# {line}\n" for line in notes) + "\n" + toml_text(content)
+    try:
+        path.write_text(text, encoding="utf-8")
+        margin = delay_margin(str(path))
+        path.write_text(f"# delay margin {1e3 * margin:.2f} ms at nominal\n{text}", "utf-8")
+    except OSError as problem:
+        raise UserError(f"--out {path}: {problem.strerror}") from None
