@@ -21,8 +21,9 @@ from gfm_hil.campaign import worker
 from gfm_hil.campaign.axes import find_axes
 from gfm_hil.campaign.execute import WorkerLost, execute, processes
 from gfm_hil.campaign.figure import draw_map
+from gfm_hil.campaign.loading import load_campaign
 from gfm_hil.campaign.result import summary
-from gfm_hil.campaign.spec import Campaign, load_campaign
+from gfm_hil.campaign.spec import Campaign
 from gfm_hil.campaign.store import Store
 from gfm_hil.campaign.worker import Record, run_chunk
 from gfm_hil.cli.main import main

@@ -1,28 +1,19 @@
-"""Campaign files: what is drawn for which scenario, in TOML, checked before anything starts."""
+"""What a campaign is: its file as pydantic models, and the scenario of each of its runs."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 import json
-import tomllib
 from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from gfm_hil.campaign.draw import Distribution, Model, draw
 from gfm_hil.campaign.paths import put
-from gfm_hil.errors import UserError
-from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, check_scenario, load_scenario
-from gfm_plant import make_plant
-
-# what a campaign decides itself; [set] may fix the last two
-_OWN = ("law", "seed", "mode", "link", "compare", "duration", "T_s")
-_SETTABLE = ("duration", "T_s")
-_TRIED = 2000  # runs, about a millisecond each; a later one that cannot be ends the campaign
+from gfm_hil.scenario import Scenario
 
 
 class Axes(Model):
@@ -91,109 +82,3 @@ class Campaign:
         """The scenario of a run, and the values drawn for it by their paths."""
         content, drawn = self.content(run, law)
         return Scenario.model_validate(content), drawn
-
-
-def find_campaign(name: str) -> Path:
-    """The file of a campaign: a path, or the name of a shipped one.
-
-    Raises:
-        UserError: neither exists.
-    """
-    if Path(name).is_file():
-        return Path(name)
-    shipped = {p.stem: p for f in SCENARIO_FOLDERS for p in (f / "campaigns").glob("*.toml")}
-    if name.removesuffix(".toml") in shipped:
-        return shipped[name.removesuffix(".toml")]
-    raise UserError(f"campaign {name}: no such file; shipped are {sorted(shipped)}")
-
-
-def load_campaign(name: str) -> Campaign:
-    """Read and check a campaign, its runs included.
-
-    Raises:
-        UserError: one line a mistake, each with its path, the value and what is allowed.
-    """
-    path = find_campaign(name)
-    try:
-        text = path.read_text(encoding="utf-8")
-        file = CampaignFile.model_validate(tomllib.loads(text))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
-        raise UserError(f"{path}: {problem}") from None
-    except ValidationError as problem:
-        raise UserError("\n".join(f"{path}: {_line(e)}" for e in problem.errors())) from None
-    base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
-    content = base.model_dump(mode="json")
-    content.update(compare=[], expect="completed")
-    _check_paths(path, file, content)
-    for target, value in file.set.items():
-        put(content, target, value)
-    laws = {law: _beside(path, law) for law in file.laws}
-    for label, law in laws.items():
-        check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
-    campaign = Campaign(path.stem, text, file, content, laws)
-    _check_ends(path, campaign)
-    _check_runs(path, campaign)
-    return campaign
-
-
-def _beside(path: Path, name: str) -> str:
-    """A file that lies beside the campaign's, or the name as it is."""
-    beside = path.parent / name
-    return str(beside.resolve()) if beside.is_file() else name
-
-
-def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> None:
-    """See that every path exists, is the campaign's to change and is given once."""
-    where = [(f"set.{p}", p) for p in file.set]
-    where += [(f"draw.{k}", p) for k, d in enumerate(file.draw) for p in d.paths()]
-    problems, seen = [], set()
-    for entry, target in where:
-        own = target.split(".")[0]
-        if own in _OWN and not (entry.startswith("set.") and own in _SETTABLE):
-            problems.append(f"{entry}: {target!r} is the campaign's own and cannot be set here")
-        elif target in seen:
-            problems.append(f"{entry}: {target!r} is given twice")
-        else:
-            seen.add(target)
-            try:
-                put(copy.deepcopy(content), target, 0)
-            except KeyError as problem:
-                problems.append(f"{entry}: {problem.args[0]}")
-    if len(set(file.laws)) < len(file.laws):
-        problems.append(f"laws = {file.laws}: each once")
-    if problems:
-        raise UserError("\n".join(f"{path}: {p}" for p in problems))
-
-
-def _check_ends(path: Path, campaign: Campaign) -> None:
-    """Try every distribution's extremes, one at a time, on the scenario as it is."""
-    for k, d in enumerate(campaign.file.draw):
-        for value in d.ends():
-            content = copy.deepcopy(campaign.base)
-            for target in d.paths():
-                put(content, target, value)
-            check_scenario(content, f"{path}: draw.{k}, {d.path} = {value}")
-
-
-def _check_runs(path: Path, campaign: Campaign) -> None:
-    """Make the runs' plants: what fails only in combination shows before anything starts."""
-    law = campaign.file.laws[0]
-    for run in range(min(campaign.file.runs, _TRIED)):
-        try:
-            scenario, _ = campaign.scenario(run, law)
-            make_plant(scenario.plant, scenario.T_s)
-        except ValueError:
-            check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
-            raise
-
-
-def _line(error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"])
-    text = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "value_error":
-        return f"{where}: {text}"
-    if error["type"] == "missing":
-        return f"{where}: missing"
-    if error["type"] == "extra_forbidden":
-        return f"{where}: unknown key"
-    return f"{where} = {error['input']!r:.60}: {text}"

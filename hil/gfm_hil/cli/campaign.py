@@ -18,8 +18,9 @@ from gfm_hil.campaign.alone import run_alone
 from gfm_hil.campaign.axes import find_axes
 from gfm_hil.campaign.execute import WorkerLost, cluster, execute, processes
 from gfm_hil.campaign.figure import draw_map
+from gfm_hil.campaign.loading import load_campaign
 from gfm_hil.campaign.result import VERDICTS, summary, verdict
-from gfm_hil.campaign.spec import Campaign, load_campaign
+from gfm_hil.campaign.spec import Campaign
 from gfm_hil.campaign.store import Store
 from gfm_hil.campaign.tables import print_campaign, print_record
 from gfm_hil.campaign.worker import Record, compile_once
