@@ -20,6 +20,7 @@ from gfm_hil.runner import Progress as TellProgress
 from gfm_hil.scenario import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
+_ABREAST = 4  # events in one table, so that it fits 80 columns
 
 
 def add_scenario_options(command: argparse.ArgumentParser) -> None:
@@ -75,6 +76,7 @@ def progress_bar(scenario: Scenario, label: str, quiet: bool) -> Iterator[tuple[
         TextColumn("{task.fields[sim]}"),
         TimeRemainingColumn(),
         console=console,
+        disable=not console.is_terminal,
         transient=True,
         refresh_per_second=5,
     ) as bar:
@@ -96,24 +98,24 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     colour = "green" if summary["status"] == summary["expected"] else "red"
     reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
     console.print(f"[bold {colour}]{summary['status']}[/]{reason}", highlight=False)
-    laws = escape(" → ".join(summary["laws"]))
+    console.print(escape(" → ".join(summary["laws"])), highlight=False)
     console.print(
-        f"{laws} · {summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
+        f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
         f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {summary['misses']} misses",
         highlight=False,
     )
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         console.print(escape(f"round trip [µs]: {text}"), highlight=False)
-    if summary["events"]:
-        console.print(events_table(summary["events"]))
+    for first in range(0, len(summary["events"]), _ABREAST):
+        console.print(events_table(summary["events"][first : first + _ABREAST]))
     console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
 
 
 def events_table(events: list[dict[str, Any]]) -> Table:
-    """One row a quantity, one column an event: fits a terminal."""
+    """One row a quantity, one column an event."""
     table = Table(box=None, pad_edge=False)
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     for event in events:
         table.add_column(escape(f"{event['label']} @ {event['t']:g} s"), justify="right")
     for name, title in EVENT_COLUMNS[2:]:

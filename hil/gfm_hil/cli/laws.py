@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law
 from gfm_runtime.lawfile import ElementSpec, LawFile
@@ -68,7 +68,8 @@ def call_list(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
         return 0
-    table = Table("law", "states", "elements of Φ(s)", "title", box=None, pad_edge=False)
+    columns = (Column("law", no_wrap=True), "states", "elements of Φ(s)", "title")
+    table = Table(*columns, box=None, pad_edge=False)
     for row in rows:
         cells = "  ".join(f"φ{k} {v}" for k, v in row["elements"].items())  # type: ignore[attr-defined]
         weak = "" if row["home_grid"]["L_g"] == 1 else " [dim](weak grid)[/]"  # type: ignore[index]

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from gfm_hil.scenario import load_scenario, shipped_scenarios
 
@@ -27,7 +27,8 @@ def call(options: argparse.Namespace) -> int:
                 for n, s in found.items()]  # fmt: skip
         print(json.dumps(rows, indent=2))
         return 0
-    table = Table("scenario", "mode", "laws", "s", "title", box=None, pad_edge=False)
+    columns = (Column("scenario", no_wrap=True), "mode", "laws", "s", "title")
+    table = Table(*columns, box=None, pad_edge=False)
     for name, s in found.items():
         table.add_row(name, s.mode, ", ".join(s.laws()), f"{s.duration:g}", s.title)
     Console().print(table)

@@ -43,7 +43,7 @@ class ZmqLink:
             self.close()
             verb = "bound" if side == "controller" else "connected to"
             raise UserError(
-                f"link.endpoint = {endpoint!r}: cannot be {verb}: {zmq.strerror(problem.errno)}"
+                f"link.endpoint = {endpoint!r}: cannot be {verb}: {zmq.strerror(problem.errno or 0)}"
             ) from None
 
     def send(self, message: bytes) -> bool:

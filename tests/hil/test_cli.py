@@ -1,0 +1,283 @@
+"""The command line: what each command prints, writes and returns."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.cli import main
+from gfm_hil.scenario import shipped_scenarios
+from gfm_hil.toml_out import toml_text
+from gfm_runtime import law_names
+
+SUMMARY = {
+    "title", "status", "reason", "expected", "laws", "link", "mode", "T_s", "ticks", "duration_s",
+    "misses", "bump_pu", "events",
+}  # fmt: skip
+EVENT = {
+    "t", "tick", "type", "label", "p_peak", "p_final", "settling_s", "overshoot_pct", "f_nadir_hz",
+    "f_peak_hz", "rocof_hz_s", "v_min", "v_max", "damping_ratio", "oscillation_hz",
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Each test in a folder of its own, on a terminal of 80 columns."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    return tmp_path
+
+
+@pytest.fixture
+def call(capsys):
+    """Run a command in this process: exit code, stdout, stderr."""
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        code = main(arguments)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+def scenario(**content: Any) -> str:
+    """A short scenario file in the folder."""
+    content = {"title": "short [run]", "duration": 0.3, "link": {"type": "inproc"}, **content}
+    Path("short.toml").write_text(toml_text(content))
+    return "short.toml"
+
+
+STEP = {"events": [{"t": 0.1, "type": "reference", "P_ref": 0.6}]}
+TRIP = {
+    "events": [{"t": 0.1, "type": "grid-phase-jump", "degrees": 20.0}],
+    "plant": {"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}},
+}
+
+
+def assert_fits(text: str) -> None:
+    """A terminal of 80 columns shows it whole: no line is longer and no cell is cut."""
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+
+
+def test_laws_lists_the_catalogue(call):
+    code, out, _ = call("laws")
+    assert code == 0
+    assert_fits(out)
+    listed = [line.split()[0] for line in out.splitlines() if line and line[0] != " "]
+    assert listed == ["law", *law_names()]
+
+
+def test_laws_as_json_is_a_list_of_objects_with_names(call):
+    code, out, _ = call("laws", "--json")
+    rows = json.loads(out)
+    assert code == 0
+    assert [row["name"] for row in rows] == list(law_names())
+    by_name = {row["name"]: row for row in rows}
+    assert by_name["mimo-gfm"]["order"] == 3
+    assert by_name["droop-5"]["elements"]["22"] == "P{IF×D}"
+
+
+def test_a_law_shows_its_matrix_its_source_and_the_discrete_matrices(call):
+    code, out, _ = call("laws", "show", "vsg-5")
+    assert code == 0
+    for part in ("Φ(s)", "omega_u  0     IF  IF       0   0", "Table II", "A =", "B_r =", "D_y ="):
+        assert part in out
+    code, out, _ = call("laws", "show", "vsg-5", "--json", "--T_s", "2e-4")
+    law = json.loads(out)
+    assert (code, law["name"], law["order"]) == (0, "vsg-5", 3)
+    assert law["phi"][1] == ["0", "IF", "IF", "0", "0"]
+    assert law["source"]
+    discrete = law["discrete"][0]
+    assert discrete["T_s"] == 2e-4
+    shapes = {n: np.shape(discrete[n]) for n in ("A", "B_r", "B_y", "C", "D_r", "D_y", "u_0")}
+    assert shapes == {
+        "A": (3, 3), "B_r": (3, 5), "B_y": (3, 5), "C": (3, 3), "D_r": (3, 5), "D_y": (3, 5),
+        "u_0": (3,),
+    }  # fmt: skip
+
+
+def test_a_scheduled_law_shows_each_stage(call):
+    assert len(json.loads(call("laws", "show", "mimo-gfm-scheduled", "--json")[1])["discrete"]) > 1
+    assert "stage 1" in call("laws", "show", "mimo-gfm-scheduled")[1]
+
+
+@pytest.mark.parametrize("name", law_names())
+def test_every_law_can_be_shown(name, call):
+    assert call("laws", "show", name)[0] == 0
+
+
+def test_scenarios_lists_what_ships(call):
+    code, out, _ = call("scenarios")
+    assert code == 0
+    assert_fits(out)
+    rows = json.loads(call("scenarios", "--json")[1])
+    assert [row["name"] for row in rows] == shipped_scenarios()
+    assert all(name in out for name in shipped_scenarios())
+
+
+def test_run_prints_summary_json_and_nothing_else(call):
+    code, out, _ = call("run", scenario(**STEP), "--json", "--out", "run")
+    found = json.loads(out)
+    assert code == 0
+    assert found == json.loads(Path("run/summary.json").read_text())
+    assert found.keys() >= SUMMARY
+    assert found["events"][0].keys() >= EVENT
+    assert (found["status"], found["laws"], found["ticks"]) == ("completed", ["mimo-gfm"], 3000)
+    assert (found["link"], found["mode"], found["misses"]) == ("inproc", "lockstep", 0)
+
+
+def test_run_leaves_a_report_that_needs_nothing_else(call):
+    call("run", scenario(**STEP, description="<b>bold</b>"), "--out", "run")
+    report = Path("run/report.html").read_text()
+    assert Path("run/signals.png").stat().st_size > 30_000
+    assert "data:image/png;base64," in report
+    assert "&lt;b&gt;bold&lt;/b&gt;" in report
+    assert "http" not in report
+    assert "P_ref = 0.6" in report
+
+
+def test_run_ends_with_a_table_that_fits_the_terminal(call):
+    events = [{"t": 0.02 * k, "type": "reference", "P_ref": 0.5 + 0.01 * k} for k in range(1, 11)]
+    code, out, _ = call("run", scenario(events=events), "--out", "run", "--no-figures")
+    assert code == 0
+    assert_fits(out)
+    for part in ("completed", "3000 ticks, 0 misses", "p peak [p.u.]", "V max [p.u.]", "P_ref"):
+        assert part in out
+    assert out.rstrip().endswith("run folder: run")
+
+
+def test_without_figures_there_are_none(call):
+    call("run", scenario(), "--out", "run", "--no-figures")
+    assert not list(Path("run").glob("*.png")) + list(Path("run").glob("*.html"))
+
+
+def test_options_override_the_file_and_the_run_folder_says_so(call):
+    import tomllib
+
+    code, out, _ = call(
+        "run", scenario(link={"type": "zmq"}, mode="realtime"), "--link", "inproc", "--law",
+        "vsg-2", "--duration", "0.05", "--seed", "9", "--out", "run", "--json", "--no-figures",
+    )  # fmt: skip
+    assert code == 0  # --link inproc alone implies lockstep
+    found = json.loads(out)
+    assert (found["laws"], found["ticks"], found["mode"]) == (["vsg-2"], 500, "lockstep")
+    resolved = tomllib.loads(Path("run/scenario.toml").read_text())
+    assert (resolved["seed"], resolved["law"], resolved["duration"]) == (9, "vsg-2", 0.05)
+
+
+def test_a_run_can_be_run_again_from_its_folder(call):
+    call("run", scenario(**STEP), "--out", "one", "--no-figures")
+    assert call("run", "one/scenario.toml", "--out", "two", "--no-figures")[0] == 0
+    with np.load("one/signals.npz") as one, np.load("two/signals.npz") as two:
+        for name in one:
+            assert one[name].tobytes() == two[name].tobytes()
+
+
+def test_a_run_without_out_gets_a_folder_of_its_own(call):
+    for _ in range(2):
+        assert call("run", scenario(duration=0.01), "--no-figures")[0] == 0
+    assert len(list(Path("runs").glob("short-*/summary.json"))) == 2
+
+
+def test_an_earlier_run_is_not_written_over(call):
+    call("run", scenario(), "--out", "run", "--no-figures")
+    before = Path("run/summary.json").read_text()
+    code, out, err = call("run", "short.toml", "--out", "run")
+    assert (code, out) == (2, "")
+    assert err == "gfmhil: run: is not empty; choose another --out\n"
+    assert Path("run/summary.json").read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("content", "expect", "code"),
+    [(STEP, "completed", 0), (STEP, "tripped", 3), (TRIP, "completed", 3), (TRIP, "tripped", 0)],
+)
+def test_the_exit_code_tells_whether_the_run_ended_as_expected(content, expect, code, call):
+    found, out, _ = call("run", scenario(**content, expect=expect), "--out", "run", "--no-figures")
+    assert found == code
+    assert out.startswith("tripped — over-current" if content is TRIP else "completed")
+
+
+def test_compare_draws_the_laws_side_by_side(call):
+    code, out, _ = call(
+        "compare", scenario(**STEP, plant={"factors": {"L_g": 10.0}}), "--laws", "vsg-2,droop-5",
+        "--out", "both",
+    )  # fmt: skip
+    assert code == 0
+    assert_fits(out)
+    assert "vsg-2" in out and "droop-5" in out and "p peak [p.u.]" in out
+    assert Path("both/comparison.png").stat().st_size > 30_000
+    found = json.loads(Path("both/comparison.json").read_text())
+    assert list(found) == ["vsg-2", "droop-5"]
+    for law, summary in found.items():
+        assert summary["laws"] == [law]
+        assert summary == json.loads(Path(f"both/{law}/summary.json").read_text())
+
+
+def test_compare_takes_the_laws_of_the_scenario_and_prints_json(call):
+    code, out, _ = call("compare", scenario(compare=["vsg-2", "vsg-5"]), "--json", "--out", "x")
+    assert code == 0
+    assert list(json.loads(out)) == ["vsg-2", "vsg-5"]
+
+
+def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
+    content = {
+        "events": [*TRIP["events"], {"t": 0.2, "type": "reference", "P_ref": 0.6}],
+        "plant": {"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}},
+    }
+    code, out, _ = call("compare", scenario(**content), "--laws", "mimo-gfm,vsg-2", "--out", "x")
+    assert code == 3
+    assert "tripped" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["compare", "short.toml"], "compare list is empty"),
+        (["compare", "short.toml", "--laws", "vsg-2,,vsg-1"], "none empty"),
+        (["compare", "short.toml", "--laws", "vsg-99"], "vsg-99"),
+        (["run", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["run", "short.toml", "--duration", "-1"], "duration"),
+        (["run", "short.toml", "--duration", "nan"], "duration"),
+        (["run", "short.toml", "--seed", "-1"], "seed"),
+        (["run", "short.toml", "--mode", "realtime"], "lockstep only"),
+        (["run", "short.toml", "--link", "zmq", "--endpoint", "x"], "tcp://host:port"),
+        (["run", "short.toml", "--out", "short.toml/x"], "not a folder"),
+        (["plant", "short.toml"], "a side alone needs a link"),
+        (["plant", "short.toml", "--link", "zmq"], "link.endpoint: not set"),
+        (["laws", "show", "vsg-99"], "vsg-99"),
+    ],
+)
+def test_wrong_use_is_one_line_and_code_2(arguments, part, call):
+    scenario()
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("gfmhil: ") and part in err
+    assert len(err.splitlines()) == 1
+    assert [path.name for path in Path().iterdir()] == ["short.toml"]
+
+
+def test_unknown_options_are_argparse_s_to_refuse(capsys):
+    with pytest.raises(SystemExit) as found:
+        main(["run", "short.toml", "--speed", "3"])
+    assert found.value.code == 2
+    assert "--speed" in capsys.readouterr().err
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", "gfm_hil", "laws", "--json"],
+            stdout=closed, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")

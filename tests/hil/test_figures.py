@@ -1,0 +1,57 @@
+"""Figures of recordings that are whole, cut short, or lack a side."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from gfm_hil.figures import draw_comparison, draw_run
+
+RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 0, "ticks": 0}
+
+
+def recording(ticks: int) -> dict[str, np.ndarray]:
+    """Signals with an oscillation, as a plant and a controller record them."""
+    t = np.arange(ticks) * 1e-4
+    names = ("p", "q", "omega_u", "omega_g", "V", "v_dc", "i")
+    wave = 1 + 0.1 * np.sin(2 * np.pi * 50 * t)
+    controller = ("ref_P_ref", "ref_Q_ref")
+    plant = (*(f"true_{n}" for n in names), "u_E_u", "u_i_u")
+    return {"t": t, **{n: wave.copy() for n in (*plant, *controller)}}
+
+
+def events(count: int) -> list[dict[str, object]]:
+    return [{"t": 0.01 * k, "label": f"event {k}"} for k in range(count)]
+
+
+@pytest.mark.parametrize("ticks", [1, 7, 3000, 50_000])
+def test_a_run_of_any_length_is_drawn_without_a_warning(ticks, make, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pictures = draw_run(
+            tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)}, []
+        )
+    assert [p.name for p in pictures] == ["signals.png"]
+    assert pictures[0].stat().st_size > 20_000
+
+
+def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):
+    signals = recording(50_000)
+    for name in ("ref_P_ref", "ref_Q_ref"):
+        signals[name][30_000:] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []}, [])
+
+
+def test_a_controller_alone_has_no_picture_of_the_plant(make, tmp_path):
+    signals = {"t": np.zeros(9), "ref_P_ref": np.zeros(9)}
+    assert draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []}, []) == []
+
+
+def test_many_laws_are_compared_in_one_figure(make, tmp_path):
+    runs = {f"law-{k}": recording(1000 + 100 * k) for k in range(9)}
+    draw_comparison(tmp_path / "comparison.png", make(), runs, events(2))
+    assert (tmp_path / "comparison.png").stat().st_size > 30_000
