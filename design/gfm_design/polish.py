@@ -116,16 +116,16 @@ def _tops(omega: Vector, size: Callable[[Vector], Vector]) -> list[tuple[float, 
     padded = np.concatenate([[-np.inf], g, [-np.inf]])
     tops = np.flatnonzero((g >= padded[:-2]) & (g > padded[2:]) & (g > 0.0))
     out = []
-    for k in tops:
+    for k in tops.tolist():
         best = (float(g[k]), float(omega[k]))
-        low, high = omega[max(k - 1, 0)], omega[min(k + 1, len(omega) - 1)]
+        low, high = float(omega[max(k - 1, 0)]), float(omega[min(k + 1, len(omega) - 1)])
         for _ in range(3):
             x = np.linspace(low, high, 9)
             y = size(x)
             j = int(np.argmax(y))
             if y[j] > best[0]:
                 best = (float(y[j]), float(x[j]))
-            low, high = x[max(j - 1, 0)], x[min(j + 1, 8)]
+            low, high = float(x[max(j - 1, 0)]), float(x[min(j + 1, 8)])
         out.append(best)
     return out
 

@@ -1,0 +1,67 @@
+"""The quick look and the polish against the norm with a guarantee."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gfm_design.encoding import Encoding
+from gfm_design.gains import free_gains
+from gfm_design.paper_problem import PaperProblem
+from gfm_design.polish import _peaks, polish
+from gfm_design.synthesis import UNSTABLE
+from gfm_runtime import law_file
+
+FILE = law_file("mimo-gfm")
+GAINS = free_gains(FILE)
+PRINTED = np.array([g.start for g in GAINS])
+PROBLEM = PaperProblem(FILE, GAINS)
+
+
+def gamma(values: np.ndarray) -> float:
+    return max(c.norm for c in PROBLEM.channels(values))
+
+
+def test_close_below_the_norm() -> None:
+    random = np.random.default_rng(0)
+    values = PRINTED * (1 + 0.05 * random.normal(size=(12, len(PRINTED))))
+    costs = PROBLEM.many(values)
+    stable = costs < UNSTABLE
+    assert stable.sum() > 5
+    for row, cost in zip(values[stable], costs[stable], strict=True):
+        norm = gamma(row)
+        assert 0.97 * norm <= cost <= norm * (1 + 1e-9)
+    for row, cost in zip(values, costs, strict=True):
+        assert PROBLEM(row) == pytest.approx(cost, rel=1e-12)
+
+
+def test_unstable_points_are_ranked_by_their_growth() -> None:
+    values = np.repeat(PRINTED[None], 3, axis=0)
+    values[:, [g.name for g in GAINS].index("k_34")] = (50.0, 70.0, 90.0)
+    costs = PROBLEM.many(values)
+    assert (costs > UNSTABLE).all()
+    assert np.argmax(costs) == np.argmax([PROBLEM.worst_mode(v).real for v in values])
+
+
+def test_slopes_of_peaks_against_differences() -> None:
+    code = Encoding(GAINS)
+    at, h = code.start, 1e-5
+
+    def highest(x: np.ndarray) -> float:
+        return gamma(code.values(x))
+
+    peak = max(_peaks(lambda x: PROBLEM.loop(code.values(x)), PROBLEM.weights, at))
+    assert peak.height == pytest.approx(highest(at), rel=1e-5)
+    for k in range(len(at)):
+        e = np.eye(len(at))[k] * h
+        slope = (highest(at + e) - highest(at - e)) / (2 * h)
+        assert peak.slope[k] == pytest.approx(slope, rel=1e-2, abs=1e-2)
+
+
+def test_polish_lowers_gamma_within_the_bounds() -> None:
+    code = Encoding(GAINS)
+    found = polish(
+        lambda x: PROBLEM.loop(code.values(x)), PROBLEM.weights, code.start, code.low, code.high
+    )
+    assert ((found >= code.low) & (found <= code.high)).all()
+    assert gamma(code.values(found)) < 1.45  # from 2.02

@@ -1,0 +1,107 @@
+"""gfmhil design gamma and tune: what they print, write and refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gfm_hil.cli.main import main
+from gfm_runtime import law_file
+
+Capture = pytest.CaptureFixture[str]
+
+
+def said(capsys: Capture, *arguments: str, code: int = 0) -> dict:
+    assert main(["design", *arguments, "--json"]) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def test_gamma(capsys: Capture) -> None:
+    out = said(capsys, "gamma", "--law", "mimo-gfm")
+    assert out["gamma"] == pytest.approx(2.0209, rel=5e-5)
+    assert [(c["i"], c["j"]) for c in out["channels"]] == [
+        (1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 1),
+    ]  # fmt: skip
+    assert set(out["channels"][0]) == {"i", "j", "norm", "omega_rad_s"}
+
+
+def test_gamma_of_other_gains(capsys: Capture) -> None:
+    # k_35 follows k_34 by the file's tie
+    out = said(capsys, "gamma", "--law", "vsg-2", "--gains", "k_34=1.9048, k_22=5.9801")
+    assert out["gamma"] == pytest.approx(15.97, rel=1e-3)
+
+
+def test_gamma_as_a_table(capsys: Capture) -> None:
+    assert main(["design", "gamma", "--law", "vsg-2"]) == 0
+    assert "γ = 15.97" in capsys.readouterr().out
+
+
+def test_gamma_of_the_sampled_loop(capsys: Capture) -> None:
+    out = said(capsys, "gamma", "--law", "vsg-2", "--discrete")
+    assert out["gamma"] > 0.0
+
+
+def test_an_unstable_loop_has_no_gamma(capsys: Capture) -> None:
+    out = said(capsys, "gamma", "--law", "vsg-2", "--gains", "k_34=50", code=3)
+    assert out["gamma"] is None
+    assert "unstable" in out["reason"]
+
+
+def test_weights_of_ones_own(capsys: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "w.toml"
+    path.write_text("[W_21]\nnum = [2.0]\nden = [1.0]\n")
+    out = said(capsys, "gamma", "--law", "mimo-gfm", "--weights", str(path))
+    assert len(out["channels"]) == 1
+    assert out["gamma"] == pytest.approx(2.0, rel=0.2)  # p follows P_ref, hardly above
+
+
+def test_tune(capsys: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    options = ("--starts", "1", "--evaluations", "640", "--seed", "4", "--quiet")
+    out = said(capsys, "tune", "--law", "vsg-2", *options, "--out", str(path))
+    assert out["gamma"] <= 15.98
+    assert out["gamma_full_order"] is None
+    assert {"gains", "seconds", "channels", "seed"} <= set(out)
+    assert out["gains"]["k_35"] == pytest.approx(20 * out["gains"]["k_34"])
+    assert law_file(str(path)).parameters["k_22"].value == out["gains"]["k_22"]
+
+
+def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
+    options = ("--starts", "1", "--evaluations", "320", "--quiet")
+    out = said(capsys, "tune", "--law", "droop-1", *options, code=3)
+    assert out["gamma"] is None
+    assert "mode at 50.7" in out["reason"]  # the synchronous resonance
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["gamma", "--law", "no-such-law"], "no-such-law"),
+        (["gamma", "--law", "vsg-2", "--gains", "k_99=1"], "k_99"),
+        (["gamma", "--law", "vsg-2", "--gains", "k_34"], "NAME=NUMBER"),
+        (["gamma", "--law", "vsg-2", "--gains", "k_34=nan"], "NAME=NUMBER"),
+        (["gamma", "--law", "vsg-2", "--gains", ""], "NAME=NUMBER"),
+        (["gamma", "--law", "vsg-2", "--gains", "k_34=1,k_34=2"], "twice"),
+        (["gamma", "--law", "vsg-2", "--gains", "k_22=0"], "k_22"),
+        (["gamma", "--law", "vsg-2", "--weights", "no-such-file"], "no-such-file"),
+        (["tune", "--law", "vsg-2", "--gains", "k_99=1"], "k_99"),
+        (["tune", "--law", "vsg-2", "--gains", "k_34=1e9"], "outside"),
+        (["tune", "--law", "vsg-2", "--only", "k_99"], "k_99"),
+        (["tune", "--law", "vsg-2", "--evaluations", "0"], "at least 1"),
+        (["tune", "--law", "vsg-2", "--seed", "-1"], "negative"),
+    ],
+)
+def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+    assert main(["design", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_refuses_an_improper_weight(capsys: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "w.toml"
+    path.write_text("[W_11]\nnum = [1.0, 1.0]\nden = [1.0]\n")
+    assert main(["design", "gamma", "--law", "vsg-2", "--weights", str(path)]) == 2
+    assert "W_11: improper" in capsys.readouterr().err
