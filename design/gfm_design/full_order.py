@@ -53,11 +53,12 @@ class FullOrder:
 
 
 def full_order(
-    plant: LinearPlant, weights: tuple[Weight, ...], seconds: float = 20.0
+    plant: LinearPlant, weights: tuple[Weight, ...], seconds: float = 15.0
 ) -> FullOrder | None:
     """The bound; None if the solver finished no part of the problem in time.
 
-    The solver runs in a process of its own: it may never return from a problem close to singular.
+    The solver runs in a process of its own, with ``seconds`` for each part: it may never return
+    from one close to singular.
 
     Raises:
         Missing: python-control or slycot is not installed.
@@ -68,11 +69,9 @@ def full_order(
         )
     columns = [tuple(w for w in weights if w.j == j) for j in (1, 2)]
     stacks = [c for c in columns if c] + [(w,) for w in weights]
-    found: dict[tuple[Weight, ...], float] = {}
-    for stack in dict.fromkeys(stacks):
-        gamma = _in_time(generalised_plant(plant, stack), seconds / len(stacks))
-        if gamma is not None:
-            found[stack] = gamma
+    stacks = list(dict.fromkeys(stacks))
+    solved = _in_time([generalised_plant(plant, stack) for stack in stacks], seconds)
+    found = {stack: g for stack, g in zip(stacks, solved, strict=False) if g is not None}
     if not found:
         return None
     first, second = (found.get(c) for c in columns)
@@ -114,26 +113,29 @@ def generalised_plant(plant: LinearPlant, stack: Sequence[Weight]) -> StateSpace
     return A, np.hstack([B_w, B_u]), np.vstack([C_z, C_y]), D
 
 
-def _in_time(system: StateSpace, seconds: float) -> float | None:
+def _in_time(systems: list[StateSpace], seconds: float) -> list[float | None]:
+    """The least norms of the first systems, as far as each came within ``seconds``."""
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_solve, args=(system, there), daemon=True)
+    process = spawn.Process(target=_solve, args=(systems, there), daemon=True)
     process.start()
     there.close()
-    try:
-        gamma: float | None = here.recv() if here.poll(seconds) else None
-    except EOFError:  # it died
-        gamma = None
+    done: list[float | None] = []
+    while len(done) < len(systems) and here.poll(seconds):
+        try:
+            done.append(here.recv())
+        except EOFError:  # it died
+            break
     process.kill()
     process.join()
-    return gamma
+    return done
 
 
-def _solve(system: StateSpace, out: Connection) -> None:
+def _solve(systems: list[StateSpace], out: Connection) -> None:
     import control
 
-    A, B, C, D = system
-    try:
-        out.send(float(control.hinfsyn(control.ss(*balance(A, B, C), D), 4, 3)[2]))
-    except Exception:  # slycot's own classes: ranks lost, no solution, no convergence
-        out.send(None)
+    for A, B, C, D in systems:
+        try:
+            out.send(float(control.hinfsyn(control.ss(*balance(A, B, C), D), 4, 3)[2]))
+        except Exception:  # slycot's own classes: ranks lost, no solution, no convergence
+            out.send(None)
