@@ -14,7 +14,7 @@ from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_controller
 from gfm_hil.timeline import Timeline
-from gfm_hil.waiting import await_message
+from gfm_hil.waiting import await_message, send_last
 from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED, missed
 
 
@@ -38,7 +38,7 @@ def run_controller(
 
     def leave(status: str, reason: str, state: int, code: int) -> None:
         timeline.end(status, reason, tick)  # type: ignore[arg-type]
-        link.send(writer.pack(tick, state, code, bench.u))
+        send_last(link, writer.pack(tick, state, code, bench.u))
 
     while timeline.running:
         wait_ns = T_ns if realtime else patience_ns

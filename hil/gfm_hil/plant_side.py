@@ -17,7 +17,7 @@ from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_plant
 from gfm_hil.timeline import Timeline
-from gfm_hil.waiting import await_message
+from gfm_hil.waiting import await_message, send_last
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.controller import REASONS, SAFE, STOPPED
 
@@ -135,5 +135,6 @@ def run_plant(
     timeline.end("completed", "", tick)
     assert timeline.outcome is not None
     state = SAFE if timeline.outcome.status == "tripped" else STOPPED
-    link.send(p.writer.pack(tick, state, int(timeline.outcome.status != "completed"), bench.y))
+    failed = int(timeline.outcome.status != "completed")
+    send_last(link, p.writer.pack(tick, state, failed, bench.y))
     return p.reader

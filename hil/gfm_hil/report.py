@@ -16,9 +16,9 @@ h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
 table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
 border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums} td.n,th.n{text-align:right}
 img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
-.status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555} .completed{background:#00734f}
-.tripped,.safe{background:#b34500} pre{background:#f6f6f6;padding:1rem;overflow-x:auto;
-font-size:13px}
+.status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
+.completed{background:#00734f} .tripped,.safe{background:#b34500}
+pre{background:#f6f6f6;padding:1rem;overflow-x:auto;font-size:13px}
 """
 
 EVENT_COLUMNS = (

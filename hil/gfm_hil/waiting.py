@@ -10,6 +10,8 @@ from gfm_hil.links import Link
 
 _SPIN_NS = 50_000  # longer takes processor time from the very threads that bring the answer
 
+_LAST_NS = 500_000_000
+
 
 def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
     """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
@@ -28,3 +30,13 @@ def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> 
             os.sched_yield()
         else:
             link.wait(min(0.02, (deadline_ns - now) * 1e-9))
+
+
+def send_last(link: Link, message: bytes) -> None:
+    """Hand over the message that ends a run, which the other side waits for.
+
+    Where there is no room, because the other side is behind, it gets a while to make some.
+    """
+    give_up = time.monotonic_ns() + _LAST_NS
+    while not link.send(message) and time.monotonic_ns() < give_up:
+        time.sleep(0.001)

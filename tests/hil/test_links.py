@@ -25,6 +25,7 @@ from gfm_hil.recording import Part, merge
 from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
 from gfm_hil.timeline import Timeline, read_log, worst
+from gfm_hil.waiting import send_last
 from gfm_runtime import law_names
 from gfm_runtime.controller import RUNNING, SAFE
 
@@ -337,6 +338,28 @@ def test_a_link_never_blocks_nor_queues_without_bound(endpoint):
         assert not link.wait(0.001)
     finally:
         link.close()
+
+
+def test_the_last_word_waits_for_room(endpoint):
+    """As it must when the other side is a hundred frames behind at the end of a run."""
+    plant, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
+    try:
+        while plant.send(b"frame"):
+            pass
+        heard: list[bytes] = []
+
+        def listen() -> None:
+            while b"last" not in heard and controller.wait(30):
+                heard.append(controller.receive())
+
+        thread = threading.Thread(target=listen)
+        thread.start()
+        send_last(plant, b"last")
+        thread.join()
+        assert heard[-1] == b"last"
+    finally:
+        plant.close()
+        controller.close()
 
 
 def test_the_safe_state_travels_in_the_frame():

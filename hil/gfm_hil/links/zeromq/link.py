@@ -10,7 +10,7 @@ import zmq
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import Side
 
-_LAST_WORDS = 200  # ms
+_LAST_WORDS = 500  # ms
 _ROOM = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
 
 
@@ -42,9 +42,8 @@ class ZmqLink:
         except zmq.ZMQError as problem:
             self.close()
             verb = "bound" if side == "controller" else "connected to"
-            raise UserError(
-                f"link.endpoint = {endpoint!r}: cannot be {verb}: {zmq.strerror(problem.errno or 0)}"
-            ) from None
+            why = zmq.strerror(problem.errno or 0)
+            raise UserError(f"link.endpoint = {endpoint!r}: cannot be {verb}: {why}") from None
 
     def send(self, message: bytes) -> bool:
         """Hand a message over; False if the peer has no room or is not there."""
