@@ -84,7 +84,7 @@ def _write(path: Path, file: LawFile, gains: dict[str, float], result: dict[str,
         f"gamma = {result['gamma']:.4f} of the paper's problem (Section III-B), P_ref = 0.5:",
         "  " + ", ".join(f"W_{c['i']}{c['j']} {c['norm']:.4f}" for c in result["channels"]),
         f"seed {result['seed']}, {result['seconds']:.0f} s, started from {file.name}",
-        f"asked of every loop: {Wanted()}",
+        "asked: " + ", ".join(f"{k} {v:g}" for k, v in asdict(Wanted()).items()),
         "the box, sensors of 300 Hz, T_s = 100 us, delay in samples:",
         *(f"  {name} {' '.join(map(str, values))}" for name, values in box.items()),
     ]

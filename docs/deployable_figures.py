@@ -1,0 +1,104 @@
+"""Figures of docs/deployable.md: sigma over delay and line of printed and deployable gains, and
+what the ceiling on gamma buys. Usage: python docs/deployable_figures.py    (about a minute)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gfm_design.box import Box, Point
+from gfm_design.gains import free_gains
+from gfm_design.robust import Loops
+from gfm_hil.box_bench import step_run
+from gfm_runtime import law_file
+
+FIGURES = Path(__file__).resolve().parent / "_static" / "figures"
+LAWS = ("mimo-gfm", "mimo-gfm-deployable")
+NAMES = ("printed gains", "deployable gains")
+RESISTANCE = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
+
+
+def sigma(law: str, points: list[Point]) -> Any:
+    """Largest sigma of a law at each point, 1/s."""
+    gains = free_gains(law_file(law))
+    return Loops(law_file(law), gains, points).sigma(np.array([g.start for g in gains]))
+
+
+def region() -> None:
+    """sigma over L_g and delay, worst over R_f, R_g in {0.1, 1, 3} and P_ref in {0, 0.5, 1}."""
+    lines, delays = np.geomspace(0.5, 30.0, 25), np.linspace(1.0, 10.0, 19)
+    figure = Figure(figsize=(8.0, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, law, name in zip(axes, LAWS, NAMES, strict=True):
+        box = Box(L_g=tuple(lines), delay=tuple(delays), P_ref=(0.0, 1.0), dc=("controlled",))
+        points = box.corners()
+        found = sigma(law, points).reshape(3, 3, len(lines), len(delays), 2)
+        worst = found.max(axis=(0, 1, 4)).T
+        shown = axis.contourf(
+            lines,
+            1e2 * delays,
+            worst,
+            [-1e3, -1.0, 0.0, 1e3],
+            colors=["#7fbf8f", "#f2e3a0", "#d98880"],
+        )
+        assert shown is not None
+        axis.plot([0.8, 20, 20, 0.8, 0.8], [100, 100, 500, 500, 100], "k--", lw=1)
+        axis.set(xscale="log", xlabel="L_g / nominal", title=name)
+    axes[0].set_ylabel("loop delay [µs]")
+    figure.suptitle("green: σ ≤ −1 1/s, yellow: stable, red: unstable; dashed: the box", fontsize=9)
+    figure.savefig(FIGURES / "deployable_region.png", dpi=150)
+
+
+def resistance() -> None:
+    """What limits alpha: sigma over R_f = R_g, worst of L_g, delay and P_ref."""
+    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    for dc in Box().dc:
+        worst = []
+        for R in RESISTANCE:
+            corners = replace(Box(), R_f=(R,), R_g=(R,), dc=(dc,)).corners()
+            worst.append(sigma(LAWS[1], corners).max())
+        axis.plot(RESISTANCE, worst, "o-", label=f"DC source {dc}")
+    axis.axhline(-1.0, color="k", ls="--", lw=1)
+    axis.axvline(0.1, color="k", ls="--", lw=1)
+    axis.set(
+        xscale="log", xlabel="R_f, R_g / nominal", ylabel="σ, worst of L_g, delay, P_ref [1/s]"
+    )
+    axis.legend(fontsize=8)
+    figure.savefig(FIGURES / "deployable_resistance.png", dpi=150)
+
+
+def overshoot() -> None:
+    """The nonlinear bench: overshoot of every step from 0.5 to 1 p.u. over L_g, both sources."""
+    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    for dc, colour in zip(Box().dc, ("C0", "C1"), strict=True):
+        points = Box(delay=(1.0, 5.0), P_ref=(0.5,), dc=(dc,)).corners()
+        runs = [step_run(p, LAWS[1]) for p in points]
+        shift = 0.97 if dc == "controlled" else 1.03
+        axis.plot(
+            [shift * r.point.L_g for r in runs],
+            [100 * r.overshoot for r in runs],
+            ".",
+            color=colour,
+            label=f"DC source {dc}",
+        )
+    axis.plot([0.7, 3.6, 3.6, 23], [5, 5, 20, 20], "k--", lw=1, label="asked for")
+    axis.set(xscale="log", xlabel="L_g / nominal", ylabel="overshoot [% of the step]")
+    axis.legend(fontsize=8)
+    figure.savefig(FIGURES / "deployable_overshoot.png", dpi=150)
+
+
+if __name__ == "__main__":
+    region()
+    resistance()
+    overshoot()
