@@ -4,6 +4,9 @@ import os
 
 from hypothesis import settings
 
+# One thread in BLAS: small matrices, and both processors are busy (see gfm_hil.blas).
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Figures are drawn without a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 

@@ -122,6 +122,7 @@ _MORE = {
     "Schedule.hysteresis": "relative, on every boundary",
     "Schedule.dwell_s": "least time between two changes, s",
     "Schedule.X_0": "estimate to start from, p.u.",
+    "Schedule.X_f": "reactance of the converter's own filter, taken off the estimate, p.u.",
 }
 _REFERENCES = {s.name: f"{s.description}, {s.low:g} to {s.high:g} {s.unit}" for s in group("ref")}
 _BOUNDS = (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤"))

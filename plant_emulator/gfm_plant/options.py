@@ -143,7 +143,7 @@ class Trip(Options):
 
 
 _TRIPS = {
-    "over_current": Trip(threshold=3.0, delay_s=0.001),
+    "over_current": Trip(threshold=3.0, delay_s=0.0),
     "over_voltage": Trip(threshold=1.4, delay_s=0.01),
     "under_voltage": Trip(threshold=0.4, delay_s=0.3),
     "dc_over_voltage": Trip(threshold=1.4, delay_s=0.001),

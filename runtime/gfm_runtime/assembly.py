@@ -100,7 +100,7 @@ class Controller:
             self.ctl["stage_X"][0, :n] = [*X[:-1], X_MAX]
             self.ctl["hysteresis"], self.ctl["since"] = schedule.hysteresis, 0
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
-            self.est[:] = make_impedance(self.T_s, schedule.X_0)
+            self.est[:] = make_impedance(self.T_s, schedule.X_0, X_f=schedule.X_f)
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
 
     def set(self, name: str, value: float, ramp_s: float = 0.0) -> None:

@@ -1,11 +1,12 @@
 """Estimate of the grid's reactance from the converter's own power swings, for gain scheduling.
 
-Around an operating point p moves with the angle as dp = K d(delta), K = V V_g cos(delta)/X, and
+Around an operating point p moves with the angle as dp = K d(delta), K = E V_g cos(delta)/X, and
 d(delta)/dt = omega_b (omega_u - omega_g) (Eq. (7) of the paper). Both sides pass the same
-washout, which removes the unknown omega_g and the operating point; K is the ratio of two
-exponentially forgetting sums, K = sum(p_w theta_w)/sum(theta_w^2). With p = V V_g sin(delta)/X the
-reactance follows without knowing delta: X = V V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u. and
-p, like K, that of the operating point, without the swing.
+low-pass, which removes the LC resonance, and the same washout, which removes the unknown omega_g
+and the operating point; K is the ratio of two exponentially forgetting sums,
+K = sum(p_w theta_w)/sum(theta_w^2). With p = E V_g sin(delta)/X the reactance follows without
+knowing delta: X = E V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u., E as V, and p, like K, that of
+the operating point. delta spans the converter's own filter as well, whose X_f is known and taken off.
 The estimate moves only while the sums hold enough excitation and p follows the angle (squared
 correlation above COHERENT), and is held otherwise: in a transient that comes from the grid p moves
 without the angle and would tell nothing.
@@ -21,12 +22,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 COHERENT = 0.7
+X_MIN = 1e-3  # p.u.; no line is shorter
 SETTLED = 5.0  # time constants of the washout; before, it still shows where it was started
 
 impedance_dtype = np.dtype(
     [
         ("T_s", "f8"),
         ("omega_b", "f8"),
+        ("X_f", "f8"),  # reactance of the converter's own filter, p.u.
+        ("smooth", "f8"),  # corner of the low-pass, rad/s
+        ("p_smooth", "f8"),
+        ("omega_smooth", "f8"),
         ("washout", "f8"),  # rad/s
         ("forget", "f8"),  # per tick
         ("excitation", "f8"),  # least sum(theta_w^2), rad^2
@@ -48,9 +54,11 @@ def make_impedance(
     T_s: float,
     X_0: float,
     omega_b: float = 100 * math.pi,
+    X_f: float = 0.0,
+    smooth_hz: float = 20.0,
     washout_hz: float = 0.5,
     memory_s: float = 0.5,
-    excitation: float = 1e-6,
+    excitation: float = 1e-7,
 ) -> NDArray[Any]:
     """Estimator record, one element.
 
@@ -58,6 +66,8 @@ def make_impedance(
         T_s: sampling time, s.
         X_0: estimate to start from, p.u.
         omega_b: base frequency, rad/s.
+        X_f: reactance between the controlled voltage and the point where p is measured, p.u.
+        smooth_hz: corner of the low-pass on p and on omega_u, Hz.
         washout_hz: corner of the washout on p and on the angle, Hz.
         memory_s: time constant of the forgetting sums, s.
         excitation: least mean square of the washed-out angle that may move X, rad^2.
@@ -69,6 +79,7 @@ def make_impedance(
         "T_s": T_s,
         "X_0": X_0,
         "omega_b": omega_b,
+        "smooth_hz": smooth_hz,
         "washout_hz": washout_hz,
         "memory_s": memory_s,
         "excitation": excitation,
@@ -78,6 +89,9 @@ def make_impedance(
             raise ValueError(f"{name} = {value} must be > 0")
     out = np.zeros(1, impedance_dtype)
     out["T_s"], out["omega_b"], out["X"] = T_s, omega_b, X_0
+    if not X_f >= 0.0:
+        raise ValueError(f"X_f = {X_f} must be >= 0")
+    out["X_f"], out["smooth"] = X_f, 2 * math.pi * smooth_hz
     out["washout"] = 2 * math.pi * washout_hz
     out["forget"] = T_s / memory_s
     out["excitation"] = excitation
@@ -89,7 +103,12 @@ def estimate(est, p, omega_u, V):
     """One tick of the estimator from p, omega_u and V (p.u.); returns X in p.u."""
     if est.age == 0:
         est.p_slow, est.omega_slow = p, omega_u
+        est.p_smooth, est.omega_smooth = p, omega_u
     est.age += 1
+    b = est.smooth * est.T_s
+    est.p_smooth += b * (p - est.p_smooth)
+    est.omega_smooth += b * (omega_u - est.omega_smooth)
+    p, omega_u = est.p_smooth, est.omega_smooth
     a = est.washout * est.T_s
     # twice through the washout, both of them: an angle under a constant omega_g is a ramp
     est.omega_slow += a * (omega_u - est.omega_slow)
@@ -103,5 +122,5 @@ def estimate(est, p, omega_u, V):
     coherent = est.s_pt * est.s_pt > COHERENT * est.s_pp * est.s_tt
     if est.age * a > SETTLED and est.s_tt > est.excitation and est.s_pt > 0.0 and coherent:
         K = est.s_pt / est.s_tt
-        est.X = V / math.sqrt(K * K + est.p_slow * est.p_slow)
+        est.X = max(V / math.sqrt(K * K + est.p_slow * est.p_slow) - est.X_f, X_MIN)
     return est.X

@@ -127,6 +127,7 @@ class Schedule(_Model):
     hysteresis: float = Field(0.15, ge=0, lt=1)
     dwell_s: float = Field(0.5, ge=0)
     X_0: float = Field(gt=0)
+    X_f: float = Field(0.0, ge=0)
 
 
 class LawFile(_Model):
