@@ -6,7 +6,7 @@ low-pass, which removes the LC resonance, and the same washout, which removes th
 and the operating point; K is the ratio of two exponentially forgetting sums,
 K = sum(p_w theta_w)/sum(theta_w^2). With p = E V_g sin(delta)/X the reactance follows without
 knowing delta: X = E V_g / sqrt(K^2 + p^2), with V_g taken as 1 p.u., E as V, and p, like K, that of
-the operating point. delta spans the converter's own filter as well, whose X_f is known and taken off.
+the operating point. delta spans the converter's own filter too, whose X_f is known and taken off.
 The estimate moves only while the sums hold enough excitation and p follows the angle (squared
 correlation above COHERENT), and is held otherwise: in a transient that comes from the grid p moves
 without the angle and would tell nothing.
