@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from pydantic import ValidationError
+
 
 class UserError(Exception):
     """Wrong input or a bench that cannot start; the message names the field, value and remedy."""
@@ -9,3 +13,27 @@ class UserError(Exception):
 
 class PeerLost(Exception):
     """The other side never came, stopped answering, or does not fit this side."""
+
+
+def lines(problem: ValidationError) -> list[str]:
+    """What pydantic found, one line a mistake: path, what is wrong, the value."""
+    return [_line(error) for error in problem.errors()]
+
+
+def _line(error: Any) -> str:
+    path = ".".join(str(part) for part in error["loc"])
+    text = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{path}: {text}" if path else text
+    if error["type"] == "missing":
+        return f"{path}: missing"
+    if error["type"] == "union_tag_not_found":
+        return f"{path}.type: missing"
+    if error["type"] == "union_tag_invalid":
+        context = error["ctx"]
+        return f"{path}.type = {context['tag']!r}: must be one of {context['expected_tags']}"
+    shown = repr(error["input"])
+    shown = shown if len(shown) < 60 else shown[:57] + "..."
+    if error["type"] == "extra_forbidden":
+        return f"{path} = {shown}: unknown key"
+    return f"{path}: {text}, not {shown}"

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from gfm_hil.bench import make_bench
 from gfm_hil.errors import UserError
+from gfm_hil.links import link_kind
 from gfm_hil.links.base import SIDES, Side
 from gfm_hil.recording import Part
 from gfm_hil.scenario import Scenario
@@ -62,7 +63,7 @@ class Processes:
             endpoint = self.scenario.link.endpoint
             if endpoint is None:  # a Unix socket's path may hold 107 bytes, so not the run folder
                 place = stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-"))
-                endpoint = f"ipc://{place}/link"
+                endpoint = link_kind(self.scenario.link.type).fresh(Path(place))
             self.notice("starting controller and plant …")
             self._sides = {side: self._start(side, endpoint) for side in SIDES}
             try:

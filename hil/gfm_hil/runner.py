@@ -15,6 +15,7 @@ from gfm_hil.processes import Processes, Progress
 from gfm_hil.recording import Part
 from gfm_hil.run_folder import Run, check_free, finish
 from gfm_hil.scenario import Scenario
+from gfm_hil.scenario_model import INPROC
 from gfm_hil.stopping import Interrupt
 from gfm_hil.timeline import Timeline
 from gfm_hil.toml_out import scenario_toml
@@ -50,7 +51,7 @@ def run_scenario(
     (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     outside = None
     with Interrupt() as interrupt:
-        if scenario.link.type == "inproc":
+        if scenario.link.type == INPROC:
             began = _run_here(bench, folder, progress, notice, interrupt)
         else:
             try:

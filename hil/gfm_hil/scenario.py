@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from gfm_hil.errors import UserError
+from gfm_hil.errors import UserError, lines
 from gfm_hil.events import GridImpedance, apply_grid_event
-from gfm_hil.scenario_model import LatePolicy, Link, References, Scenario
+from gfm_hil.scenario_model import INPROC, LatePolicy, Link, References, Scenario
 from gfm_plant import make_plant
 from gfm_runtime import LawError, discretise, load_law
 
@@ -58,7 +58,8 @@ def load_scenario(name: str, **changed: Any) -> Scenario:
     Args:
         name: path or shipped name.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
-            None leaves the file's value.
+            None leaves the file's value. Another link than the file's forgets its endpoint
+            and options.
 
     Raises:
         UserError: one line a mistake, each with its path, the value and what is allowed.
@@ -68,6 +69,10 @@ def load_scenario(name: str, **changed: Any) -> Scenario:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
         raise UserError(f"{path}: {problem}") from None
+    link, chosen = content.get("link"), changed.get("link__type")
+    if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
+        link.pop("endpoint", None)  # they are of the file's own link
+        link.pop("options", None)
     for key, value in changed.items():
         if value is not None:
             table: Any = content
@@ -88,7 +93,7 @@ def check_scenario(content: dict[str, Any], where: str) -> Scenario:
     try:
         scenario = Scenario.model_validate(content)
     except ValidationError as problem:
-        raise UserError("\n".join(f"{where}: {line}" for line in _lines(problem))) from None
+        raise UserError("\n".join(f"{where}: {line}" for line in lines(problem))) from None
     try:
         for law in [*scenario.laws(), *scenario.compare]:
             for stage in load_law(law).laws:
@@ -105,7 +110,7 @@ def _try_plant(scenario: Scenario) -> None:
     try:
         par, st = make_plant(scenario.plant, scenario.T_s)
     except ValidationError as problem:
-        raise UserError("; ".join(f"{converter}: {line}" for line in _lines(problem))) from None
+        raise UserError("; ".join(f"{converter}: {line}" for line in lines(problem))) from None
     except OSError as problem:
         raise UserError(f"{converter}: {problem.strerror}") from None
     except tomllib.TOMLDecodeError as problem:
@@ -118,27 +123,3 @@ def _try_plant(scenario: Scenario) -> None:
                 apply_grid_event(event, par, st)
             except ValueError as problem:
                 raise UserError(f"events.{k}: {problem}") from None
-
-
-def _lines(problem: ValidationError) -> list[str]:
-    """One line a mistake: path, what is wrong, the value."""
-    return [_line(error) for error in problem.errors()]
-
-
-def _line(error: Any) -> str:
-    path = ".".join(str(part) for part in error["loc"])
-    text = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "value_error":
-        return f"{path}: {text}" if path else text
-    if error["type"] == "missing":
-        return f"{path}: missing"
-    if error["type"] == "union_tag_not_found":
-        return f"{path}.type: missing"
-    if error["type"] == "union_tag_invalid":
-        context = error["ctx"]
-        return f"{path}.type = {context['tag']!r}: must be one of {context['expected_tags']}"
-    shown = repr(error["input"])
-    shown = shown if len(shown) < 60 else shown[:57] + "..."
-    if error["type"] == "extra_forbidden":
-        return f"{path} = {shown}: unknown key"
-    return f"{path}: {text}, not {shown}"

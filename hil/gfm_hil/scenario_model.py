@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from gfm_hil.errors import lines
 from gfm_hil.events import (
     Breaker,
     Event,
     LawChange,
     check_reference,
 )
+from gfm_hil.links import link_kind, link_names
 from gfm_plant import Plant, load_converter
 from gfm_runtime import law_file
 from gfm_runtime.signals import REF_NAMES, table_hash
@@ -24,27 +25,38 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+INPROC = "inproc"  # no link: both sides in one compiled loop
+
+
 class Link(_Model):
     """How the two sides exchange frames."""
 
-    type: Literal["zmq", "inproc"] = Field(
-        "zmq", description="zmq: two processes; inproc: one compiled loop, lockstep only"
-    )
+    type: str = Field("zmq", description="name of a link; inproc: one compiled loop, lockstep only")
     endpoint: str | None = Field(
-        None, description="ipc://… or tcp://host:port; a fresh ipc endpoint if none"
+        None,
+        description="where the sides meet, in the form of the link; a fresh one if none",
     )
+    options: dict[str, Any] = Field(default_factory=dict, description="the link's own options")
     peer_timeout_s: float = Field(
         0.5, gt=0, le=60, description="silence after which the other side counts as gone"
     )
     start_timeout_s: float = Field(60.0, gt=0, description="how long to wait for it at the start")
 
     @model_validator(mode="after")
-    def _an_endpoint(self) -> Link:
-        if self.endpoint is None:
+    def _known(self) -> Link:
+        if self.type == INPROC:  # endpoint and options wait for the day there is a link again
             return self
-        found = re.fullmatch(r"ipc://.+|tcp://[^/\s]+:(\d{1,5})", self.endpoint)
-        if found is None or int(found[1] or 0) > 65535:
-            raise ValueError(f"endpoint = {self.endpoint!r}: must be ipc://path or tcp://host:port")
+        if self.type not in link_names():
+            raise ValueError(
+                f"type = {self.type!r}: must be one of {sorted([INPROC, *link_names()])}"
+            )
+        kind = link_kind(self.type)
+        if self.endpoint is not None:
+            kind.check_endpoint(self.endpoint)
+        try:
+            kind.options.model_validate(self.options)
+        except ValidationError as problem:
+            raise ValueError("; ".join(f"options.{line}" for line in lines(problem))) from None
         return self
 
 
@@ -136,8 +148,15 @@ class Scenario(_Model):
                 )
             if isinstance(event, Breaker) and self.plant.grid.load_R is None:
                 problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
-        if self.mode == "realtime" and self.link.type == "inproc":
-            problems.append("link.type = 'inproc': runs in lockstep only; use zmq for real time")
+        if self.link.type == INPROC:
+            if self.mode == "realtime":
+                problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
+        else:
+            kind = link_kind(self.link.type)
+            try:
+                kind.check(kind.options.model_validate(self.link.options), self.T_s)
+            except ValueError as problem:
+                problems.append(f"link.options: {problem}")
         if problems:
             raise ValueError("; ".join(problems))
         return self

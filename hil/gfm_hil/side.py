@@ -53,7 +53,7 @@ def _run(
     if scenario.mode == "realtime":  # before the link starts threads, which inherit both
         own_processor(side)
         first = go_first()
-    link = open_link(scenario.link.type, side, endpoint)
+    link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
     folder.mkdir(parents=True, exist_ok=True)
     part = Part.create(folder, side, scenario.ticks)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))

@@ -19,7 +19,7 @@ from gfm_hil.frames import FrameReader, FrameWriter
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import SIDES, Side
-from gfm_hil.links.zeromq import ZmqLink
+from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.plant_side import run_plant
 from gfm_hil.recording import Part, merge
 from gfm_hil.scenario import Scenario

@@ -27,7 +27,7 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     """Options that override what a scenario says."""
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     command.add_argument("--mode", choices=["lockstep", "realtime"], help="override mode")
-    command.add_argument("--link", choices=["zmq", "inproc"], help="override link.type")
+    command.add_argument("--link", help="override link.type: zmq, inproc or another link there is")
     command.add_argument("--endpoint", help="override link.endpoint, e.g. tcp://127.0.0.1:5555")
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")

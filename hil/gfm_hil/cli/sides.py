@@ -10,8 +10,10 @@ from typing import Any
 from gfm_hil.bench import make_bench
 from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
 from gfm_hil.errors import UserError
+from gfm_hil.links import link_names
 from gfm_hil.links.base import Side
 from gfm_hil.run_folder import check_free, finish
+from gfm_hil.scenario_model import INPROC
 from gfm_hil.side import run_side
 from gfm_hil.stopping import end_with_parent
 from gfm_hil.toml_out import scenario_toml
@@ -36,8 +38,8 @@ def call(options: argparse.Namespace) -> int:
     """Carry one side out; returns the exit code."""
     side: Side = options.side
     scenario = resolve(options, law=options.law)
-    if scenario.link.type != "zmq":
-        raise UserError(f"link.type = {scenario.link.type!r}: a side alone needs a link: zmq")
+    if scenario.link.type == INPROC:
+        raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     folder = new_folder(options.out, side)
     if options.part:  # of `gfmhil run`, which puts the parts together
         end_with_parent()

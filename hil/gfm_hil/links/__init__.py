@@ -1,6 +1,16 @@
 """Links: how frames get from one process to the other. One folder a link, one interface."""
 
-from gfm_hil.links.base import Link, LinkFactory
-from gfm_hil.links.registry import open_link
+from gfm_hil.links.base import Link, LinkKind, LinkOptions
+from gfm_hil.links.port import Port, port_function
+from gfm_hil.links.registry import link_kind, link_names, open_link
 
-__all__ = ["Link", "LinkFactory", "open_link"]
+__all__ = [
+    "Link",
+    "LinkKind",
+    "LinkOptions",
+    "Port",
+    "link_kind",
+    "link_names",
+    "open_link",
+    "port_function",
+]

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+from gfm_hil.links.port import Port
 
 Side = Literal["controller", "plant"]
 SIDES: tuple[Side, ...] = ("controller", "plant")
@@ -14,6 +22,10 @@ class Link(Protocol):
     A message is delivered whole or not at all, and in order. Nothing is queued without bound:
     a message that the peer has no room for is dropped, and ``send`` says so.
     """
+
+    @property
+    def port(self) -> Port | None:
+        """The same end for compiled loops, or None: the loops then run in Python."""
 
     def send(self, message: bytes) -> bool:
         """Hand a message over; False if it had to be dropped."""
@@ -28,12 +40,43 @@ class Link(Protocol):
         """Let go of everything; what was sent last gets a fraction of a second to leave."""
 
 
-class LinkFactory(Protocol):
-    """Opens one end of a link."""
+class LinkOptions(BaseModel):
+    """Base of a link's own options, the table ``link.options`` of a scenario."""
 
-    def __call__(self, side: Side, endpoint: str) -> Link:
-        """Open the end of ``side`` at ``endpoint``.
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-        Raises:
-            gfm_hil.errors.UserError: the endpoint is malformed or occupied.
-        """
+
+def _fits(options: Any, T_s: float) -> None:
+    """Any options at any sampling time."""
+
+
+@dataclass(frozen=True)
+class LinkKind:
+    """What the bench knows of a link before it opens one.
+
+    Attributes:
+        name: as in ``link.type``.
+        text: what it is, in a few words.
+        pattern, form: what an endpoint must match, and the same in words.
+        fresh: an endpoint for a run of our own, given a new empty folder of short path.
+        open: opens the end of a side at an endpoint with checked options. Heavy imports belong
+            in there. Raises ``UserError`` where the endpoint is not to be had.
+        options: model of ``link.options``.
+        check: sees that options fit the sampling time in s; raises ValueError in one line.
+        exact: float64 arrives as sent, so that results are those of a run in process.
+    """
+
+    name: str
+    text: str
+    pattern: str
+    form: str
+    fresh: Callable[[Path], str]
+    open: Callable[[Side, str, Any], Link]
+    options: type[LinkOptions] = LinkOptions
+    check: Callable[[Any, float], None] = _fits
+    exact: bool = True
+
+    def check_endpoint(self, endpoint: str) -> None:
+        """Raises ValueError if it is not of this link's form."""
+        if re.fullmatch(self.pattern, endpoint) is None:
+            raise ValueError(f"endpoint = {endpoint!r}: must be {self.form}")

@@ -1,20 +1,59 @@
-"""Links by name."""
+"""Links by name: ours, and those that other packages register.
+
+A package adds a link by an entry point of the group ``gfmhil.links`` whose name is that of the
+link and which is a ``LinkKind``.
+"""
 
 from __future__ import annotations
 
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
 from gfm_hil.errors import UserError
-from gfm_hil.links.base import Link, LinkFactory, Side
-from gfm_hil.links.zeromq import ZmqLink
+from gfm_hil.links.base import Link, LinkKind, Side
 
-LINKS: dict[str, LinkFactory] = {"zmq": ZmqLink}
+GROUP = "gfmhil.links"
+
+_OURS = {"zmq": "gfm_hil.links.zeromq"}
 
 
-def open_link(name: str, side: Side, endpoint: str) -> Link:
+def link_names() -> list[str]:
+    """Names of all links there are."""
+    return sorted({*_OURS, *(point.name for point in entry_points(group=GROUP))})
+
+
+@cache
+def link_kind(name: str) -> LinkKind:
+    """The link of that name.
+
+    Raises:
+        ValueError: there is none, or a foreign one cannot be loaded.
+    """
+    if name in _OURS:
+        return import_module(_OURS[name]).KIND
+    for point in entry_points(group=GROUP, name=name):
+        try:
+            kind = point.load()
+        except Exception as problem:  # whatever a foreign module may raise
+            raise ValueError(f"link {name!r}: {point.value} cannot be loaded: {problem}") from None
+        if not isinstance(kind, LinkKind):
+            raise ValueError(f"link {name!r}: {point.value} is not a LinkKind")
+        return kind
+    raise ValueError(f"link.type = {name!r}: must be one of {link_names()}")
+
+
+def open_link(name: str, side: Side, endpoint: str, options: dict[str, Any] | None = None) -> Link:
     """Open one end of the link of that name.
 
     Raises:
         UserError: an unknown name, or what the link's factory raises.
     """
-    if name not in LINKS:
-        raise UserError(f"link.type = {name!r}: must be one of {sorted(LINKS)}")
-    return LINKS[name](side, endpoint)
+    try:
+        kind = link_kind(name)
+        kind.check_endpoint(endpoint)
+        checked = kind.options.model_validate(options or {})
+    except ValueError as problem:
+        raise UserError(f"link: {problem}") from None
+    return kind.open(side, endpoint, checked)

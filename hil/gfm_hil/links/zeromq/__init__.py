@@ -1,5 +1,29 @@
 """ZeroMQ over ipc or tcp."""
 
-from gfm_hil.links.zeromq.link import ZmqLink
+from __future__ import annotations
 
-__all__ = ["ZmqLink"]
+from pathlib import Path
+
+from gfm_hil.links.base import Link, LinkKind, LinkOptions, Side
+
+
+def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:
+    from gfm_hil.links.zeromq.link import ZmqLink
+
+    return ZmqLink(side, endpoint)
+
+
+def _fresh(folder: Path) -> str:
+    return f"ipc://{folder}/link"
+
+
+_PORT = r"([1-9]\d{0,3}|[1-5]\d{4}|6[0-4]\d{3}|65[0-4]\d\d|655[0-2]\d|6553[0-5])"
+
+KIND = LinkKind(
+    name="zmq",
+    text="ZeroMQ, on one machine or two",
+    pattern=rf"ipc://.+|tcp://[^/\s]+:{_PORT}",
+    form="ipc://path or tcp://host:port",
+    fresh=_fresh,
+    open=_open,
+)

@@ -9,6 +9,7 @@ import zmq
 
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import Side
+from gfm_hil.links.port import Port
 
 _LAST_WORDS = 500  # ms
 _ROOM = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
@@ -22,12 +23,12 @@ class ZmqLink:
         endpoint: ``ipc:///path`` or ``tcp://host:port``.
 
     Raises:
-        UserError: not such an endpoint, or it cannot be bound because it is in use.
+        UserError: it cannot be bound, as when it is in use.
     """
 
+    port: Port | None = None
+
     def __init__(self, side: Side, endpoint: str) -> None:
-        if not endpoint.startswith(("ipc://", "tcp://")):
-            raise UserError(f"link.endpoint = {endpoint!r}: must be ipc://path or tcp://host:port")
         if side == "controller" and endpoint.startswith("ipc://"):
             _refuse_if_served(endpoint)
         self._context = zmq.Context()

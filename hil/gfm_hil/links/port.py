@@ -1,0 +1,43 @@
+"""A link's end as compiled loops use it: two first-class functions and a handle.
+
+A loop is compiled once for all links: it gets the functions as values and calls them through
+their address (3 ns). They hold no Python object and never the interpreter's lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import cfunc, types
+from numpy.typing import NDArray
+
+#: what both functions look like: (handle, message) -> number
+PORT_CALL = types.int64(types.int64[::1], types.uint8[::1])
+
+
+@dataclass(frozen=True)
+class Port:
+    """One side's end of a link, for compiled loops.
+
+    Attributes:
+        handle: whatever the functions need (addresses, counters), int64; its owner keeps alive
+            what it points to, and a closed link must no longer be called through it.
+        send: hands the whole of ``message`` over: 1, or 0 if it had to be dropped.
+        receive: writes the next message to ``message``; returns its bytes, 0 if none has arrived.
+            One that is too long returns its length and is gone.
+        spins: looks in vain before a waiting loop begins to yield its processor: many where
+            the peer itself delivers, 0 where a thread of the link needs the processor for it.
+    """
+
+    handle: NDArray[np.int64]
+    send: Any
+    receive: Any
+    spins: int
+
+
+def port_function(function: Callable[[Any, Any], int]) -> Any:
+    """Compile a function of (handle, message) for a ``Port``; cached on disk."""
+    return cfunc(PORT_CALL, cache=True)(function)
