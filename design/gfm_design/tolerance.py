@@ -6,7 +6,7 @@ lost too: the converter cannot be there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,11 +68,15 @@ class GridStrength:
 
 def element_ranges(case: Case) -> dict[Element, Range | None]:
     """The range of every element; None for one whose value is 0 and has no percentage."""
-    found: dict[Element, Range | None] = {}
-    for name in ELEMENTS:
-        now = case.factor(name)
-        found[name] = _range(case, lambda f, n=name, v=now: {n: v * f}) if now > 0.0 else None  # type: ignore[misc]
-    return found
+    return {
+        name: element_range(case, (name,)) if case.factor(name) > 0.0 else None for name in ELEMENTS
+    }
+
+
+def element_range(case: Case, names: Sequence[Element]) -> Range:
+    """The range of one element, or of several together, each over its value in the case."""
+    now = {name: case.factor(name) for name in names}
+    return _range(case, lambda f: {name: v * f for name, v in now.items()})
 
 
 def grid_strength(case: Case) -> GridStrength:

@@ -26,9 +26,8 @@ from gfm_hil.cli.design.common import (
     weights_of,
 )
 from gfm_hil.errors import UserError
-from gfm_hil.toml_out import toml_text
+from gfm_hil.tuned_law import write_law
 from gfm_runtime import law_file
-from gfm_runtime.lawfile import LawFile
 
 
 def add(kinds: Any) -> None:
@@ -140,27 +139,3 @@ def _bound(problem: PaperProblem, result: dict[str, Any]) -> str:
     result["full_order_columns"] = list(found.columns)
     columns = ", ".join("not solved" if c is None else f"{c:.4g}" for c in found.columns)
     return f"no controller at all goes below {found.bound:.4g}; stack of P_ref, of ω_g: {columns}"
-
-
-def write_law(path: Path, file: LawFile, gains: dict[str, float], result: dict[str, Any]) -> None:
-    """The law file with its tuned gains and, as comments, what they were tuned for.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    content = file.model_dump(mode="json", exclude_none=True)
-    content["name"] = path.stem
-    content["title"] = f"{file.title}, tuned"
-    content["source"] = f"{file.source.strip()}; tuned by gfmhil design tune, see the comments"
-    for name, value in gains.items():
-        content["parameters"][name]["value"] = value
-        content["parameters"][name]["source"] = f"gfmhil design tune, seed {result['seed']}"
-    notes = [
-        f"# gamma = {result['gamma']:.6g} of the paper's problem (Section III-B), P_ref = 0.5",
-        *(f"# W_{c['i']}{c['j']}: {c['norm']:.6g}" for c in result["channels"]),
-        f"# {result['evaluations']} evaluations, {result['seconds']:.1f} s, seed {result['seed']}",
-    ]
-    try:
-        path.write_text("\n".join(notes) + "\n\n" + toml_text(content), encoding="utf-8")
-    except OSError as problem:
-        raise UserError(f"--out {path}: {problem.strerror}") from None
