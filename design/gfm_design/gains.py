@@ -2,7 +2,8 @@
 
 The paper pulls its gains out of the loop into a static K (Section III-B): the law's matrices are
 then affine in the gains. Whether that holds for a law as its file writes it is tried out once; if
-so, a law for new gains costs a few additions, and if not it is built anew from the file.
+so, a law for new gains costs a few additions, and if not ``gfm_design.batch`` builds it from the
+file, a whole population in one pass.
 """
 
 from __future__ import annotations
@@ -13,16 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.linear import LinearLaw, linearise_law
+from gfm_design.batch import realise_each
+from gfm_design.linear import LinearLaw, closed_law, error_map_slopes, linearise_law
 from gfm_design.operating_point import OperatingPoint
 from gfm_runtime.errors import LawError
-from gfm_runtime.expressions import evaluate
+from gfm_runtime.expressions import evaluate, evaluate_each
 from gfm_runtime.lawfile import LawFile, build_law
 from gfm_runtime.realise import realise
 
 Vector = NDArray[np.float64]
 
 _MATRICES = ("A", "B", "C", "D", "B_r", "D_r")
+_GOLDEN = (5.0**0.5 - 1.0) / 2.0  # its multiples modulo 1 never meet
 _AFFINE = 1e-9  # relative misfit at a point away from the base that still counts as affine
 
 
@@ -81,6 +84,18 @@ def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
     return out
 
 
+def _generic(gain: FreeGain, k: int) -> float:
+    """The k-th gain a little off its start, by a share of it that no other gain has."""
+    share = 1e-3 * (0.5 + (k + 1) * _GOLDEN % 1.0)
+    step = share * (abs(gain.start) or min(1.0, abs(gain.low), abs(gain.high)))
+    moved = gain.start + step if gain.start + step <= gain.high else gain.start - step
+    return min(max(moved, gain.low), gain.high)
+
+
+def _parts(law: LinearLaw) -> list[Vector]:
+    return [getattr(law, name) for name in _MATRICES]
+
+
 class GainedLaw:
     """A law around an operating point, as a function of its free gains.
 
@@ -100,6 +115,7 @@ class GainedLaw:
     ) -> None:
         self.file, self.gains = file, tuple(gains)
         self._op, self._ref, self._dc_control = op, ref, dc_control
+        self._off_start = np.array([_generic(g, k) for k, g in enumerate(self.gains)])
         self._affine = self._try_affine()
 
     @property
@@ -113,28 +129,55 @@ class GainedLaw:
         return tied(self.file, free)
 
     def __call__(self, values: Vector) -> LinearLaw:
-        """The law at these gains.
+        """The law at these gains, shape (n,); or the laws at many, shape (N,n), on a leading axis.
 
-        Raises:
-            LawError: the gains make no law.
+        Gains that make no law give matrices of nan.
         """
         if self._affine is None:
-            return self._build(values)
+            many = self._many(np.atleast_2d(values))
+            return many if np.ndim(values) == 2 else LinearLaw(*(m[0] for m in _parts(many)))
         base, slopes = self._affine
         return LinearLaw(
             *(m + np.tensordot(values, s, 1) for m, s in zip(base, slopes, strict=True))
         )
 
-    def _build(self, values: Vector) -> LinearLaw:
+    def exact(self, values: Vector) -> LinearLaw:
+        """The law as the runtime builds it, in lowest terms.
+
+        Raises:
+            LawError: the gains make no law.
+        """
         law = build_law(self.file, self.named(values))
         return linearise_law(law, realise(law), self._op, self._ref, self._dc_control)
+
+    def _many(self, values: Vector) -> LinearLaw:
+        values = np.vstack([self._off_start, values])  # whose first row tells the structure
+        numbers = {n: np.full(len(values), p.value) for n, p in self.file.parameters.items()}
+        numbers |= {g.name: values[:, k] for k, g in enumerate(self.gains)}
+        for name, p in self.file.parameters.items():
+            if p.tied is not None:
+                numbers[name] = evaluate_each(f"parameters.{name}.tied", p.tied, numbers)
+        law = closed_law(realise_each(self.file, numbers), self._map(numbers), self._dc_control)
+        return LinearLaw(*(m[1:] for m in _parts(law)))
+
+    def _map(self, numbers: Mapping[str, Vector]) -> tuple[Vector, Vector]:
+        """The error map's slopes; stacked, if it depends on free gains."""
+        kind = self.file.error_map
+        given = [v for v in (kind.R, kind.X) if v is not None]
+        shape = next(iter(numbers.values())).shape
+        impedance = [np.broadcast_to(evaluate_each("error_map", v, numbers), shape) for v in given]
+        rows = np.array(impedance).reshape(len(given), *shape).T
+        distinct, where = np.unique(rows, axis=0, return_inverse=True)
+        slopes = [error_map_slopes(kind.type, row, self._op.y, self._ref) for row in distinct]
+        r, y = (np.array(part) for part in zip(*slopes, strict=True))
+        return (r[0], y[0]) if len(distinct) == 1 else (r[where], y[where])
 
     def _try_affine(self) -> tuple[list[Vector], list[Vector]] | None:
         at = np.array([g.start for g in self.gains])
         step = np.array([0.1 * (abs(g.start) or 1.0) for g in self.gains])
-        here = self._build(at)
-        sides = [self._build(at + np.eye(len(at))[k] * step[k]) for k in range(len(at))]
-        far = self._build(at + 0.7 * step)
+        here = self.exact(at)
+        sides = [self.exact(at + np.eye(len(at))[k] * step[k]) for k in range(len(at))]
+        far = self.exact(at + 0.7 * step)
         base, slopes = [], []
         for name in _MATRICES:
             m = getattr(here, name)

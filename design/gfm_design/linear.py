@@ -9,6 +9,7 @@ noise and limits are left out. All in p.u. and s.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,34 +111,49 @@ def linearise_law(
     law: Law, ss: DiscreteLaw | LawStateSpace, op: OperatingPoint, ref: Matrix, dc_control: bool
 ) -> LinearLaw:
     """A law, discrete or continuous, around ``op``; ``dc_control`` says that row 1 is in force."""
-    mapped_r, mapped_y = _error_map_slopes(law, op.y, ref)
+    slopes = error_map_slopes(law.error_map, law.error_parameters, op.y, ref)
+    return closed_law(ss, slopes, dc_control)
+
+
+def closed_law(
+    ss: DiscreteLaw | LawStateSpace, slopes: tuple[Matrix, Matrix], dc_control: bool
+) -> LinearLaw:
+    """State space with the error map's slopes and the omega_u loop in it.
+
+    The matrices may have leading axes, one entry a law.
+    """
+    mapped_r, mapped_y = slopes
     # one matrix for (y, r), so that the omega_u loop is closed through both at once
     B = ss.B_r @ mapped_r + ss.B_y @ mapped_y
     D = ss.D_r @ mapped_r + ss.D_y @ mapped_y
-    D[:, NY:] += ss.D_u0
-    gain = 1.0 / (1.0 - D[OMEGA_ROW, OMEGA_COLUMN])  # omega_u = c x + d (y, r) + D omega_u
-    b, d = B[:, [OMEGA_COLUMN]] * gain, D[:, [OMEGA_COLUMN]] * gain
-    B[:, OMEGA_COLUMN], D[:, OMEGA_COLUMN] = 0.0, 0.0
-    c_omega, d_omega = ss.C[[OMEGA_ROW]], D[[OMEGA_ROW]].copy()
+    D[..., NY:] += ss.D_u0
+    # omega_u = c x + d (y, r) + D omega_u
+    gain = 1.0 / (1.0 - D[..., [OMEGA_ROW], :][..., [OMEGA_COLUMN]])
+    b, d = B[..., [OMEGA_COLUMN]] * gain, D[..., [OMEGA_COLUMN]] * gain
+    B[..., OMEGA_COLUMN], D[..., OMEGA_COLUMN] = 0.0, 0.0
+    c_omega, d_omega = ss.C[..., [OMEGA_ROW], :], D[..., [OMEGA_ROW], :].copy()
     A, B, C, D = ss.A + b @ c_omega, B + b @ d_omega, ss.C + d @ c_omega, D + d @ d_omega
     k = [i for i, row in enumerate(ss.rows) if dc_control or row != 0]
-    return LinearLaw(A[np.ix_(k, k)], B[k, :NY], C[:, k], D[:, :NY], B[k, NY:], D[:, NY:])
+    A, B, C = A[..., k, :][..., k], B[..., k, :], C[..., k]
+    return LinearLaw(A, B[..., :NY], C, D[..., :NY], B[..., NY:], D[..., NY:])
 
 
-def _error_map_slopes(law: Law, y: Matrix, ref: Matrix) -> tuple[Matrix, Matrix]:
+def error_map_slopes(
+    error_map: str, parameters: Sequence[float], y: Matrix, ref: Matrix
+) -> tuple[Matrix, Matrix]:
     """Slopes of the mapped r and of the mapped y over (y, r), both (5,10)."""
-    if law.error_map == "linear":
+    if error_map == "linear":
         zero, eye = np.zeros((NY, NY)), np.eye(NY)
         return np.hstack([zero, eye]), np.hstack([eye, zero])
     impedance = np.zeros(2)
-    impedance[: len(law.error_parameters)] = law.error_parameters
+    impedance[: len(parameters)] = parameters
     mapped = np.empty((2, 2, NY, 2 * NY))  # up or down, r or y, component, by which input
     for k, sign in enumerate((1.0, -1.0)):
         for j in range(2 * NY):
             inputs = np.concatenate([y, ref])
             inputs[j] += sign * _NUDGE
             z, r = inputs[:NY], inputs[NY:]
-            map_errors(ERROR_MAPS[law.error_map], impedance, r, z)
+            map_errors(ERROR_MAPS[error_map], impedance, r, z)
             mapped[k, 0, :, j], mapped[k, 1, :, j] = r, z
     slopes = (mapped[0] - mapped[1]) / (2 * _NUDGE)
     return slopes[0], slopes[1]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,7 +24,6 @@ from gfm_design.screen import Screen
 from gfm_design.synthesis import UNSTABLE, unstable_cost
 from gfm_plant import Plant, make_plant
 from gfm_runtime.discretise import discretise
-from gfm_runtime.errors import LawError
 from gfm_runtime.lawfile import LawFile, build_law
 from gfm_runtime.signals import NU
 
@@ -76,22 +73,33 @@ class PaperProblem:
         dc_control = self.plant.dc_source.mode == "controlled"
         self._rest = op, ref, dc_control
         self.law = GainedLaw(self.file, self.gains, *self._rest)
-        self._slopes = self._affine_loop() if self.law.is_affine else None
+        self._slopes = self._affine_loop() if self.gains and self.law.is_affine else None
 
     def _affine_loop(self) -> list[tuple[Vector, Vector]]:
         """T(s)'s matrices at gains of zero, and what each gain adds: they are affine too."""
-        base = self.loop(np.zeros(len(self.gains)))
-        ones = [self.loop(row) for row in np.eye(len(self.gains))]
-        return [(m, np.array([one[k] - m for one in ones])) for k, m in enumerate(base)]
+        base = performance_loop(self._linear, self.law(np.zeros(len(self.gains))))
+        ones = performance_loop(self._linear, self.law(np.eye(len(self.gains))))
+        return [(m, one - m) for m, one in zip(base, ones, strict=True)]
 
     @property
     def linear(self) -> LinearPlant:
         """The plant around its operating point."""
         return self._linear
 
+    def loops(self, values: Vector) -> StateSpace:
+        """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
+        if self._slopes is None:
+            return performance_loop(self._linear, self.law(values))
+        A, B, C, D = (m + np.tensordot(values, s, 1) for m, s in self._slopes)
+        return A, B, C, D
+
     def loop(self, values: Vector) -> StateSpace:
-        """T(s) at these gains."""
-        return performance_loop(self._linear, self.law(values))
+        """T(s) at these gains, with as few states as the law needs.
+
+        Raises:
+            LawError: the gains make no law.
+        """
+        return performance_loop(self._linear, self.law.exact(values))
 
     def __call__(self, values: Vector) -> float:
         """Cost: a close lower bound of gamma, or what an unstable loop costs."""
@@ -100,34 +108,20 @@ class PaperProblem:
     def many(self, values: Vector) -> Vector:
         """Costs of several sets of gains, one a row."""
         costs = np.full(len(values), 1.99 * UNSTABLE)
-        for rows, loops in self._stacks(values):
-            gammas, abscissae = self._screen(loops)
-            costs[rows] = np.where(np.isfinite(gammas), gammas, unstable_cost(abscissae))
+        A, B, C, D = self.loops(values)
+        good = np.flatnonzero(np.all([np.isfinite(m).all(axis=(1, 2)) for m in (A, B, C, D)], 0))
+        if len(good):
+            gammas, abscissae = self._screen((A[good], B[good], C[good], D[good]))
+            costs[good] = np.where(np.isfinite(gammas), gammas, unstable_cost(abscissae))
         return costs
-
-    def _stacks(self, values: Vector) -> Iterator[tuple[list[int], StateSpace]]:
-        """Loops of equal order stacked on axis 0, and which rows of ``values`` they belong to."""
-        if self._slopes is not None:
-            A, B, C, D = (m + np.tensordot(values, s, 1) for m, s in self._slopes)
-            yield [*range(len(values))], (A, B, C, D)
-            return
-        by_order: dict[int, list[tuple[int, StateSpace]]] = {}
-        for k, row in enumerate(values):
-            with suppress(LawError):  # such gains make no law
-                loop = self.loop(row)
-                if all(np.isfinite(m).all() for m in loop):  # a gain of zero may cost a state
-                    by_order.setdefault(len(loop[0]), []).append((k, loop))
-        for same in by_order.values():
-            A, B, C, D = (np.stack([loop[m] for _, loop in same]) for m in range(4))
-            yield [k for k, _ in same], (A, B, C, D)
 
     def polish(self, code: Encoding, point: Vector) -> Vector:
         """A lower gamma nearby, by its active peaks."""
         try:
             return polish(
-                lambda x: self.loop(code.values(x)), self.weights, point, code.low, code.high
+                lambda x: self.loops(code.values(x)), self.weights, point, code.low, code.high
             )
-        except (LawError, np.linalg.LinAlgError):
+        except np.linalg.LinAlgError:
             return point
 
     def worst_mode(self, values: Vector) -> complex:

@@ -110,25 +110,21 @@ def performance_loop(plant: LinearPlant, law: LinearLaw, D_q: float = D_Q) -> St
     """State space of T(s), or T(z), from w (2) to z (4) of the closed loop.
 
     Plant and law are both continuous, or both the steps of one tick. ``plant`` must be the ideal
-    one (no sensors): z speaks of true quantities.
+    one (no sensors): z speaks of true quantities. The law may be many, stacked on leading axes.
     """
-    n, m = len(plant.A), len(law.A)
-    by_p_ref = law.D_r[:, [_P_REF]]
-    A = np.block(
-        [
-            [plant.A + plant.B @ law.D @ plant.C, plant.B @ law.C],
-            [law.B @ plant.C, law.A],
-        ]
-    )
-    B = np.zeros((n + m, 2))
-    B[:n, :1], B[n:, :1] = plant.B @ by_p_ref, law.B_r[:, [_P_REF]]
-    B[:n, 1] = plant.B_d[:, 0]
+    n, m = len(plant.A), law.A.shape[-1]
+    by_p_ref = law.D_r[..., _P_REF]
+    many = law.D.shape[:-2]
+    A, B = np.empty((*many, n + m, n + m)), np.empty((*many, n + m, 2))
+    A[..., :n, :n], A[..., :n, n:] = plant.A + plant.B @ law.D @ plant.C, plant.B @ law.C
+    A[..., n:, :n], A[..., n:, n:] = law.B @ plant.C, law.A
+    B[..., :n, 0], B[..., n:, 0] = by_p_ref @ plant.B.T, law.B_r[..., _P_REF]
+    B[..., :n, 1], B[..., n:, 1] = plant.B_d[:, 0], 0.0
     p, q, V = plant.C[1], plant.C[3], plant.C[4]
-    omega_u = np.concatenate([law.D[1] @ plant.C, law.C[1]])
-    C = np.zeros((4, n + m))
-    C[0, :n], C[1, :n], C[2], C[3, :n] = -p, p, omega_u, q + V / D_q
-    D = np.zeros((4, 2))
-    D[0, 0], D[2, 0] = 1.0, by_p_ref[1, 0]
+    C, D = np.zeros((*many, 4, n + m)), np.zeros((*many, 4, 2))
+    C[..., 0, :n], C[..., 1, :n], C[..., 3, :n] = -p, p, q + V / D_q
+    C[..., 2, :n], C[..., 2, n:] = law.D[..., 1, :] @ plant.C, law.C[..., 1, :]
+    D[..., 0, 0], D[..., 2, 0] = 1.0, by_p_ref[..., 1]
     return A, B, C, D
 
 

@@ -34,7 +34,7 @@ class Peak(NamedTuple):
 
 
 def polish(
-    loop: Callable[[Vector], StateSpace],
+    loops: Callable[[Vector], StateSpace],
     weights: tuple[Weight, ...],
     start: Vector,
     low: Vector,
@@ -44,7 +44,7 @@ def polish(
     """Coordinates near ``start``, within [low, high], at which the highest peak is least.
 
     Args:
-        loop: T(s) at given coordinates.
+        loops: T(s) at given coordinates, stacked on axis 0 if they are.
         weights: W_ij.
         start: a stable point; an unstable one comes back as it is.
         rounds: steps at most.
@@ -52,7 +52,7 @@ def polish(
     from scipy.optimize import linprog
 
     at, reach = np.clip(start, low, high), 0.1
-    now = _peaks(loop, weights, at)
+    now = _peaks(loops, weights, at)
     while now and rounds > 0 and reach > _SMALLEST:
         rounds -= 1
         inverse = np.array([1.0 / p.height for p in now])
@@ -71,7 +71,7 @@ def polish(
         promised = (inverse + slopes @ step).min() - inverse.min()
         if promised <= 1e-9 * inverse.min():
             break
-        then = _peaks(loop, weights, at + step)
+        then = _peaks(loops, weights, at + step)
         gained = 1.0 / max(p.height for p in then) - inverse.min() if then else -np.inf
         if gained > _ACCEPTED * promised:
             at, now = at + step, then
@@ -82,10 +82,10 @@ def polish(
 
 
 def _peaks(
-    loop: Callable[[Vector], StateSpace], weights: tuple[Weight, ...], at: Vector
+    loops: Callable[[Vector], StateSpace], weights: tuple[Weight, ...], at: Vector
 ) -> list[Peak]:
     """The tall peaks of every channel; none if the loop is unstable."""
-    A, B, C, D = loop(at)
+    A, B, C, D = loops(at)
     values, vectors = np.linalg.eig(A)
     if values.real.max() >= 0.0:
         return []
@@ -105,7 +105,7 @@ def _peaks(
     tall = [p for p in found if p[0] > _TALL * highest]
     if not tall:
         return []
-    slopes = _loop_slopes(loop, at)
+    slopes = _loop_slopes(loops, at)
     modes = values, vectors, inverse
     return [Peak(height, _slope(modes, (B, C, D), slopes, w, x)) for height, x, w in tall]
 
@@ -130,22 +130,18 @@ def _tops(omega: Vector, size: Callable[[Vector], Vector]) -> list[tuple[float, 
     return out
 
 
-def _loop_slopes(loop: Callable[[Vector], StateSpace], at: Vector) -> list[StateSpace]:
-    """The loop's matrices differentiated by each coordinate, by central differences."""
-    out = []
-    for k in range(len(at)):
-        step = np.zeros(len(at))
-        step[k] = 1e-5
-        up, down = loop(at + step), loop(at - step)
-        a, b, c, d = ((u - v) / 2e-5 for u, v in zip(up, down, strict=True))
-        out.append((a, b, c, d))
-    return out
+def _loop_slopes(loops: Callable[[Vector], StateSpace], at: Vector) -> StateSpace:
+    """The loop's matrices differentiated by each coordinate (axis 0), by central differences."""
+    steps = 1e-5 * np.eye(len(at))
+    stacked = loops(np.vstack([at + steps, at - steps]))
+    A, B, C, D = ((m[: len(at)] - m[len(at) :]) / 2e-5 for m in stacked)
+    return A, B, C, D
 
 
 def _slope(
     modes: tuple[Vector, Vector, Vector],
     matrices: tuple[Vector, Vector, Vector],
-    slopes: list[StateSpace],
+    slopes: StateSpace,
     w: Weight,
     omega: float,
 ) -> Vector:
@@ -156,8 +152,7 @@ def _slope(
     right = vectors @ (gain * (inverse @ B[:, j]))
     left = ((C[i] @ vectors) * gain) @ inverse
     T = C[i] @ right + D[i, j]
-    dT = np.array(
-        [c[i] @ right + left @ a @ right + left @ b[:, j] + d[i, j] for a, b, c, d in slopes]
-    )
+    dA, dB, dC, dD = slopes
+    dT = dC[:, i] @ right + (dA @ right) @ left + dB[:, :, j] @ left + dD[:, i, j]
     weight = np.abs(w(np.array([1j * omega])))[0]
     return np.asarray(weight * (np.conj(T) * dT).real / np.abs(T))

@@ -6,6 +6,7 @@ import ast
 import math
 import operator
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from gfm_runtime.errors import LawError
 
@@ -37,6 +38,11 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
     if isinstance(result, complex) or not math.isfinite(result):
         raise LawError(where, f"{value!r} gives {result}, not a finite number")
     return result
+
+
+def evaluate_each(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
+    """As ``evaluate`` for parameters that are arrays; what is not finite is left in the array."""
+    return _walk(where, _parse(where, value), parameters)
 
 
 def _parse(where: str, value: float | str) -> ast.expr:

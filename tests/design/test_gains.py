@@ -8,7 +8,9 @@ import pytest
 from gfm_design.encoding import Encoding
 from gfm_design.gains import FreeGain, free_gains, tied
 from gfm_design.paper_problem import PaperProblem
+from gfm_design.synthesis import UNSTABLE
 from gfm_runtime import LawError, law_file, law_names
+from gfm_runtime.lawfile import parse_law
 
 
 def test_ties_follow() -> None:
@@ -38,15 +40,67 @@ def test_every_law_declares_its_gains(law: str) -> None:
     assert not {"D_p", "D_q", "R", "X"} & {n for n, p in file.parameters.items() if p.free}
 
 
-@pytest.mark.parametrize(("law", "affine"), [("mimo-gfm", True), ("vsg-11", False)])
-def test_a_law_as_a_function_of_its_gains(law: str, affine: bool) -> None:
+@pytest.mark.parametrize("law", law_names())
+def test_a_law_as_a_function_of_its_gains(law: str) -> None:
+    """Many at once against one by one from the file, by T(s)."""
     gains = free_gains(law_file(law))
     problem = PaperProblem(law_file(law), gains)
-    assert problem.law.is_affine is affine
-    values = np.array([g.start for g in gains]) * 1.1
-    built, quick = problem.law._build(values), problem.law(values)
-    for name in "ABCD":
-        np.testing.assert_allclose(getattr(quick, name), getattr(built, name), atol=1e-9)
+    code = Encoding(gains)
+    random = np.random.default_rng(1)
+    points = code.start + 0.3 * random.normal(size=(3, len(gains)))
+    values = code.values(np.vstack([code.start, points]))
+    quick = [*zip(*problem.loops(values), strict=True)]
+    assert len(quick) == len(values)
+    for row, loop in zip(values, quick, strict=True):
+        for s in 1j * np.logspace(-1, 4, 12):
+            exact, many = (
+                C @ np.linalg.solve(s * np.eye(len(A)) - A, B.astype(complex)) + D
+                for A, B, C, D in (problem.loop(row), loop)
+            )
+            np.testing.assert_allclose(many, exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize(("law", "affine"), [("mimo-gfm", True), ("vsg-11", False)])
+def test_affine_or_not(law: str, affine: bool) -> None:
+    gains = free_gains(law_file(law))
+    assert PaperProblem(law_file(law), gains).law.is_affine is affine
+
+
+OWN = """
+name = "own"
+title = "t"
+source = "s"
+[error_map]
+type = "hybrid-angle"
+R = "X / 10"
+X = "X"
+[phi]
+11 = { type = "PI", k = 90.0, k_i = 400.0 }
+22 = [{ type = "IF", k = 0.2, T = "T" }, { type = "D", T = 1.0 }, { type = "I", T = "T" }]
+34 = { type = "PI", k = "k", T = 0.1 }
+35 = { type = "PD", k = "k", T = "T", T_f = "0.01 - T" }
+[parameters]
+X = { value = 0.0174, unit = "p.u.", source = "s", free = [0.01, 0.1] }
+T = { value = 0.005, unit = "s", source = "s", free = [0.001, 0.1] }
+k = { value = 1.0, unit = "p.u.", source = "s", free = [-5.0, 5.0] }
+"""
+
+
+def test_gains_in_the_error_map_cancelling_factors_and_gains_that_make_no_law() -> None:
+    file = parse_law(OWN)
+    problem = PaperProblem(file, free_gains(file))
+    values = np.array([[0.02, 0.004, 2.0], [0.05, 0.006, -1.0], [0.05, 0.02, 1.0]])
+    A, B, C, D = problem.loops(values)
+    for k in (0, 1):
+        a, b, c, d = problem.loop(values[k])
+        assert len(a) == A.shape[1]
+        exact = c @ np.linalg.solve(10j * np.eye(len(a)) - a, b.astype(complex)) + d
+        many = C[k] @ np.linalg.solve(10j * np.eye(len(a)) - A[k], B[k].astype(complex)) + D[k]
+        np.testing.assert_allclose(many, exact, rtol=1e-9, atol=1e-12)
+    with pytest.raises(LawError, match="must be > 0"):
+        problem.loop(values[2])  # T_f = -0.01 s
+    assert np.isnan(A[2]).any()
+    assert problem(values[2]) > UNSTABLE
 
 
 def test_coordinates() -> None:

@@ -50,7 +50,7 @@ def test_slopes_of_peaks_against_differences() -> None:
     def highest(x: np.ndarray) -> float:
         return gamma(code.values(x))
 
-    peak = max(_peaks(lambda x: PROBLEM.loop(code.values(x)), PROBLEM.weights, at))
+    peak = max(_peaks(lambda x: PROBLEM.loops(code.values(x)), PROBLEM.weights, at))
     assert peak.height == pytest.approx(highest(at), rel=1e-5)
     for k in range(len(at)):
         e = np.eye(len(at))[k] * h
@@ -61,7 +61,7 @@ def test_slopes_of_peaks_against_differences() -> None:
 def test_polish_lowers_gamma_within_the_bounds() -> None:
     code = Encoding(GAINS)
     found = polish(
-        lambda x: PROBLEM.loop(code.values(x)), PROBLEM.weights, code.start, code.low, code.high
+        lambda x: PROBLEM.loops(code.values(x)), PROBLEM.weights, code.start, code.low, code.high
     )
     assert ((found >= code.low) & (found <= code.high)).all()
     assert gamma(code.values(found)) < 1.45  # from 2.02
