@@ -7,31 +7,19 @@ before it. Two data ids exist: y (plant to controller) and u (controller to plan
 
 from __future__ import annotations
 
-import struct
-import zlib
-from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.signals import TABLE_VERSION, Group, names
+from gfm_hil.codec import FAULTS as FAULT_NAMES
+from gfm_hil.codec import buffer, make_reader, pack, unpack, wire_dtype
+from gfm_runtime.signals import Group, names
 
-MAGIC = 0x4647  # "GF"
-HEADER = "<HBBBBHIQ"
 DATA_IDS: dict[Group, int] = {"y": 1, "u": 2}
 
 Fault = Literal["size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence"]
-FAULTS: tuple[Fault, ...] = (
-    "size",
-    "magic",
-    "version",
-    "source",
-    "crc",
-    "repeated",
-    "lost",
-    "out_of_sequence",
-)
+FAULTS: tuple[Fault, ...] = FAULT_NAMES  # type: ignore[assignment]
 
 
 class FrameError(ValueError):
@@ -42,16 +30,11 @@ class FrameError(ValueError):
         self.fault = fault
 
 
-def _layout(group: Group) -> struct.Struct:
-    return struct.Struct(f"{HEADER}{len(names(group))}dI")
-
-
 def frame_dtype(group: Group) -> np.dtype:
-    """The same layout as a NumPy record, for tools that read recorded frames."""
-    header = ["magic", "version", "data_id", "state", "reason", "spare", "sequence", "tick"]
-    kinds = ["<u2", "u1", "u1", "u1", "u1", "<u2", "<u4", "<u8"]
-    values = [(name, "<f8") for name in names(group)]
-    return np.dtype([*zip(header, kinds, strict=True), *values, ("crc", "<u4")])
+    """The layout as a NumPy record with a field a signal, for tools that read recorded frames."""
+    wire = wire_dtype(len(names(group)))
+    fields = [(name, wire[name]) for name in wire.names or () if name not in ("values", "crc")]
+    return np.dtype([*fields, *((name, "<f8") for name in names(group)), ("crc", "<u4")])
 
 
 class FrameWriter:
@@ -62,68 +45,61 @@ class FrameWriter:
     """
 
     def __init__(self, group: Group) -> None:
-        self._struct, self._id = _layout(group), DATA_IDS[group]
-        self._sequence = 0
-        self._buffer = bytearray(self._struct.size)
-        self._body = memoryview(self._buffer)[:-4]
+        self.sequence = np.zeros(1, np.int64)
+        self.frame, self.message = buffer(len(names(group)), DATA_IDS[group])
 
     def pack(self, tick: int, state: int, reason: int, values: NDArray[np.float64]) -> bytes:
         """One frame; ``values`` has the shape of the group, p.u."""
-        self._struct.pack_into(
-            self._buffer, 0, MAGIC, TABLE_VERSION, self._id, state, reason, 0,
-            self._sequence & 0xFFFFFFFF, tick, *values.tolist(), 0,
-        )  # fmt: skip
-        struct.pack_into("<I", self._buffer, len(self._body), zlib.crc32(self._body))
-        self._sequence += 1
-        return bytes(self._buffer)
+        pack(self.sequence, self.frame, self.message, tick, state, reason, values)
+        return self.message.tobytes()
 
 
-@dataclass
 class FrameReader:
     """Unpacks the other side's vector and counts every frame that fails a check, by its fault.
 
     A gap in the sequence is counted as that many ``lost`` frames, and the frame is used; a frame
     that is not newer than the last is ``repeated`` or ``out_of_sequence`` and is refused.
+
+    Args:
+        group: ``"y"`` or ``"u"``.
     """
 
-    group: Group
-    faults: dict[Fault, int] = field(default_factory=lambda: dict.fromkeys(FAULTS, 0))
-    tick: int = -1
-    state: int = 0
-    reason: int = 0
-    _next: int = 0
+    def __init__(self, group: Group) -> None:
+        self.group = group
+        self.record = make_reader()
+        self.data_id = DATA_IDS[group]
+        self.frame, self.message = buffer(len(names(group)), self.data_id)
 
-    def __post_init__(self) -> None:
-        self._struct, self._id = _layout(self.group), DATA_IDS[self.group]
+    @property
+    def faults(self) -> dict[Fault, int]:
+        """Frames refused or missing so far, by fault."""
+        return dict(zip(FAULTS, self.record["faults"][0].tolist(), strict=True))
 
-    def unpack(self, frame: bytes, values: NDArray[np.float64]) -> int:
+    @property
+    def tick(self) -> int:
+        """Tick of the last good frame, -1 before the first."""
+        return int(self.record["tick"][0])
+
+    @property
+    def state(self) -> int:
+        """The sender's state in the last good frame."""
+        return int(self.record["state"][0])
+
+    @property
+    def reason(self) -> int:
+        """The sender's reason in the last good frame."""
+        return int(self.record["reason"][0])
+
+    def unpack(self, message: bytes, values: NDArray[np.float64]) -> int:
         """Write the values of a good frame into ``values``; returns its tick.
 
         Raises:
             FrameError: the frame failed a check, was counted, and ``values`` is unchanged.
         """
-        if len(frame) != self._struct.size:
-            self._refuse("size")
-        magic, version, data_id, state, reason, _, sequence, tick, *payload, crc = (
-            self._struct.unpack(frame)
-        )
-        if crc != zlib.crc32(frame[:-4]):
-            self._refuse("crc")
-        if magic != MAGIC:
-            self._refuse("magic")
-        if version != TABLE_VERSION:
-            self._refuse("version")
-        if data_id != self._id:
-            self._refuse("source")
-        ahead = (sequence - self._next) & 0xFFFFFFFF
-        if ahead >= 0x80000000:
-            self._refuse("repeated" if ahead == 0xFFFFFFFF else "out_of_sequence")
-        self.faults["lost"] += ahead
-        self._next = (sequence + 1) & 0xFFFFFFFF
-        values[:] = payload
-        self.tick, self.state, self.reason = tick, state, reason
+        size = len(message)
+        if size == len(self.message):
+            self.message[:] = np.frombuffer(message, np.uint8)
+        tick = unpack(self.record, self.data_id, self.frame, self.message, size, values)
+        if tick < 0:
+            raise FrameError(FAULTS[int(self.record["fault"][0])])
         return int(tick)
-
-    def _refuse(self, fault: Fault) -> None:
-        self.faults[fault] += 1
-        raise FrameError(fault)
