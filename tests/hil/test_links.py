@@ -70,15 +70,16 @@ def both_sides(
     folder: Path,
     endpoint: str,
     touch: Callable[[Side, Link], Link] = lambda side, link: link,
+    name: str = "zmq",
 ) -> dict[str, np.ndarray]:
-    """Run a scenario over ZeroMQ; returns the signals and leaves the logs in ``folder``."""
+    """Run a scenario over a link; returns the signals and leaves the logs in ``folder``."""
     benches = {side: make_bench(scenario) for side in SIDES}
     parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
     for side in SIDES:
         compile_side(benches[side], parts[side])
 
     def call(side: Side) -> None:
-        link = open_link("zmq", side, endpoint)
+        link = open_link(name, side, endpoint)
         timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
         try:
             t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None)

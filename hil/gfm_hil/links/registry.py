@@ -16,7 +16,7 @@ from gfm_hil.links.base import Link, LinkKind, Side
 
 GROUP = "gfmhil.links"
 
-_OURS = {"zmq": "gfm_hil.links.zeromq"}
+_OURS = {"shm": "gfm_hil.links.shm", "zmq": "gfm_hil.links.zeromq"}
 
 
 def link_names() -> list[str]:

@@ -1,0 +1,28 @@
+"""Shared memory between two processes of one machine."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+
+from gfm_hil.links.base import Link, LinkKind, LinkOptions, Side
+
+
+def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:
+    from gfm_hil.links.shm.link import ShmLink
+
+    return ShmLink(side, endpoint)
+
+
+def _fresh(folder: Path) -> str:
+    return f"shm://{secrets.token_hex(8)}"
+
+
+KIND = LinkKind(
+    name="shm",
+    text="shared memory, two processes of one machine",
+    pattern=r"shm://[A-Za-z0-9._-]{1,200}",
+    form="shm://name, the name of 1 to 200 letters, digits, dots, dashes or underscores",
+    fresh=_fresh,
+    open=_open,
+)

@@ -1,0 +1,67 @@
+"""Memory that another process writes to, inside numba: ordered loads and stores at an address.
+
+numba has no atomics on the CPU; llvmlite has the instructions. An acquire load of what a release
+store wrote sees all that was written before that store (C11 and LLVM's "Atomic Memory Ordering").
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core.cgutils import raw_memcpy
+from numba.extending import intrinsic
+
+_WORD = ir.IntType(64)
+_BYTES = ir.IntType(8).as_pointer()
+
+
+@intrinsic
+def load_acquire(typingctx, address):
+    """The int64 at an address; what is read after it cannot be older."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = builder.inttoptr(arguments[0], _WORD.as_pointer())
+        return builder.load_atomic(pointer, "acquire", 8)
+
+    return types.int64(types.int64), make
+
+
+@intrinsic
+def store_release(typingctx, address, value):
+    """Write an int64 to an address; what was written before it is seen before it."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = builder.inttoptr(arguments[0], _WORD.as_pointer())
+        builder.store_atomic(arguments[1], pointer, "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64), make
+
+
+@intrinsic
+def pause(typingctx):
+    """Tell the processor that this is a spin: ``pause`` on x86, nothing elsewhere."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        module = builder.module
+        if module.triple.startswith(("x86_64", "i386", "i686")):
+            name = "llvm.x86.sse2.pause"
+            known = module.globals.get(name)
+            builder.call(known or ir.Function(module, ir.FunctionType(ir.VoidType(), []), name), [])
+        return context.get_dummy_value()
+
+    return types.void(), make
+
+
+@intrinsic
+def copy(typingctx, to, origin, size):
+    """Copy ``size`` bytes from one address to another."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        to, origin = (builder.inttoptr(address, _BYTES) for address in arguments[:2])
+        raw_memcpy(builder, to, origin, arguments[2], 1)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), make

@@ -1,0 +1,105 @@
+"""Shared-memory link: a ring each way, the controller makes the memory, the plant joins it."""
+
+from __future__ import annotations
+
+import time
+from multiprocessing.shared_memory import SharedMemory
+
+import numpy as np
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import Side
+from gfm_hil.links.port import Port
+from gfm_hil.links.shm import ring, segment
+
+_SPINS = 200  # looks, about 10 µs; on one processor the peer then needs it
+_FIRST_S, _LONGEST_S = 50e-6, 1e-3  # sleeps of a wait, from the first to the longest
+
+
+class ShmLink:
+    """One end of the link; implements ``gfm_hil.links.Link``.
+
+    Args:
+        side: the controller makes the memory, the plant joins it, however late it comes.
+        endpoint: ``shm://name``.
+
+    Raises:
+        UserError: it is in use or not of our making. Where the controller comes later, ``send``,
+            ``receive`` and ``wait`` of the plant may raise it too.
+    """
+
+    port: Port
+
+    def __init__(self, side: Side, endpoint: str) -> None:
+        self._side, self._endpoint = side, endpoint
+        self._memory: SharedMemory | None = None
+        self._handle = np.zeros(ring.HANDLE, np.int64)
+        self._message = np.empty(ring.LONGEST, np.uint8)
+        self._closed = False
+        self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
+        self._open()
+
+    def send(self, message: bytes) -> bool:
+        """Hand a message of 1 to 504 bytes over; False if the peer has no room or is not there."""
+        if len(message) > ring.LONGEST or not self._there():
+            return False
+        room = self._message[: len(message)]
+        room[:] = np.frombuffer(message, np.uint8)
+        return bool(ring.put(self._handle, room))
+
+    def receive(self) -> bytes | None:
+        """The next message, or None."""
+        size = self._there() and ring.take(self._handle, self._message)
+        return self._message[:size].tobytes() if size else None
+
+    def wait(self, seconds: float) -> bool:
+        """Sleep until a message is there, at most ``seconds``: it is looked for every millisecond
+        at least, and more often at first."""
+        until = time.monotonic() + seconds
+        step = _FIRST_S
+        while not (self._there() and ring.waiting(self._handle)):
+            left = until - time.monotonic()
+            if left <= 0:
+                return False
+            time.sleep(min(step, left))
+            step = min(2 * step, _LONGEST_S)
+        return True
+
+    def close(self) -> None:
+        """Let go of the memory; what was sent last stays readable to a peer that has joined."""
+        self._closed = True
+        self._handle[:] = 0
+        memory, self._memory = self._memory, None
+        if memory is not None:
+            (segment.remove if self._side == "controller" else segment.leave)(memory)
+
+    def _there(self) -> bool:
+        if self._memory is None and not self._closed:
+            self._open()
+        return self._memory is not None
+
+    def _open(self) -> None:
+        name = self._endpoint.removeprefix("shm://")
+        owner = self._side == "controller"
+        try:
+            memory = segment.create(name) if owner else segment.join(name)
+        except segment.Refused as problem:
+            verb = "created" if owner else "joined"
+            raise UserError(
+                f"link.endpoint = {self._endpoint!r}: cannot be {verb}: {problem}"
+            ) from None
+        if memory is None:
+            return
+        assert memory.buf is not None
+        words = np.frombuffer(memory.buf, np.int64)
+        out, into = (1, 0) if owner else (0, 1)
+        h = self._handle
+        h[ring.SEEN] = words[segment.HEADS[out] // ring.WORD]
+        h[ring.TAKEN] = words[segment.HEADS[into] // ring.WORD]
+        first = segment.RINGS[out] // ring.WORD
+        stamps = words[first : first + ring.RING // ring.WORD : ring.SLOT // ring.WORD]
+        h[ring.SENT] = stamps.max() >> ring.LENGTH_BITS
+        base = words.ctypes.data
+        h[ring.OUT_HEAD], h[ring.IN_HEAD] = base + np.array(segment.HEADS)[[out, into]]
+        h[ring.OUT], h[ring.IN] = base + np.array(segment.RINGS)[[out, into]]
+        self._memory = memory
