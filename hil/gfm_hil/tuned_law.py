@@ -1,4 +1,4 @@
-"""A law file with its tuned gains and, as comments, what they were tuned for."""
+"""What a synthesis found: its channels as plain data, and the law file with its gains."""
 
 from __future__ import annotations
 
@@ -6,9 +6,26 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from gfm_design.performance import Channel
 from gfm_hil.errors import UserError
 from gfm_hil.toml_out import toml_text
 from gfm_runtime.lawfile import LawFile
+
+
+def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
+    """gamma and its channels as plain data; a peak that is only a limit has no frequency."""
+    rows = [
+        {
+            "i": c.i,
+            "j": c.j,
+            "norm": c.norm,
+            "omega_rad_s": c.omega if np.isfinite(c.omega) else None,
+        }
+        for c in channels
+    ]
+    return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 
 def write_law(
@@ -18,7 +35,9 @@ def write_law(
     result: Mapping[str, Any],
     notes: Sequence[str] = (),
 ) -> None:
-    """Write it; its name is that of the path.
+    """Write a law file with its tuned gains and, as comments, what they were tuned for.
+
+    Its name is that of the path.
 
     Args:
         path: the new file.

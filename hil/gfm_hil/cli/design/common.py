@@ -6,7 +6,6 @@ import argparse
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -16,6 +15,7 @@ from gfm_design.performance import PAPER_WEIGHTS, Channel, Weight
 from gfm_design.weights_file import read_weights
 from gfm_hil.errors import UserError
 from gfm_hil.report import cell
+from gfm_hil.tuned_law import channels_as_json as channels_as_json
 
 
 def add_law_options(command: argparse.ArgumentParser) -> None:
@@ -77,20 +77,6 @@ def singular_is_users(
             ) from None
 
     return checked
-
-
-def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
-    """gamma and its channels as plain data; a peak that is only a limit has no frequency."""
-    rows = [
-        {
-            "i": c.i,
-            "j": c.j,
-            "norm": c.norm,
-            "omega_rad_s": c.omega if np.isfinite(c.omega) else None,
-        }
-        for c in channels
-    ]
-    return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 
 def print_channels(name: str, channels: Sequence[Channel]) -> None:

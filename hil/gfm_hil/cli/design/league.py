@@ -1,0 +1,136 @@
+"""gfmhil design league: every law tuned for the same problem, and what each then does."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from gfm_hil.campaign.execute import WorkerLost
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
+from gfm_hil.errors import UserError
+from gfm_hil.league import LEFT_OUT, Job, Row
+from gfm_hil.league_figures import draw
+from gfm_hil.league_run import kept, run
+from gfm_hil.league_tables import TABLES, markdown, print_league, ranked
+from gfm_hil.stopping import Interrupt
+from gfm_runtime import law_names
+
+
+def add(kinds: Any) -> None:
+    """Add the command to the parser."""
+    command = kinds.add_parser("league", help="every law tuned for the same problem, in a table")
+    command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
+    command.add_argument("--seed", type=int, default=0, help="of the searches")
+    command.add_argument("--evaluations", type=int, default=12000, help="of each start")
+    command.add_argument("--starts", type=int, default=2, help="the given start and random ones")
+    command.add_argument("--out", help="folder to write, or to go on with; runs/league-<time>")
+    command.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
+    command.add_argument("--json", action="store_true", help="print league.json, nothing else")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Make the league; a law that --out has already is not tuned again."""
+    jobs = _jobs(options)
+    folder = new_folder(options.out, "league")
+    _make(folder)
+    rows = {job.law: row for job in jobs if (row := kept(folder, job))}
+    missing = [job for job in jobs if job.law not in rows]
+    lost = None
+    with Interrupt() as interrupt, _bar(jobs, options) as (tell, done):
+        for row in rows.values():
+            done(row)
+
+        def keep(row: Row) -> None:
+            rows[row["law"]] = row
+            done(row)
+
+        if missing:
+            try:
+                run(missing, folder, options.jobs, tell, keep, lambda: interrupt.came)
+            except WorkerLost as problem:
+                lost = problem
+    order = ranked(list(rows.values()))
+    left_out = {name: why for name, why in LEFT_OUT.items() if not options.laws}
+    result = {"seed": options.seed, "laws": order, "left_out": left_out}
+    (folder / "league.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    for name in TABLES:
+        (folder / f"{name}.md").write_text(markdown(name, order), encoding="utf-8")
+    draw(folder, order)
+    if options.json:
+        print(json.dumps(result, indent=1))
+    else:
+        print_league(order, left_out)
+        Console(highlight=False, soft_wrap=True).print(f"folder: {folder}")
+    if len(rows) < len(jobs):
+        why = f"{lost}; " if lost else "interrupted; "
+        again = f"the same command with --out {folder} goes on"
+        print(f"gfmhil: {why}{len(jobs) - len(rows)} laws are missing; {again}", file=sys.stderr)
+        return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
+    return 0
+
+
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    for name, least in (("evaluations", 1), ("starts", 1), ("jobs", 1), ("seed", 0)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} {getattr(options, name)}: must be at least {least}")
+    rated = [name for name in law_names() if name not in LEFT_OUT]
+    names = split_laws(options.laws) if options.laws else rated
+    for name in names:
+        if name in LEFT_OUT:
+            raise UserError(f"--laws {name}: has no row; {LEFT_OUT[name]}")
+        if name not in rated:
+            raise UserError(f"--laws {name}: not in the catalogue; use some of {rated}")
+    return [
+        Job(name, options.seed, options.evaluations, options.starts)
+        for name in dict.fromkeys(names)
+    ]
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise UserError(f"--out {folder}: {problem.strerror}") from None
+
+
+@contextlib.contextmanager
+def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
+    """A bar of laws and one of each search; yields what tells them of evaluations and of rows."""
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[best]}"),
+        console=console,
+        transient=True,
+    ) as bar:
+        laws = bar.add_task("laws", total=len(jobs), best="")
+        searches: dict[str, Any] = {}
+
+        def tell(law: str, done: int, best: float) -> None:
+            if law not in searches:
+                total = options.evaluations * options.starts
+                searches[law] = bar.add_task(law, total=total, best="")
+            shown = f"γ {best:.4g}" if best < 1e6 else "looking for a stable loop"
+            bar.update(searches[law], completed=done, best=shown if math.isfinite(best) else "")
+
+        def done(row: Row) -> None:
+            if row["law"] in searches:
+                bar.remove_task(searches.pop(row["law"]))
+            bar.advance(laws)
+            found = f"γ {row['gamma']:.4g}" if row["gamma"] is not None else "not stabilised"
+            bar.console.print(f"{row['law']}: {found}, {row['seconds']:.0f} s")
+
+        yield tell, done

@@ -1,0 +1,147 @@
+"""One law of the league from its file to its row: search, law file, sampled loop, bench."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from gfm_design.league import Found, as_it_is, search, stands
+from gfm_design.league_modes import Culprit
+from gfm_design.linear import Mode
+from gfm_design.performance import Channel
+from gfm_design.tolerance import End, Range
+from gfm_hil.league_bench import EXPERIMENTS, experiment
+from gfm_hil.tuned_law import channels_as_json, write_law
+from gfm_runtime import law_file
+
+#: laws that run with their own gains, and why these are not searched
+AS_SHIPPED = {
+    "mimo-gfm-deployable": "tuned for a box of sampled loops; freed it would be mimo-gfm",
+}
+#: laws without a row, and why
+LEFT_OUT = {
+    "mimo-gfm-scheduled": "on the paper's grid its first stage is in force, which is mimo-gfm",
+}
+
+Row = dict[str, Any]
+Tell = Callable[[str, int, float], None]  # law, evaluations done, least gamma so far
+
+
+@dataclass(frozen=True)
+class Job:
+    """What decides a row."""
+
+    law: str
+    seed: int
+    evaluations: int
+    starts: int
+
+    def digest(self) -> str:
+        """Hash over the law's contents, the search and the version."""
+        content = [law_file(self.law).model_dump(), asdict(self), version("gfmhil")]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def make_row(job: Job, folder: Path, tell: Tell) -> Row:
+    """A law's row as plain data; its tuned gains go to ``folder``/laws/NAME-tuned.toml."""
+    file = law_file(job.law)
+    row: Row = {"law": job.law, "title": file.title, "digest": job.digest(), "seed": job.seed}
+    if job.law in AS_SHIPPED:
+        found = as_it_is(file)
+    else:
+        found = search(
+            file,
+            job.seed,
+            job.evaluations,
+            job.starts,
+            lambda done, best: tell(job.law, done, best),
+        )
+    row |= _found(found)
+    loop = stands(file, found.gains or {})
+    row |= {
+        "order": loop.order,
+        "sigma": loop.sigma,
+        "worst": _mode(loop.worst),
+        "delay_us": 1e6 * loop.delay.seconds if loop.delay else None,
+        "delay_hz": loop.delay.frequency_hz if loop.delay else None,
+        "L_g": _range(loop.L_g),
+        "R": _range(loop.R),
+    }
+    if found.gains is None:
+        return row
+    name = job.law
+    if job.law not in AS_SHIPPED:
+        path = folder / "laws" / f"{job.law}-tuned.toml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_law(path, file, found.gains, row, _notes(job, row))
+        name = str(path)
+    row["bench"] = {kind: experiment(kind, name) for kind in EXPERIMENTS}
+    return row
+
+
+def _found(found: Found) -> Row:
+    tuned = _channels(found.after)
+    return {
+        "free": list(found.free),
+        "before": _channels(found.before),
+        "gains": found.gains,
+        "droop_fixed": found.droop_fixed,
+        "evaluations": found.evaluations,
+        "seconds": found.seconds,
+        **tuned,
+    }
+
+
+def _channels(found: Sequence[Channel] | Culprit) -> Row:
+    """gamma and channels, or the reason why there are none."""
+    if isinstance(found, Culprit):
+        mode = {**_mode(found.mode), "states": [list(s) for s in found.states]}
+        return {"gamma": None, "channels": [], "reason": found.words(), "mode": mode}
+    return channels_as_json(found)
+
+
+def _mode(mode: Mode) -> Row:
+    return {"sigma": mode.sigma, "frequency_hz": mode.frequency_hz, "ratio": mode.ratio}
+
+
+def _range(found: Range | None) -> list[Row] | None:
+    """[low, high] as factors; ``limit`` says whether a mode or the operating point is lost."""
+
+    def end(e: End) -> Row:
+        return {
+            "factor": e.factor,
+            "limit": e.bounded,
+            "lost_hz": e.lost.frequency_hz if e.lost else None,
+        }
+
+    return [end(found.low), end(found.high)] if found else None
+
+
+def _notes(job: Job, row: Row) -> list[str]:
+    """What the law file says besides gamma, channels, seed and time."""
+    mode = row["worst"]
+    lines = [
+        "the problem: w = (P_ref, omega_g), z = (P_ref - p, p, omega_u, q + V/D_q), the paper's",
+        "  six weights; its converter ideal (no delay, no sensors), the loop continuous, the DC",
+        "  source a current that row 1 commands",
+        f"started from {job.law}, {job.starts} starts of at most {job.evaluations} evaluations",
+    ]
+    if row["droop_fixed"]:
+        lines.append("W_41 T_41(0) does not depend on the gains: chosen for the other channels")
+    late = "holds" if row["sigma"] < 0.0 else "is lost"
+    lines.append(
+        f"one sample (100 us) late the loop {late}: sigma {row['sigma']:+.3g} 1/s; least damping "
+        f"ratio {mode['ratio']:.4f} at {mode['frequency_hz']:.4g} Hz"
+    )
+    if row["delay_us"] is not None:
+        lines.append(f"u may act {row['delay_us']:.0f} us after the sample of y")
+    for name in ("L_g", "R"):
+        if row[name]:
+            low, high = (e["factor"] for e in row[name])
+            lines.append(f"one sample late it holds for {name} x {low:.3g} ... {high:.3g}")
+    return lines

@@ -1,0 +1,107 @@
+"""gfmhil design league: rows, tables, law files, going on, what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gfm_hil.cli.main import main
+from gfm_hil.league_bench import AT, TRACE_EVERY, experiment
+from gfm_hil.league_tables import number
+from gfm_runtime import law_file
+
+Capture = pytest.CaptureFixture[str]
+SHORT = ("--evaluations", "320", "--starts", "1", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("league") / "out"
+    assert main(["design", "league", "--laws", "droop-1,vsg-2", "--out", str(out), *SHORT]) == 0
+    return out
+
+
+def test_rows(folder: Path) -> None:
+    vsg, droop = json.loads((folder / "league.json").read_text())["laws"]
+    assert (vsg["law"], droop["law"]) == ("vsg-2", "droop-1")  # by gamma, none last
+    assert vsg["gamma"] == pytest.approx(15.973, rel=1e-3)
+    assert {(c["i"], c["j"]) for c in vsg["channels"]} >= {(1, 1), (4, 1)}
+    assert set(vsg["free"]) == {"k_22", "k_34"}
+    assert vsg["bench"]["p_ref"]["status"] == "completed"
+    assert vsg["bench"]["switchover"]["bump_pu"] < 1e-9
+    assert droop["gamma"] is None
+    assert "50.7" in droop["reason"]
+    assert "bench" not in droop
+
+
+def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Capture) -> None:
+    path = folder / "laws" / "vsg-2-tuned.toml"
+    row = json.loads((folder / "league.json").read_text())["laws"][0]
+    assert main(["design", "gamma", "--law", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["gamma"] == pytest.approx(row["gamma"], rel=1e-9)
+    file = law_file(str(path))
+    assert file.name == "vsg-2-tuned"
+    assert {n: file.parameters[n].value for n in row["gains"]} == row["gains"]
+
+
+def test_tables(folder: Path) -> None:
+    assert "| vsg-2 | 3 | 2 | 15.97 | **15.97** |" in (folder / "league_gamma.md").read_text()
+    assert "droop-1" not in (folder / "league_gamma.md").read_text()
+    assert "50.7" in (folder / "league_unstable.md").read_text()
+
+
+def test_what_is_done_is_kept(folder: Path, capsys: Capture) -> None:
+    def written() -> dict[str, int]:
+        return {p.name: p.stat().st_mtime_ns for p in (folder / "rows").iterdir()}
+
+    before = written()
+    again = ("design", "league", "--laws", "droop-1,vsg-2", "--out", str(folder))
+    assert main([*again, *SHORT]) == 0
+    assert written() == before
+    assert main([*again, *SHORT, "--seed", "1"]) == 0
+    assert all(written()[name] > before[name] for name in before)
+
+
+def test_an_experiment_measures_the_bench() -> None:
+    run = experiment("p_ref", "mimo-gfm")
+    trace = run["trace"]
+    at = round(AT / 1e-4) // TRACE_EVERY
+    assert trace[at - 1] == pytest.approx(0.5, abs=1e-3)
+    assert trace[-1] == pytest.approx(1.0, abs=1e-2)
+    overshoot = 100 * (max(trace) - run["p_final"]) / (run["p_final"] - run["p_before"])
+    assert run["overshoot_pct"] == pytest.approx(overshoot, abs=0.5)
+
+
+def test_an_experiment_that_ends_early() -> None:
+    run = experiment("late", "mimo-gfm")  # the printed gains do not hold one sample late
+    assert run["status"] == "tripped"
+    assert 0.0 < run["end_s"] < 4.5
+    assert "overshoot_pct" not in run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--laws", "no-such-law"], "not in the catalogue"),
+        (["--laws", "vsg-2,,mimo-gfm"], "none empty"),
+        (["--laws", "mimo-gfm-scheduled"], "first stage"),
+        (["--jobs", "0"], "at least 1"),
+        (["--seed", "-1"], "at least 0"),
+        (["--evaluations", "0"], "at least 1"),
+    ],
+)
+def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+    assert main(["design", "league", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0"), (1.42879, "1.43"), (-0.00132, "−0.00132"), (987.98, "988")],
+)
+def test_numbers(value: float | None, text: str) -> None:
+    assert number(value) == text
