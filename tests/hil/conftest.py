@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,13 @@ def run(make: Make, tmp_path: Path) -> RunIt:
         return run_scenario(make(**content), tmp_path / f"run{next(count)}", figures=False)
 
     return call
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """A fresh ipc endpoint; its path must be short, which a test's own folder need not be."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
+        yield f"ipc://{folder}/link"
 
 
 @pytest.fixture

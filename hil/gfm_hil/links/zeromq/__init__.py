@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gfm_hil.links.base import Link, LinkKind, LinkOptions, Side
+from gfm_hil.links.base import Link, LinkKind, Side
+from gfm_hil.links.zeromq.options import ZmqOptions
 
 
-def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:
+def _open(side: Side, endpoint: str, options: ZmqOptions) -> Link:
     from gfm_hil.links.zeromq.link import ZmqLink
 
-    return ZmqLink(side, endpoint)
+    return ZmqLink(side, endpoint, options)
 
 
 def _fresh(folder: Path) -> str:
@@ -26,4 +27,5 @@ KIND = LinkKind(
     form="ipc://path or tcp://host:port",
     fresh=_fresh,
     open=_open,
+    options=ZmqOptions,
 )

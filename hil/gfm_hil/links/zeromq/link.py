@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import warnings
 
 import zmq
 
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import Side
 from gfm_hil.links.port import Port
+from gfm_hil.links.zeromq.native import native_port
+from gfm_hil.links.zeromq.options import ZmqOptions
 
 _LAST_WORDS = 500  # ms
 _ROOM = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
+_DEFAULT = ZmqOptions()
 
 
 class ZmqLink:
@@ -21,6 +25,11 @@ class ZmqLink:
     Args:
         side: the controller binds, the plant connects (and keeps trying while nobody listens).
         endpoint: ``ipc:///path`` or ``tcp://host:port``.
+        options: of the link.
+
+    Attributes:
+        port: libzmq itself on the same socket; None if the options leave the frames to pyzmq, or
+            if it has no library that could be called (it says so).
 
     Raises:
         UserError: it cannot be bound, as when it is in use.
@@ -28,7 +37,7 @@ class ZmqLink:
 
     port: Port | None = None
 
-    def __init__(self, side: Side, endpoint: str) -> None:
+    def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
         if side == "controller" and endpoint.startswith("ipc://"):
             _refuse_if_served(endpoint)
         self._context = zmq.Context()
@@ -45,6 +54,10 @@ class ZmqLink:
             verb = "bound" if side == "controller" else "connected to"
             why = zmq.strerror(problem.errno or 0)
             raise UserError(f"link.endpoint = {endpoint!r}: cannot be {verb}: {why}") from None
+        if not options.portable:
+            self.port = native_port(self._socket)
+            if self.port is None:
+                warnings.warn("no libzmq that could be called: frames go by pyzmq", stacklevel=2)
 
     def send(self, message: bytes) -> bool:
         """Hand a message over; False if the peer has no room or is not there."""
@@ -66,6 +79,8 @@ class ZmqLink:
 
     def close(self) -> None:
         """Free the endpoint; the last words get a moment to leave."""
+        if self.port is not None:
+            self.port.handle[:] = 0  # its functions then do nothing
         self._socket.close(linger=_LAST_WORDS)
         self._context.term()
 

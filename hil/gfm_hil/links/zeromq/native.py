@@ -1,0 +1,83 @@
+"""libzmq itself for compiled loops: its functions are called by their address, without pyzmq.
+
+The library is the very one that pyzmq has loaded, so that both see the same socket. A socket may
+change threads behind a full fence; starting and joining a thread is one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import zmq
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from gfm_hil.links.port import Port, port_function
+
+#: elements of a port's handle: zmq_send, zmq_recv and the socket, as addresses; 0 once closed
+_SEND, _RECEIVE, _SOCKET = range(3)
+
+_DONTWAIT = int(zmq.DONTWAIT)
+
+
+def native_port(socket: zmq.Socket[bytes]) -> Port | None:
+    """The port of an open socket, or None where pyzmq shows no libzmq that could be called."""
+    found = _functions()
+    if found is None:
+        return None
+    handle = np.array([*found, socket.underlying], dtype=np.int64)
+    return Port(handle, _send, _receive, spins=0)  # libzmq's own thread needs the processor
+
+
+def _functions() -> tuple[int, int] | None:
+    """Addresses of zmq_send and zmq_recv.
+
+    They are looked for through pyzmq's extension module, which finds them in whatever library it
+    was linked to: that of its wheel, or the system's.
+    """
+    try:
+        from zmq.backend.cython import _zmq
+
+        library = ctypes.CDLL(_zmq.__file__)
+        send, receive = (
+            ctypes.cast(getattr(library, name), ctypes.c_void_p).value
+            for name in ("zmq_send", "zmq_recv")
+        )
+    except (ImportError, AttributeError, OSError):  # PyPy; linked in and hidden; no such loader
+        return None
+    return (send, receive) if send and receive else None
+
+
+@intrinsic
+def _transfer(typingctx, address, socket, message, size, flags):
+    """zmq_send or zmq_recv at an address, given addresses and sizes as int64; returns int32."""
+    int64 = ir.IntType(64)
+    pointer = ir.IntType(8).as_pointer()
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        where, *pointers, size, flags = arguments
+        kind = ir.FunctionType(ir.IntType(32), [pointer, pointer, int64, ir.IntType(32)])
+        function = builder.inttoptr(where, kind.as_pointer())
+        pointers = [builder.inttoptr(p, pointer) for p in pointers]
+        return builder.call(function, [*pointers, size, builder.trunc(flags, ir.IntType(32))])
+
+    return types.int32(*[types.int64] * 5), make
+
+
+@port_function
+def _send(handle, message):
+    if handle[_SOCKET] == 0:
+        return 0
+    sent = _transfer(handle[_SEND], handle[_SOCKET], message.ctypes.data, message.size, _DONTWAIT)
+    return 1 if sent == message.size else 0
+
+
+@port_function
+def _receive(handle, message):
+    if handle[_SOCKET] == 0:
+        return 0
+    got = _transfer(handle[_RECEIVE], handle[_SOCKET], message.ctypes.data, message.size, _DONTWAIT)
+    return max(0, got)

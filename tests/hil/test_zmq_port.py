@@ -1,0 +1,143 @@
+"""ZeroMQ called from compiled code: the same messages as by pyzmq, to the byte."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit, types
+
+from gfm_hil.links import Link
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.port import PORT_CALL
+from gfm_hil.links.zeromq.link import ZmqLink
+from gfm_hil.links.zeromq.options import ZmqOptions
+from gfm_hil.waiting import send_last
+
+from .conftest import home_plant
+from .test_links import PATIENT, RIG, assert_same, both_sides
+
+_FUNCTION = types.FunctionType(PORT_CALL)
+
+
+@njit(types.int64(_FUNCTION, types.int64[::1], types.uint8[::1]), nogil=True)
+def compiled(function, handle, message):
+    return function(handle, message)
+
+
+class ByPort:
+    """A link whose messages all go through its port."""
+
+    def __init__(self, link: Link, size: int = 512) -> None:
+        assert link.port is not None
+        self._link, self._port, self._room = link, link.port, np.zeros(size, np.uint8)
+
+    def send(self, message: bytes) -> bool:
+        content = np.frombuffer(bytearray(message), np.uint8)
+        return bool(compiled(self._port.send, self._port.handle, content))
+
+    def receive(self) -> bytes | None:
+        size = compiled(self._port.receive, self._port.handle, self._room)
+        return self._room[:size].tobytes() if size else None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+
+@pytest.fixture
+def ends(endpoint: str) -> Iterator[dict[Side, ZmqLink]]:
+    """Both ends of a link that has already carried a message each way."""
+    links = {side: ZmqLink(side, endpoint) for side in SIDES}
+    send_last(links["plant"], b"hello")
+    assert links["controller"].wait(30)
+    assert links["controller"].receive() == b"hello"
+    yield links
+    for link in links.values():
+        link.close()
+
+
+@pytest.mark.parametrize("by_port", [("plant",), ("controller",), SIDES])
+def test_lockstep_by_port_is_bit_for_bit_in_process(by_port, make, run, tmp_path, endpoint):
+    content = {
+        "law": "vsg-2",
+        "duration": 0.05,
+        "seed": 3,
+        "link": PATIENT,
+        "plant": {**RIG, **home_plant("vsg-2")},
+        "events": [{"tick": 50, "type": "reference", "P_ref": 0.55}],
+    }
+
+    def touch(side: Side, link: Link) -> Any:
+        return ByPort(link) if side in by_port else link
+
+    apart = both_sides(make(**content), tmp_path, endpoint, touch)
+    assert np.ptp(apart["true_p"]) > 0
+    assert_same(apart, run(**content).signals)
+
+
+def test_messages_of_any_size_either_way_in_order(ends):
+    sent = [bytes(range(k)) for k in (1, 68, 84, 255)]
+    for side, other in zip(SIDES, SIDES[::-1], strict=True):
+        for message in sent:
+            assert ByPort(ends[side]).send(message)
+        for k, message in enumerate(sent):  # by turns through the port and through pyzmq
+            link = ByPort(ends[other]) if k % 2 else ends[other]
+            assert ends[other].wait(30)
+            assert link.receive() == message
+        assert ByPort(ends[other]).receive() is None
+
+
+def test_a_message_that_is_too_long_is_gone_and_tells_its_length(ends):
+    send_last(ends["plant"], b"x" * 100)
+    send_last(ends["plant"], b"next")
+    assert ends["controller"].wait(30)
+    room, port = np.zeros(84, np.uint8), ends["controller"].port
+    assert compiled(port.receive, port.handle, room) == 100
+    assert room.tobytes() == b"x" * 84
+    assert ends["controller"].wait(30)
+    assert ByPort(ends["controller"]).receive() == b"next"
+
+
+def test_a_port_with_nobody_there_drops_and_one_that_is_closed_does_nothing(endpoint):
+    link = ZmqLink("plant", endpoint)
+    by_port = ByPort(link)
+    try:
+        assert not all([by_port.send(b"x" * 60) for _ in range(1000)])
+        assert by_port.receive() is None
+    finally:
+        link.close()
+    assert not by_port.send(b"x")
+    assert by_port.receive() is None
+
+
+def test_portable_leaves_the_frames_to_pyzmq(endpoint):
+    link = ZmqLink("plant", endpoint, ZmqOptions(portable=True))
+    link.close()
+    assert link.port is None
+
+
+@pytest.mark.parametrize("missing", ["zmq.backend.cython", "ctypes"])
+def test_without_a_libzmq_to_call_it_says_so_and_goes_on(missing, endpoint):
+    """As with PyPy, or a pyzmq whose extension does not show the library linked into it."""
+    hide = {
+        "zmq.backend.cython": "import sys; sys.modules['zmq.backend.cython'] = None",
+        "ctypes": "import ctypes; ctypes.CDLL = lambda path: object()",
+    }[missing]
+    program = f"""
+import zmq
+from gfm_hil.links import open_link
+{hide}
+ends = [open_link("zmq", side, {endpoint!r}) for side in ("controller", "plant")]
+assert ends[0].port is None
+ends[1].send(b"frame")
+assert ends[0].wait(30) and ends[0].receive() == b"frame"
+for end in ends:
+    end.close()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "frames go by pyzmq" in done.stderr
