@@ -23,6 +23,7 @@ MODULES = {
     "run": "run",
     "compare": "compare",
     "campaign": "campaign",
+    "bench": "bench",
     "laws": "laws",
     "design": "design",
     "scenarios": "scenarios",

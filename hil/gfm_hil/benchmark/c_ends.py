@@ -1,0 +1,115 @@
+"""The ends of the C ping-pongs: what is set up from Python, before and after the C loops run."""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.benchmark.c_code import NoCompiler, load_c
+from gfm_hil.links.base import Side
+
+_SLOTS = 2 * 1024  # bytes, two slot_t
+_WORD = ctypes.c_int64
+_ORDER: dict[Side, int] = {"controller": 1, "plant": -1}
+_ROOM = 64  # messages, as in the link
+
+
+class CEnd:
+    """One end of a C ping-pong.
+
+    Args:
+        library: pingpong.c, compiled.
+        kind: ``shm``, ``udp`` or ``zmq``.
+        arguments: what the kind's functions begin with, as ctypes values.
+        size: bytes that this side sends.
+        keep: what has to be let go of in the end.
+    """
+
+    compiled = True
+
+    def __init__(
+        self, library: Path, kind: str, arguments: list[Any], size: int, keep: ExitStack
+    ) -> None:
+        functions = load_c(library)
+        self._ping, self._pong = functions[f"ping_{kind}"], functions[f"pong_{kind}"]
+        self._ping.restype, self._pong.restype = _WORD, None
+        self._arguments, self._size, self._keep = arguments, _WORD(size), keep
+
+    def ping(
+        self, stop: NDArray[np.int64], period_ns: int, duration_ns: int, took: NDArray[np.int64]
+    ) -> int:
+        """Ask; see ``gfm_hil.benchmark.pingpong``."""
+        return int(
+            self._ping(
+                *self._arguments, self._size, _WORD(period_ns), _WORD(duration_ns),
+                ctypes.c_void_p(took.ctypes.data), _WORD(len(took)),
+            )
+        )  # fmt: skip
+
+    def pong(self, stop: NDArray[np.int64]) -> None:
+        """Answer until told to stop."""
+        self._pong(*self._arguments, self._size, ctypes.c_void_p(stop.ctypes.data))
+
+    def close(self) -> None:
+        """Let go of sockets and memory."""
+        self._keep.close()
+
+
+def open_shm(library: Path, side: Side, path: str, size: int) -> CEnd:
+    """Shared memory: a file that both map."""
+    if side == "controller":
+        Path(path).write_bytes(bytes(_SLOTS))
+    slots = np.memmap(path, np.uint8, "r+")
+    keep = ExitStack()
+    keep.callback(slots.flush)  # holds the mapping as long as the end
+    first = _WORD(side == "controller")
+    return CEnd(library, "shm", [ctypes.c_void_p(slots.ctypes.data), first], size, keep)
+
+
+def open_udp(library: Path, side: Side, ports: str, size: int) -> CEnd:
+    """UDP on the loopback interface; ``ports`` are those of the controller and the plant."""
+    keep = ExitStack()
+    end = keep.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    own, other = (("127.0.0.1", int(port)) for port in ports.split(",")[:: _ORDER[side]])
+    end.bind(own)
+    end.connect(other)
+    return CEnd(library, "udp", [_WORD(end.fileno())], size, keep)
+
+
+def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
+    """libzmq, the very one that the link uses, on a socket with the options of the link's."""
+    import zmq
+
+    keep = ExitStack()
+    context = keep.enter_context(zmq.Context())
+    end = keep.enter_context(context.socket(zmq.PAIR))
+    end.set(zmq.LINGER, 0)
+    end.set(zmq.SNDHWM, _ROOM)
+    end.set(zmq.RCVHWM, _ROOM)
+    if side == "controller":
+        end.bind(endpoint)
+    else:
+        end.connect(endpoint)
+    functions = loaded_libzmq()
+    call = [ctypes.cast(functions[name], ctypes.c_void_p) for name in ("zmq_send", "zmq_recv")]
+    return CEnd(library, "zmq", [ctypes.c_void_p(end.underlying), *call], size, keep)
+
+
+def loaded_libzmq() -> ctypes.CDLL:
+    """The shared library that pyzmq has loaded.
+
+    Raises:
+        NoCompiler: it is not a library of its own.
+    """
+    with Path("/proc/self/maps").open(encoding="utf-8") as maps:
+        paths = {line.split(maxsplit=5)[-1].strip() for line in maps if "libzmq" in line}
+    for path in sorted(paths):
+        if ".so" in path:
+            return ctypes.CDLL(path)
+    raise NoCompiler("pyzmq was built with libzmq inside: nothing for C to call")

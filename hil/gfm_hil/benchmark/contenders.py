@@ -1,0 +1,156 @@
+"""What can be measured: the bench's links, and beside each the limit in C.
+
+A contender is data, so that it can be sent to the two processes, which open their ends of it.
+"""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.benchmark.pingpong import LinkEnd, Messages, frames, plain
+from gfm_hil.errors import UserError
+from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.base import Side
+
+FRAME = 84  # bytes of y; the answer is then a u of 68
+
+
+class End(Protocol):
+    """One end of a contender; see ``gfm_hil.benchmark.pingpong``."""
+
+    @property
+    def compiled(self) -> bool:
+        """Its loop holds no Python."""
+
+    def ping(
+        self, stop: NDArray[np.int64], period_ns: int, duration_ns: int, took: NDArray[np.int64]
+    ) -> int:
+        """Ask."""
+
+    def pong(self, stop: NDArray[np.int64]) -> None:
+        """Answer."""
+
+    def close(self) -> None:
+        """Let go."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One way of getting a message there and back.
+
+    Attributes:
+        name: in tables, unique.
+        link: name of the link, or of what the C peer uses (``shm``, ``udp``, ``zmq``).
+        peer: ``ours``, ``C`` or the name of a foreign package.
+        endpoint: where both sides meet.
+        options: of the link.
+        baseline: name of the contender that it is measured against; its own for a limit.
+        library: of a C peer, compiled.
+    """
+
+    name: str
+    link: str
+    peer: str
+    endpoint: str
+    options: dict[str, Any]
+    baseline: str
+    library: Path | None = None
+
+    def open(self, side: Side, payload: int) -> End:
+        """Open one end; the controller first.
+
+        Raises:
+            UserError: as ``open_link``.
+        """
+        messages = self.messages(side, payload)
+        if self.peer == "C":
+            from gfm_hil.benchmark import c_ends
+
+            assert self.library is not None
+            how = {"shm": c_ends.open_shm, "udp": c_ends.open_udp, "zmq": c_ends.open_zmq}
+            return how[self.link](self.library, side, self.endpoint, messages.shape[1])
+        return LinkEnd(open_link(self.link, side, self.endpoint, self.options), messages)
+
+    @staticmethod
+    def messages(side: Side, payload: int) -> Messages:
+        """What a side sends: the bench's own frames if the payload is theirs."""
+        if payload == FRAME:
+            return frames("y" if side == "plant" else "u")
+        return plain(payload)
+
+
+def check_links(names: list[str]) -> list[str]:
+    """The names, if each is a link.
+
+    Raises:
+        UserError: one is not, or cannot be loaded.
+    """
+    for name in names:
+        try:
+            link_kind(name)
+        except ValueError as problem:
+            raise UserError(f"--links: {problem}") from None
+    return names
+
+
+def of_links(links: list[str], place: Path, library: Path | None) -> list[Contender]:
+    """The contenders of some links and the limits they are measured against.
+
+    Args:
+        links: names, checked.
+        place: an empty folder in memory, of a short path.
+        library: pingpong.c, or None if there is no compiler.
+    """
+    found: dict[str, Contender] = {}
+
+    def limit(name: str, link: str, endpoint: str) -> str:
+        if library is None:
+            return ""
+        found.setdefault(name, Contender(name, link, "C", endpoint, {}, name, library))
+        return name
+
+    for link in links:
+        kind = link_kind(link)
+        folder = place / link
+        folder.mkdir()
+        if link == "zmq":
+            c_ipc = limit("C zmq ipc", "zmq", f"ipc://{folder}/c")
+            c_tcp = limit("C zmq tcp", "zmq", f"tcp://127.0.0.1:{free_port()}")
+            portable = {"portable": True}
+            ipc, tcp = kind.fresh(folder), f"tcp://127.0.0.1:{free_port()}"
+            for name, endpoint, options, baseline in (
+                ("zmq ipc", ipc, {}, c_ipc),
+                ("zmq ipc, portable", f"{ipc}-portable", portable, c_ipc),
+                ("zmq tcp", tcp, {}, c_tcp),
+            ):
+                found[name] = Contender(name, link, "ours", endpoint, options, baseline)
+        else:
+            baseline = (
+                limit("C shm", "shm", str(place / "slots"))
+                if link == "shm"
+                else limit("C udp", "udp", f"{free_port()},{free_port()}")
+            )
+            found[link] = Contender(link, link, "ours", kind.fresh(folder), {}, baseline)
+    return list(found.values())
+
+
+def free_port() -> int:
+    """A port of the loopback interface that nobody uses now, for TCP and most likely for UDP."""
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def memory_folder(stack: ExitStack) -> Path:
+    """A folder that is removed in the end, in memory where there is /dev/shm."""
+    memory = Path("/dev/shm")
+    place = str(memory) if memory.is_dir() else None
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-", dir=place)))

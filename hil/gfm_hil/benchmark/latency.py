@@ -1,0 +1,145 @@
+"""Round trips of every link beside the limit in C, in interleaved rounds of one run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from gfm_hil.benchmark.c_code import NoCompiler, compile_c
+from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
+from gfm_hil.benchmark.histogram import Counts, histogram, quantiles, sparse
+from gfm_hil.benchmark.hogs import Load, hogs
+from gfm_hil.benchmark.pair import Policy, pair
+
+Mode = Literal["lockstep", "realtime"]
+MODES: tuple[Mode, ...] = ("lockstep", "realtime")
+PERIOD_NS = 100_000
+
+SHARES = {"p50": 0.5, "p90": 0.9, "p99": 0.99, "p99_9": 0.999, "p99_99": 0.9999, "max": 1.0}
+_FIRST_S = 0.02  # the round that is not kept
+_REST = 0.15  # of a round: the kernel takes from SCHED_FIFO 5 % of each second that it spins away
+_BY_ROUND = ("p50", "p90", "p99")  # there are enough times in a round
+
+Tell = Callable[[str, float], None]  # what is being done, and the share that is done
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked for.
+
+    Attributes:
+        links: names.
+        modes: lockstep: one round trip after the other; realtime: one every 100 µs.
+        loads: idle, or beside a hog on each processor.
+        policy: how the two processes are scheduled.
+        payload: bytes there; 84 stands for the bench's frames, 84 there and 68 back.
+        seconds: of one round.
+        rounds: of each.
+    """
+
+    links: Sequence[str]
+    modes: Sequence[Mode]
+    loads: Sequence[Load]
+    policy: Policy
+    payload: int
+    seconds: float
+    rounds: int
+
+
+@dataclass
+class _Cell:
+    """One contender under one mode and load."""
+
+    contender: Contender
+    mode: Mode
+    load: Load
+    compiled: bool
+    rounds: dict[int, Counts] = field(default_factory=dict)
+    silent: int = 0
+
+    def p50(self, number: int) -> float:
+        return quantiles(self.rounds[number], [0.5])[0]
+
+
+def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
+    """Measure; returns (results, remarks), one result a contender, mode and load.
+
+    Raises:
+        UserError: an unknown link, or one that is not to be had.
+    """
+    remarks = []
+    with ExitStack() as stack:
+        place = memory_folder(stack)
+        try:
+            library = compile_c("pingpong.c", place, "pingpong")
+        except NoCompiler as problem:
+            library = None
+            remarks.append(f"{problem}: no limits in C, no ratios")
+        contenders = of_links(list(plan.links), place, library)
+        two = stack.enter_context(pair(plan.policy, place))
+        load = stack.enter_context(hogs())
+        cells = []
+        for contender in contenders:
+            tell(f"opening {contender.name}", 0.0)
+            compiled = two.open(contender, plan.payload)
+            cells += [_Cell(contender, m, w, compiled) for w in plan.loads for m in plan.modes]
+        for number in range(-1, plan.rounds):  # the first to compile and to warm up
+            for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
+                done = (max(number, 0) + k / len(cells)) / plan.rounds
+                tell(f"{cell.contender.name}, {cell.mode}, {cell.load}", done if number >= 0 else 0)
+                period = PERIOD_NS if cell.mode == "realtime" else 0
+                with load(cell.load):
+                    seconds = plan.seconds if number >= 0 else _FIRST_S
+                    times = two.round(cell.contender, period, seconds)
+                time.sleep(_REST * seconds)
+                if number >= 0 and len(times):
+                    cell.rounds[number] = histogram(times)
+                cell.silent += not len(times)
+    by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
+    results = [_result(c, by_key.get((c.contender.baseline, c.mode, c.load)), plan) for c in cells]
+    return results, remarks
+
+
+def _result(cell: _Cell, baseline: _Cell | None, plan: Plan) -> dict[str, Any]:
+    c = cell.contender
+    row: dict[str, Any] = {
+        "name": c.name,
+        "link": c.link,
+        "peer": c.peer,
+        "code": "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python"),
+        "mode": cell.mode,
+        "load": cell.load,
+        "policy": plan.policy,
+        "payload": plan.payload,
+        "n": 0,
+        **{f"{name}_us": None for name in SHARES},
+        "baseline": c.baseline or None,
+        "ratio_to_baseline_p50": None,
+        "silent_rounds": cell.silent,
+        "rounds_p50_us": [],
+        "histogram": [],
+    }
+    if not cell.rounds:
+        return row
+    each = (
+        np.array([quantiles(counts, list(SHARES.values())) for counts in cell.rounds.values()])
+        / 1e3
+    )
+    whole: Counts = np.sum([*cell.rounds.values()], axis=0)
+    over_all = np.array(quantiles(whole, list(SHARES.values()))) / 1e3
+    for k, name in enumerate(SHARES):
+        value = np.median(each[:, k]) if name in _BY_ROUND else over_all[k]
+        row[f"{name}_us"] = round(float(value), 3)
+    row["n"] = int(whole.sum())
+    row["rounds_p50_us"] = [round(float(x), 4) for x in each[:, 0]]
+    row["histogram"] = sparse(whole)
+    both = sorted(cell.rounds.keys() & baseline.rounds.keys()) if baseline else []
+    if baseline and both:
+        ratio = np.median([cell.p50(k) / baseline.p50(k) for k in both])
+        row["ratio_to_baseline_p50"] = round(float(ratio), 4)
+    return row

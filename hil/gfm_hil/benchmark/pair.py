@@ -1,0 +1,138 @@
+"""Two processes that stay for a whole benchmark: one asks, one answers, each on its processor.
+
+Every contender is open in both from the start, so that rounds of one can follow rounds of another
+at once. They are pinned and ranked as the two sides of a run in real time are.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.benchmark.contenders import Contender, End
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, own_processor
+from gfm_hil.stopping import end_with_parent
+
+Policy = Literal["fifo", "other"]
+
+CAPACITY = 1 << 20  # round trips in a round
+WARM_NS = 20_000_000
+
+# of one of the two processes
+_side: Side = "plant"
+_ends: dict[str, End] = {}
+_took = np.zeros(0, np.int64)
+_stop = np.zeros(1, np.int64)
+
+
+class Pair:
+    """The two processes as the benchmark sees them."""
+
+    def __init__(self, pools: dict[Side, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
+        self._pools, self._stop = pools, stop
+
+    def call(self, side: Side, work: Any, *arguments: Any, timeout: float = 120.0) -> Any:
+        """Call a function in one of them and wait for what it returns."""
+        return self._wait(self._pools[side].submit(work, *arguments), timeout)
+
+    def both(self, work: Any, *arguments: Any, timeout: float = 120.0) -> dict[Side, Any]:
+        """Call a function in both at a time."""
+        futures = {s: pool.submit(work, *arguments) for s, pool in self._pools.items()}
+        return {s: self._wait(future, timeout) for s, future in futures.items()}
+
+    def open(self, contender: Contender, payload: int) -> bool:
+        """Open a contender's ends; returns whether its loops are compiled.
+
+        Raises:
+            UserError: it is not to be had.
+        """
+        for side in SIDES:
+            compiled = self.call(side, _open, contender, payload)
+        return bool(compiled)
+
+    def round(self, contender: Contender, period_ns: int, seconds: float) -> NDArray[np.int64]:
+        """Times of the round trips of one round in ns; none if the other side fell silent."""
+        self._stop[0] = 0
+        answers = self._pools["controller"].submit(_pong, contender.name)
+        try:
+            return self.call("plant", _ping, contender.name, period_ns, int(seconds * 1e9))
+        finally:
+            self._stop[0] = 1
+            self._wait(answers, 30.0)
+
+    @staticmethod
+    def _wait(future: Future[Any], timeout: float) -> Any:
+        try:
+            return future.result(timeout)
+        except BrokenProcessPool:
+            raise RuntimeError("a process of the benchmark died") from None
+
+
+@contextmanager
+def pair(policy: Policy, place: Path) -> Iterator[Pair]:
+    """Start both; ``place`` is a folder in memory."""
+    path = place / "stop"
+    path.write_bytes(bytes(8))
+    context = multiprocessing.get_context("spawn")
+    pools = {
+        side: ProcessPoolExecutor(
+            1, mp_context=context, initializer=_set_up, initargs=(side, policy, str(path))
+        )
+        for side in SIDES
+    }
+    stop = np.memmap(path, np.int64, "r+")
+    try:
+        yield Pair(pools, stop)
+    finally:
+        stop[0] = 1
+        for pool in pools.values():
+            with suppress(BrokenProcessPool):
+                pool.submit(_close)
+        for pool in pools.values():
+            pool.shutdown(cancel_futures=True)
+
+
+def _set_up(side: Side, policy: Policy, stop: str) -> None:
+    global _side, _took, _stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    end_with_parent()
+    if policy == "fifo":
+        ask_for_real_time(side)
+    else:
+        own_processor(side)
+    _side, _took = side, np.zeros(CAPACITY, np.int64)
+    _took += 1  # no page is first touched in a round
+    _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
+    no_collector_pauses()
+
+
+def _open(contender: Contender, payload: int) -> bool:
+    end = _ends[contender.name] = contender.open(_side, payload)
+    return end.compiled
+
+
+def _pong(name: str) -> None:
+    _ends[name].pong(_stop)
+
+
+def _ping(name: str, period_ns: int, duration_ns: int) -> NDArray[np.int64]:
+    end = _ends[name]
+    if end.ping(_stop, period_ns, WARM_NS, _took) < 0:
+        return _took[:0]
+    return _took[: max(end.ping(_stop, period_ns, duration_ns, _took), 0)]
+
+
+def _close() -> None:
+    for end in _ends.values():
+        end.close()
+    _ends.clear()

@@ -1,0 +1,158 @@
+"""Round trips over one link between two processes: ``ping`` asks, ``pong`` answers at once.
+
+The compiled loops call a link through its port, as the compiled loops of a run do; a link without
+one is driven through its Python methods. ``pingpong.c`` is the same in C.
+
+A loop fills ``took`` (capacity,) with the ns of its round trips and returns how many there were,
+or -1 if the other side fell silent. With ``period_ns`` 0 they follow each other. Else one begins
+every period, at absolute deadlines, and its time counts from the deadline: a late start is not left
+out. ``stop`` is one number in memory that both processes share.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gfm_hil.frames import FrameWriter
+from gfm_hil.links import Link, Port
+from gfm_hil.loops.clock import give_way, now_ns, wait_until
+from gfm_runtime.signals import Group, names
+
+SILENCE_NS = 1_000_000_000
+LONGEST = 512  # bytes
+_DIFFERENT = 256  # messages in turn, so that a link that counts sees every frame follow the last
+_LOOKS = 1024  # between two looks at the clock
+
+Messages = NDArray[np.uint8]
+
+
+def frames(group: Group) -> Messages:
+    """The bench's own frames, one after the other in sequence; shape (256, bytes)."""
+    writer, values = FrameWriter(group), np.ones(len(names(group)))
+    packed = b"".join(writer.pack(k, 0, 0, values) for k in range(_DIFFERENT))
+    return np.frombuffer(packed, np.uint8).reshape(_DIFFERENT, -1)
+
+
+def plain(size: int) -> Messages:
+    """Messages of any other size in bytes, shape (256, size)."""
+    return np.resize(np.arange(251, dtype=np.uint8), (_DIFFERENT, size))
+
+
+@njit(cache=True, nogil=True)
+def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_ns, took):
+    """``ping`` through a port's functions."""
+    answer = np.empty(LONGEST, np.uint8)
+    message = np.empty(messages.shape[1], np.uint8)
+    while receive(handle, answer) > 0:  # the late answer of a round that was given up
+        pass
+    begin = now_ns()
+    end, due, n = begin + duration_ns, begin + period_ns, 0
+    while n < len(took) and begin < end:
+        if period_ns > 0:
+            wait_until(due, spins)
+            begin = due
+            due += period_ns
+        for i in range(len(message)):
+            message[i] = messages[n % len(messages), i]
+        send(handle, message)
+        looks = 0
+        while receive(handle, answer) == 0:
+            looks += 1
+            if looks > spins:
+                give_way()
+            if looks % _LOOKS == 0 and now_ns() - begin > SILENCE_NS:
+                return -1
+        now = now_ns()
+        took[n] = now - begin
+        begin = now
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def pong_port(handle, send, receive, spins, messages, stop):
+    """``pong`` through a port's functions, until ``stop[0]``."""
+    heard = np.empty(LONGEST, np.uint8)
+    message = np.empty(messages.shape[1], np.uint8)
+    n = looks = 0
+    while stop[0] == 0:
+        if receive(handle, heard) == 0:
+            looks += 1
+            if looks > spins:
+                give_way()
+            continue
+        for i in range(len(message)):
+            message[i] = messages[n % len(messages), i]
+        send(handle, message)
+        n += 1
+        looks = 0
+    return n
+
+
+class LinkEnd:
+    """One end of an open link, by its port where it has one."""
+
+    def __init__(self, link: Link, messages: Messages) -> None:
+        self._link, self._messages = link, messages
+        self._bytes = [row.tobytes() for row in messages]
+
+    @property
+    def compiled(self) -> bool:
+        """It has a port."""
+        return self._link.port is not None
+
+    def ping(
+        self,
+        stop: NDArray[np.int64],
+        period_ns: int,
+        duration_ns: int,
+        took: NDArray[np.int64],
+    ) -> int:
+        """Ask; see the module."""
+        if (p := self._link.port) is not None:
+            return int(ping_port(*_call(p), self._messages, stop, period_ns, duration_ns, took))
+        while self._link.receive() is not None:
+            pass
+        begin = time.monotonic_ns()
+        end, due, n = begin + duration_ns, begin + period_ns, 0
+        while n < len(took) and begin < end:
+            if period_ns:
+                wait_until(due, 0)
+                begin, due = due, due + period_ns
+            self._link.send(self._bytes[n % _DIFFERENT])
+            while self._link.receive() is None:
+                os.sched_yield()
+                if time.monotonic_ns() - begin > SILENCE_NS:
+                    return -1
+            now = time.monotonic_ns()
+            took[n] = now - begin
+            begin = now
+            n += 1
+        return n
+
+    def pong(self, stop: NDArray[np.int64]) -> None:
+        """Answer until told to stop."""
+        if (p := self._link.port) is not None:
+            pong_port(*_call(p), self._messages, stop)
+            return
+        n = 0
+        while not stop[0]:
+            if self._link.receive() is None:
+                os.sched_yield()
+                continue
+            self._link.send(self._bytes[n % _DIFFERENT])
+            n += 1
+
+    def close(self) -> None:
+        """Close the link."""
+        self._link.close()
+
+
+def _call(port: Port) -> tuple[Any, Any, Any, int]:
+    return port.handle, port.send, port.receive, port.spins

@@ -1,0 +1,61 @@
+"""The result of a benchmark as plain data, and its file."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.environment import StealTime, caveats, environment
+from gfm_hil.errors import UserError
+
+FORMAT = 1
+
+
+class Recorder:
+    """Collects what one run of the benchmark found.
+
+    ``content`` has ``results`` (rows of `latency`), ``jitter``, ``kernel`` and ``loop`` (those that
+    were asked for), ``remarks``, ``environment``, ``caveats`` and ``seconds``.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._begin, self._steal = time.monotonic(), StealTime()
+        self.content: dict[str, Any] = {
+            "format": FORMAT,
+            "bench": what,
+            "results": [],
+            "remarks": [],
+            "environment": environment(),
+        }
+
+    def close(self) -> dict[str, Any]:
+        """The whole, with the time it took."""
+        badge = self.content["environment"]
+        badge["steal_pct"] = self._steal.percent()
+        self.content["caveats"] = caveats(badge)
+        self.content["seconds"] = round(time.monotonic() - self._begin, 1)
+        return self.content
+
+
+def write_result(content: dict[str, Any], path: Path) -> None:
+    """Write it as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Read a result, or the one in a folder.
+
+    Raises:
+        UserError: it is none.
+    """
+    file = path / "bench.json" if path.is_dir() else path
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as problem:
+        raise UserError(f"{file}: cannot be read: {problem}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise UserError(f"{file}: not a result of `gfmhil bench` of format {FORMAT}")
+    return content
