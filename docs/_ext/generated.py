@@ -10,11 +10,13 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from _ext import law_pages, outputs, scenario_pages
+from _ext import design_pages, law_pages, outputs, scenario_pages
 
 _LINE = re.compile(r"^<!-- generate: (\S+) ?(.*?) *-->$", re.MULTILINE)
 
 MAKERS: dict[str, Callable[..., str]] = {
+    "design-gammas": design_pages.gammas,
+    "design-weights": design_pages.weights,
     "law-overview": law_pages.overview,
     "law-catalogue": law_pages.catalogue,
     "law-keys": scenario_pages.law_tables,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from gfm_design.linear import Mode, ideal_modes, loop_modes
 from gfm_design.operating_point import operating_point
@@ -65,6 +66,17 @@ def modes(law: str, plant: dict[str, Any], ideal: bool = False, **gains: float) 
 def within(found: Sequence[Mode], low: float, high: float) -> Mode:
     """The longest lasting mode of a band, Hz."""
     return next(m for m in found if low < m.frequency_hz < high)
+
+
+def dress(axes: Axes, title: str) -> None:
+    """What every panel has: a title at the left, a faint grid, no box."""
+    axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
+    axes.grid(True, color="#e4e4e4", lw=0.6)
+    axes.tick_params(labelsize=8.5, color=GREY)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(GREY)
 
 
 def number(value: float | None, digits: int = 3) -> str:

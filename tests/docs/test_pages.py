@@ -11,6 +11,8 @@ import pytest
 
 from gfm_design.linear import loop_modes
 from gfm_design.operating_point import operating_point
+from gfm_design.performance import PAPER_WEIGHTS
+from gfm_design.weights_file import read_weights
 from gfm_hil.runner import Run, run_scenario
 from gfm_hil.scenario import load_scenario
 from gfm_plant import Plant, make_plant
@@ -95,3 +97,46 @@ def test_committed_eigenvalues_are_current(monkeypatch: pytest.MonkeyPatch) -> N
         assert len(committed) == len(rows)
         for old, new in zip(committed, rows, strict=True):  # in the last digit they may differ
             np.testing.assert_allclose(numbers(old), numbers(new), rtol=1e-3, atol=0.02)
+
+
+def test_committed_modes_over_the_delay_are_current(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
+    from _figures import delay_loci
+
+    written: list[list[str]] = []
+    monkeypatch.setattr(delay_loci, "write_table", lambda name, head, rows: written.extend(rows))
+    delay_loci.table()
+    committed = (DOCS / "tables" / "delay_loci.md").read_text(encoding="utf-8").splitlines()[2:]
+    for old, new in zip(committed, written, strict=True):
+        np.testing.assert_allclose(numbers(old), numbers(" ".join(new)), rtol=1e-3, atol=2.5)
+
+
+@pytest.mark.timeout(600)
+def test_worked_example_of_a_tuning_says_what_the_page_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
+    from _figures import tuning
+
+    # all but tune_box, whose thousand corners are looked at in the tests of that command
+    said = tuning.run_example(tmp_path, ("tune_tune", "tune_run", "tune_margins"))
+    for name, what in (
+        ("tune_tune", r"γ = ([\d.]+)"),
+        ("tune_file", r"gamma = ([\d.]+)"),
+        ("tune_run", r"p final \[p\.u\.\] +([\d.]+)"),
+        ("tune_margins", r"delay margin on top of 0 µs: ([\d.]+)"),
+    ):
+        committed = (DOCS / "tables" / f"{name}.md").read_text(encoding="utf-8")
+        assert "[exit code" not in said[name]
+        # gamma's minimum is flat: other rounding leads to gains that differ in the third digit
+        shown = [float(n) for n in re.findall(what, committed)]
+        assert shown
+        assert [float(n) for n in re.findall(what, said[name])] == pytest.approx(shown, rel=0.02)
+
+
+def test_weights_to_begin_with_are_the_papers() -> None:
+    found = {(w.i, w.j): w for w in read_weights(EXAMPLES / "my-weights.toml")}
+    s = 1j * np.logspace(-4, 6, 50)
+    for weight in PAPER_WEIGHTS:
+        np.testing.assert_allclose(found.pop((weight.i, weight.j))(s), weight(s), rtol=1e-9)
+    assert not found
