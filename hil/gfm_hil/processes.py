@@ -85,7 +85,7 @@ class Processes:
         bench = make_bench(self.scenario)
         with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
             for side in SIDES:
-                compile_side(bench, Part.create(Path(place), side, 1))
+                compile_side(side, bench, Part.create(Path(place), side, 1))
 
     def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
         # -P: a file of the operator's folder must not stand in for a module

@@ -29,8 +29,9 @@ CONTROLLER_COLUMNS = (
     "state",  # of the controller, gfm_runtime.controller.STATES
     "X_est",  # estimated grid reactance of a scheduled law, p.u.
 )
-PLANT_TIMES = ("scheduled", "woke", "sent", "received")  # ns, CLOCK_MONOTONIC; -1: never
-CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent")
+# ns of CLOCK_MONOTONIC, -1: never; "stall" is the longest gap between two looks at the clock
+PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
+CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
 _TRUE = NY + NU
 

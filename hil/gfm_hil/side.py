@@ -12,8 +12,10 @@ from gfm_hil.errors import PeerLost, UserError
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links import open_link
 from gfm_hil.links.base import Side
+from gfm_hil.loops.drive import compile_loops
+from gfm_hil.loops.thread import run_compiled
 from gfm_hil.plant_side import run_plant
-from gfm_hil.realtime import go_first, no_collector_pauses, own_processor
+from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording import Part, record_controller, record_plant
 from gfm_hil.scenario import Scenario
 from gfm_hil.stopping import Interrupt
@@ -49,17 +51,16 @@ def _run(
     interrupt: Interrupt,
 ) -> Outcome:
     bench = make_bench(scenario)
-    first = False
-    if scenario.mode == "realtime":  # before the link starts threads, which inherit both
-        own_processor(side)
-        first = go_first()
-    link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
     folder.mkdir(parents=True, exist_ok=True)
     part = Part.create(folder, side, scenario.ticks)
+    compile_side(side, bench, part)
+    rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
+    link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
-    if scenario.mode == "realtime":
-        timeline.write(0, "scheduling", side=side, priority="highest" if first else "as given")
-    compile_side(bench, part)
+    if rights is not None:
+        if link.port is None:  # a loop in Python never sleeps
+            rights["policy"] = ordinary_priority()
+        timeline.write(0, "scheduling", side=side, **rights)
 
     def stopped() -> bool:
         return interrupt.came
@@ -67,8 +68,11 @@ def _run(
     try:
         no_collector_pauses()
         t0_ns = shake_hands(side, link, scenario, stopped, notice)
-        run = run_controller if side == "controller" else run_plant
-        reader = run(bench, link, part, timeline, t0_ns, stopped)
+        if link.port is not None:
+            reader = run_compiled(side, bench, link, part, timeline, t0_ns, stopped)
+        else:
+            run = run_controller if side == "controller" else run_plant
+            reader = run(bench, link, part, timeline, t0_ns, stopped)
         faults = {"side": side, "faults": reader.faults}
         (folder / f"link_{side}.json").write_text(json.dumps(faults))
     except PeerLost as problem:
@@ -80,13 +84,14 @@ def _run(
     return timeline.outcome
 
 
-def compile_side(bench: Bench, part: Part) -> None:
+def compile_side(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
     par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
     plant_sample(par, st, y)
     plant_advance(par, st, u)
     warm_up(bench.controller)
-    if part.signals.shape[1] > len(y) + len(u) + 1:
+    compile_loops(side, bench, part)
+    if side == "plant":
         record_plant(part.signals[0].copy(), y, u, par, st)
     else:
         record_controller(part.signals[0].copy(), bench.controller.ctl, bench.controller.est)

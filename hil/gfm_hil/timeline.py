@@ -6,6 +6,7 @@ The log is one JSON object a line, written at once, so that it is there however 
 from __future__ import annotations
 
 import json
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -49,6 +50,8 @@ class Timeline:
             if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in sides
         ]
         self._changes = 0
+        self._lines: deque[dict[str, Any]] = deque()
+        self.put_off = False  # a disk may keep the writer waiting for longer than a tick
         self.outcome: Outcome | None = None
 
     @property
@@ -97,13 +100,21 @@ class Timeline:
             self.write(tick, "end", status=status, reason=reason, side="+".join(self._sides))
 
     def write(self, tick: int, kind: str, **more: Any) -> None:
-        """One line of the log."""
+        """One line of the log; on disk at once, or at the next ``flush`` if that is put off."""
         t = round(tick * self._bench.scenario.T_s, 9)
-        self._log.write(json.dumps({"tick": tick, "t": t, "event": kind, **more}) + "\n")
+        self._lines.append({"tick": tick, "t": t, "event": kind, **more})
+        if not self.put_off:
+            self.flush()
+
+    def flush(self) -> None:
+        """Put on disk what is not there yet; may be called from another thread."""
+        while self._lines:
+            self._log.write(json.dumps(self._lines.popleft()) + "\n")
         self._log.flush()
 
     def close(self) -> None:
         """Close the log."""
+        self.flush()
         self._log.close()
 
 

@@ -11,11 +11,15 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
+from gfm_hil.links.shm.atomics import pause as _pause
+
 _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
 _NS = 1_000_000_000
 
 # numba's own annotation has the typing context among the caller's arguments
 _intrinsic: Any = intrinsic
+
+pause: Any = _pause
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _TIMESPEC = ir.LiteralStructType([_I64, _I64])
@@ -81,6 +85,9 @@ def give_way(typingctx):
     return types.int32(), make
 
 
+_YIELDS, _NAP_NS = 5_000, 100_000  # looks, about a ms; ns
+
+
 @njit(cache=True, nogil=True)
 def wait_until(deadline_ns, spins):
     """Sleep until shortly before a deadline, then spin; returns the longest gap in the spin, ns.
@@ -100,3 +107,19 @@ def wait_until(deadline_ns, spins):
         if spins == 0:
             give_way()
     return gap
+
+
+@njit(cache=True, nogil=True)
+def between_looks(looks, spins, patient):
+    """What a waiting loop does after its ``looks``-th look in vain.
+
+    At first it spins, where the peer itself delivers (``spins`` looks), then it yields, and if it
+    is ``patient``, in simulated time, it sleeps in the end: on a crowded machine a thread that
+    yields for ever keeps the very peer from running that it waits for.
+    """
+    if looks <= spins:
+        pause()
+    elif patient and looks > _YIELDS:
+        sleep_until(now_ns() + _NAP_NS)
+    else:
+        give_way()

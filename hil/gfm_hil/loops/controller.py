@@ -1,0 +1,129 @@
+"""The controller's ticks over a port: take y, compute, send u, until something is to be said.
+
+The same rules as ``gfm_hil.controller_side``, which does it in Python for links without a port.
+In real time it sleeps until shortly before the next frame, which a phase lock to the frames
+received so far foretells: it needs no clock in common with the plant.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from gfm_hil.codec import OUT_OF_SEQUENCE, pack, unpack
+from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until
+from gfm_hil.loops.records import EVENT, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, STOPPED_HERE
+from gfm_hil.recording import record_controller
+from gfm_runtime.controller import RUNNING, SAFE, STOPPED, control, missed
+
+_Y_ID = 1
+_CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
+_PHASE, _RATE = 1 / 16, 1 / 512  # of the phase lock, critically damped: 16 ticks
+_CLIP = 0.25  # of a tick: a stall must not throw the lock
+
+
+@njit(cache=True, nogil=True)
+def controller_ticks(
+    send, receive, handle, spins, out, into, reader, loop, stop, ctl, laws, states, est, y, u,
+    rows, times, progress, event,
+):  # fmt: skip
+    """Answer frames; returns why it came back, one of ``gfm_hil.loops.records``.
+
+    Comes back with EVENT when the next tick is ``event`` or later, after computing the one
+    before; if frames were lost on the way there, with that tick's y in hand (``pending``).
+
+    Args:
+        send, receive, handle, spins, out, into, reader, loop, stop: as for ``plant_ticks``.
+        ctl, laws, states, est: the controller's records.
+        y, u: vectors of ``gfm_hil.bench.Bench``.
+        rows, times, progress: of the recording's part.
+    """
+    r = loop[0]
+    sequence, frame, message = out
+    while True:
+        if not r.pending:
+            why = _next_frame(
+                receive, handle, spins, into, reader, r, stop, ctl, y, times, len(rows)
+            )
+            if why >= 0:
+                return why
+            if r.tick >= event:
+                r.pending = 1
+                return EVENT
+        r.pending = 0
+        k = r.tick
+        changes = ctl[0].changes
+        control(ctl, laws, states, est, y, u)
+        times[k, 2] = now_ns()
+        pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
+        send(handle, message)
+        times[k, 3] = now_ns()
+        record_controller(rows[k], ctl, est)
+        r.done += 1
+        progress[0] = r.done
+        if ctl[0].state != RUNNING or ctl[0].changes != changes:
+            return LOOK
+        if k + 1 >= event:
+            return EVENT
+
+
+@njit(cache=True, nogil=True)
+def _next_frame(
+    receive, handle, spins, into, reader, r, stop, ctl, y, times, ticks
+):  # fmt: skip
+    """Wait for a good frame of the plant: -1, its tick in ``r``; or why to come back."""
+    got, got_bytes = into
+    if r.realtime and r.done > 0 and stop[0] == 0:
+        wake = r.t0 + int(r.expected) - AHEAD_NS
+        if wake - now_ns() > 0:
+            sleep_until(min(wake, now_ns() + r.T))
+    gap = 0
+    before = now_ns()
+    looks = 0
+    while True:
+        size = receive(handle, got_bytes)
+        looks += 1
+        if size > 0 or r.realtime or looks % _CLOCK_EVERY == 0:
+            now = now_ns()
+            gap = max(gap, now - before)
+            before = now
+            if size > 0:
+                r.heard = now
+                k = unpack(reader, _Y_ID, got, got_bytes, size, y)
+                if k >= ticks and reader[0].state != SAFE and reader[0].state != STOPPED:
+                    reader[0].faults[OUT_OF_SEQUENCE] += 1
+                elif k >= 0:
+                    break
+                continue
+            if now - r.heard >= r.patience:
+                return SILENT
+            if r.realtime and r.done > 0:  # before tick 0 nothing can be stale
+                while ctl[0].stale < (now - r.heard) // r.T and ctl[0].state != SAFE:
+                    missed(ctl)
+                if ctl[0].state == SAFE:
+                    return LOOK
+        if stop[0] != 0:
+            return STOPPED_HERE
+        between_looks(looks, spins, not r.realtime)
+    if reader[0].state == SAFE:
+        return PEER_SAFE
+    if reader[0].state == STOPPED:
+        return PEER_STOPPED
+    if r.realtime:
+        _lock(r, k, now)
+    times[k, 0] = r.t0 + k * r.T
+    times[k, 1], times[k, 4] = now, gap
+    r.tick = k
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _lock(r, k, now):
+    """Learn from the arrival of frame k when the next one will come."""
+    if r.done == 0:
+        r.expected = float(now - r.t0)
+    else:
+        r.expected += (k - r.tick - 1) * r.period
+    most = _CLIP * r.T
+    error = min(max(now - r.t0 - r.expected, -most), most)
+    r.period += _RATE * error
+    r.expected += _PHASE * error + r.period

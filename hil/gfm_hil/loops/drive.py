@@ -1,0 +1,161 @@
+"""Driving the compiled loops: call them, and say in Python what they came back for.
+
+Both functions do what ``run_plant`` and ``run_controller`` do for a link without a port, with the
+same rules, words and recording. They are meant for a thread of their own.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.bench import Bench
+from gfm_hil.frames import FrameReader, FrameWriter
+from gfm_hil.links import Link, Port, port_function
+from gfm_hil.links.base import Side
+from gfm_hil.loops.controller import controller_ticks
+from gfm_hil.loops.plant import plant_ticks
+from gfm_hil.loops.records import (
+    DONE,
+    EVENT,
+    LATE,
+    LOOK,
+    PEER_SAFE,
+    PEER_STOPPED,
+    SILENT,
+    STOPPED_HERE,
+    make_loop,
+)
+from gfm_hil.recording import Part
+from gfm_hil.timeline import Timeline
+from gfm_hil.waiting import send_last
+from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED
+from gfm_runtime.signals import Group
+
+_FAR = 2**62  # as of a timeline without events
+
+
+class _Loop:
+    """One side's compiled loop with everything that its calls have in common."""
+
+    def __init__(
+        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, stop: NDArray[np.int64]
+    ) -> None:
+        assert link.port is not None
+        scenario, port, self.part = bench.scenario, link.port, part
+        plant = side == "plant"
+        self.bench, self.link, self.stop = bench, link, stop
+        own: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
+        self.writer, self.reader = FrameWriter(own[0]), FrameReader(own[1])
+        self.loop = make_loop(
+            scenario.mode == "realtime", 0 if plant else -1, t0_ns, scenario.T_s,
+            scenario.link.peer_timeout_s, scenario.late_policy.hold,
+        )  # fmt: skip
+        w, r, c = self.writer, self.reader, bench.controller
+        records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
+        self._arguments: tuple[Any, ...] = (
+            port.send, port.receive, port.handle, port.spins, (w.sequence, w.frame, w.message),
+            (r.frame, r.message), r.record, self.loop, stop, *records, bench.y, bench.u,
+            part.signals, part.times, part.progress,
+        )  # fmt: skip
+        self._call = plant_ticks if plant else controller_ticks
+
+    def go(self, until: int) -> int:
+        """Run until that tick or until there is something to say."""
+        return int(self._call(*self._arguments, until))  # type: ignore[call-arg]
+
+    @property
+    def tick(self) -> int:
+        """Plant: the next tick; controller: the last one received."""
+        return int(self.loop["tick"][0])
+
+    def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
+        """Tell the other side how this one ends."""
+        send_last(self.link, self.writer.pack(max(self.tick, 0), state, reason, values))
+
+
+def drive_plant(
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, stop: NDArray[np.int64]
+) -> FrameReader:
+    """Run the plant's side of a scenario after the handshake; returns its frame counters."""
+    loop, ticks = _Loop("plant", bench, link, part, t0_ns, stop), bench.scenario.ticks
+    while timeline.running:
+        timeline.carry_out(loop.tick)
+        why = loop.go(min(timeline.next_tick(), ticks))
+        tick = loop.tick
+        timeline.look(max(tick - 1, 0))
+        if why == DONE and tick >= ticks:
+            timeline.end("completed", "", tick)
+        elif why == STOPPED_HERE:
+            timeline.end("interrupted", "stopped by the operator", tick)
+        elif why == PEER_SAFE:
+            timeline.end("safe", REASONS[loop.reader.reason], tick)
+        elif why == PEER_STOPPED:
+            timeline.end("interrupted", "the controller was stopped", tick)
+        elif why == SILENT:
+            timeline.end("safe", "the controller's process is gone", tick)
+        elif why == LATE:
+            why_late = "no fresh u for longer than late_policy.hold allows"
+            timeline.end("safe", why_late, tick)
+    assert timeline.outcome is not None
+    state = SAFE if timeline.outcome.status == "tripped" else STOPPED
+    loop.last_words(state, int(timeline.outcome.status != "completed"), bench.y)
+    return loop.reader
+
+
+def drive_controller(
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, stop: NDArray[np.int64]
+) -> FrameReader:
+    """Run the controller's side of a scenario after the handshake; returns its frame counters."""
+    loop, ctl = _Loop("controller", bench, link, part, t0_ns, stop), bench.controller.ctl
+    loop.loop["heard"] = time.monotonic_ns()
+    while timeline.running:
+        event = timeline.next_tick()
+        if loop.loop["pending"][0]:  # frames were lost on the way to the event
+            timeline.carry_out(loop.tick)
+            event = timeline.next_tick()
+        elif event <= loop.tick + 1:
+            timeline.carry_out(loop.tick + 1)
+            event = timeline.next_tick()
+        why = loop.go(event)
+        tick = loop.tick
+        if why in (LOOK, EVENT) and not loop.loop["pending"][0]:
+            timeline.look(max(tick, 0))
+        if why == STOPPED_HERE:
+            timeline.end("interrupted", "stopped by the operator", tick)
+            loop.last_words(STOPPED, 0, bench.u)
+        elif why == PEER_SAFE:
+            timeline.end("tripped", REASONS[PLANT_TRIP], tick)
+            loop.last_words(SAFE, PLANT_TRIP, bench.u)
+        elif why == PEER_STOPPED:
+            if loop.reader.reason:
+                timeline.end("interrupted", "the plant ended before the scenario did", tick)
+            else:
+                timeline.end("completed", "", tick)
+        elif why == SILENT:
+            timeline.end("safe", REASONS[LOST_PEER], tick)
+            loop.last_words(SAFE, LOST_PEER, bench.u)
+        elif why == LOOK and int(ctl["reason"][0]) == STALE:
+            timeline.end("safe", REASONS[STALE], tick)
+            loop.last_words(SAFE, STALE, bench.u)
+    return loop.reader
+
+
+def compile_loops(side: Side, bench: Bench, part: Part) -> None:
+    """Compile (or load from cache) a side's loop without running a tick."""
+    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(1, np.int64))
+    loop.go(_FAR if side == "controller" else 0)
+
+
+@port_function
+def _nothing(handle, message):
+    return 0
+
+
+class _Nowhere:
+    """A link to nobody: the loops are the same for all links."""
+
+    port = Port(np.zeros(1, np.int64), _nothing, _nothing, 0)

@@ -1,0 +1,108 @@
+"""The plant's ticks over a port: sample, send, take u, advance, until something is to be said.
+
+The same rules as ``gfm_hil.plant_side``, which does it in Python for links without a port.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from gfm_hil.codec import pack, unpack
+from gfm_hil.loops.clock import between_looks, now_ns, wait_until
+from gfm_hil.loops.records import DONE, LATE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, STOPPED_HERE
+from gfm_hil.recording import record_plant
+from gfm_plant import plant_advance, plant_sample
+from gfm_runtime.controller import SAFE, STOPPED
+
+_U_ID = 2
+_CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
+
+
+@njit(cache=True, nogil=True)
+def plant_ticks(
+    send, receive, handle, spins, out, into, reader, loop, stop, par, st, y, u, rows, times,
+    progress, last,
+):  # fmt: skip
+    """Run ticks until ``last``; returns why it came back, one of ``gfm_hil.loops.records``.
+
+    Args:
+        send, receive, handle, spins: of the link's ``Port``.
+        out: sequence, record and bytes of the frame to send; ``into``: record and bytes to
+            receive into; see ``gfm_hil.codec``.
+        reader: counters of what was received.
+        loop: one-element array of ``loop_dtype``.
+        stop: shape (1,), int64; not 0 asks the loop to come back.
+        par, st, y, u: the plant's records and the vectors of ``gfm_hil.bench.Bench``.
+        rows, times, progress: of the recording's part.
+    """
+    r = loop[0]
+    sequence, frame, message = out
+    got, got_bytes = into
+    while r.tick < last:
+        if stop[0] != 0:
+            return STOPPED_HERE
+        k = r.tick
+        due = r.t0 + k * r.T
+        gap = 0
+        if r.realtime:
+            gap = wait_until(due, spins)
+            times[k, 0], times[k, 1] = due, now_ns()
+        plant_sample(par, st, y)
+        pack(sequence, frame, message, k, 0, 0, y)
+        send(handle, message)
+        sent = now_ns()
+        times[k, 2] = sent
+        until = due + r.T if r.realtime else sent + r.patience
+        fresh, silent, gap = _answer(
+            receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k, until, gap
+        )
+        record_plant(rows[k], y, u, par, st)
+        progress[0] = k + 1
+        if reader[0].state == SAFE:
+            return PEER_SAFE
+        if reader[0].state == STOPPED:
+            return PEER_STOPPED
+        if not fresh:
+            if not r.realtime:
+                return SILENT if silent else STOPPED_HERE
+            r.misses += 1
+            progress[1] = r.misses
+        r.late = 0 if fresh else r.late + 1
+        times[k, 4] = gap
+        plant_advance(par, st, u)
+        r.tick = k + 1
+        if st[0].trip != 0:
+            return LOOK
+        if r.late * r.T >= r.patience:
+            return SILENT
+        if r.late > r.hold:
+            return LATE
+    return DONE
+
+
+@njit(cache=True, nogil=True)
+def _answer(
+    receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k, until, gap
+):  # fmt: skip
+    """Wait for u[k]: whether it came, whether the time ran out, the longest gap between looks."""
+    before = times[k, 2]
+    looks = 0
+    while True:
+        size = receive(handle, got_bytes)
+        if size > 0:
+            tick = unpack(reader, _U_ID, got, got_bytes, size, u)
+            # a controller that leaves says so under the last tick it saw
+            if tick == k or reader[0].state == SAFE or reader[0].state == STOPPED:
+                times[k, 3] = now_ns()
+                return tick == k, False, max(gap, times[k, 3] - before)
+        looks += 1
+        if r.realtime or looks % _CLOCK_EVERY == 0:
+            now = now_ns()
+            gap = max(gap, now - before)
+            before = now
+            if now >= until:
+                return False, True, gap
+        if size <= 0:
+            if not r.realtime and stop[0] != 0:
+                return False, False, gap
+            between_looks(looks, spins, not r.realtime)

@@ -1,0 +1,62 @@
+"""A compiled loop in a thread of its own, watched by the main thread, which hears Ctrl-C."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from gfm_hil.bench import Bench
+from gfm_hil.frames import FrameReader
+from gfm_hil.links import Link
+from gfm_hil.links.base import Side
+from gfm_hil.loops.drive import drive_controller, drive_plant
+from gfm_hil.realtime import stand_back
+from gfm_hil.recording import Part
+from gfm_hil.timeline import Timeline
+
+_LOOK_S = 0.05
+
+
+def run_compiled(
+    side: Side,
+    bench: Bench,
+    link: Link,
+    part: Part,
+    timeline: Timeline,
+    t0_ns: int,
+    stopped: Callable[[], bool],
+) -> FrameReader:
+    """Run one side after the handshake, over a link with a port; returns its frame counters.
+
+    The thread inherits processor and priority from the caller, who then steps back to ordinary
+    priority and only looks, a few times a second, whether to stop and what to write down.
+    """
+    stop = np.zeros(1, np.int64)
+    found: list[FrameReader] = []
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            drive = drive_plant if side == "plant" else drive_controller
+            found.append(drive(bench, link, part, timeline, t0_ns, stop))
+        except BaseException as problem:  # to be raised where somebody sees it
+            failed.append(problem)
+
+    timeline.put_off = True
+    thread = threading.Thread(target=work, name=f"{side}-loop", daemon=True)
+    thread.start()
+    stand_back()
+    try:
+        while thread.is_alive():
+            thread.join(_LOOK_S)
+            stop[0] = stopped()
+            timeline.flush()
+    finally:  # a second Ctrl-C: the thread must not outlive what it writes to
+        stop[0] = 1
+        thread.join()
+        timeline.put_off = False
+    if failed:
+        raise failed[0]
+    return found[0]
