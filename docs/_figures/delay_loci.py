@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from _figures.common import FIGURES, GREY, REF, T_S, dress, number, write_table
+from _figures.common import FIGURES, REF, T_S, dress, number, write_table
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -115,10 +115,8 @@ def table() -> None:
             k_worst = int(np.argmax([s.real for s in worst]))
             grows = np.array([s.real.max() >= 0.0 for s in found])
             s = worst[k_worst]
-            rows.append([
-                name, sensors, _ranges(~grows),
-                f"{number(s.real, 1)} 1/s at {s.imag / (2 * np.pi):.0f} Hz, {DELAYS[k_worst]:.0f} µs",
-            ])  # fmt: skip
+            what = f"{number(s.real, 1)} 1/s at {s.imag / (2 * np.pi):.0f} Hz"
+            rows.append([name, sensors, _ranges(~grows), f"{what}, {DELAYS[k_worst]:.0f} µs"])
     head = ["gains", "sensors", "stable at a delay of", "longest lasting oscillation, at its worst"]
     write_table("delay_loci", head, rows)
 

@@ -60,7 +60,7 @@ def weights() -> None:
     axes.set_xlim(1e-4, 1e5)
     axes.set_ylim(3e-3, 3e6)
     axes.set_xlabel("ω [rad/s]", fontsize=9)
-    dress(axes, "|W_ij(jω)|; W_31 in s, the others without unit")
+    dress(axes, "|W_ij(jω)|")
     figure.savefig(FIGURES / "design_weights.png", dpi=110)
 
 
@@ -105,10 +105,32 @@ def channels(found: Tuned) -> None:
         a.set_xlim(1e-2, 1e5)
         z, w = SIGNALS[0][weight.i - 1], SIGNALS[1][weight.j - 1]
         dress(a, f"$T_{{{weight.i}{weight.j}}}$: ${w}$ to ${z}$")
+        if (weight.i, weight.j) == (3, 1):
+            _closer(a, (0.07, 0.09, 0.48, 0.4), (6600.0, 7600.0), (7e-7, 7e-6))
     for a in axes[3:]:
         a.set_xlabel("ω [rad/s]", fontsize=9)
+    for a in axes[::3]:
+        a.set_ylabel("|T| [p.u. per p.u.]", fontsize=9)
     axes[0].legend(fontsize=8.5, frameon=False, loc="lower right")
     figure.savefig(FIGURES / "design_channels.png", dpi=110)
+
+
+def _closer(
+    a: Axes,
+    place: tuple[float, float, float, float],
+    x: tuple[float, float],
+    y: tuple[float, float],
+) -> None:
+    """The same lines in a window of their own, which spans x [rad/s] and y."""
+    window = a.inset_axes(place)
+    for line in a.get_lines():
+        window.plot(*line.get_data(), color=line.get_color(), lw=line.get_linewidth(),
+                    marker=line.get_marker(), ms=line.get_markersize())  # fmt: skip
+    window.set(xlim=x, ylim=y, yscale="log", xticks=x, yticks=[])
+    window.set_xticks([], minor=True)
+    window.set_yticks([], minor=True)
+    window.tick_params(labelsize=7.5, color=GREY)
+    a.indicate_inset_zoom(window, edgecolor="#444444")
 
 
 def _peak(
@@ -155,7 +177,7 @@ def bound(found: Tuned) -> None:
     figure = Figure(figsize=(7.6, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    for y, (label, value, colour) in enumerate(rows):
+    for y, (_, value, colour) in enumerate(rows):
         axes.barh(-y, value, color=colour, height=0.7)
         axes.annotate(
             f"{value:.3f}", (value, -y), (4, -3.5), textcoords="offset points", fontsize=9
