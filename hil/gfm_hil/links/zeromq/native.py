@@ -51,8 +51,7 @@ def _functions() -> tuple[int, int] | None:
     return (send, receive) if send and receive else None
 
 
-@intrinsic
-def _transfer(typingctx, address, socket, message, size, flags):
+def _make_transfer(typingctx, address, socket, message, size, flags):
     """zmq_send or zmq_recv at an address, given addresses and sizes as int64; returns int32."""
     int64 = ir.IntType(64)
     pointer = ir.IntType(8).as_pointer()
@@ -65,6 +64,9 @@ def _transfer(typingctx, address, socket, message, size, flags):
         return builder.call(function, [*pointers, size, builder.trunc(flags, ir.IntType(32))])
 
     return types.int32(*[types.int64] * 5), make
+
+
+_transfer: Any = intrinsic(_make_transfer)
 
 
 @port_function
