@@ -7,6 +7,8 @@ written survives the process, however it ends. ``merge`` turns the parts into ``
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,7 @@ PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
 CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
 _TRUE = NY + NU
+_MEMORY = Path("/dev/shm")
 
 
 @njit(cache=True)
@@ -73,7 +76,7 @@ class Part:
         columns = PLANT_COLUMNS if side == "plant" else CONTROLLER_COLUMNS
         times = PLANT_TIMES if side == "plant" else CONTROLLER_TIMES
         parts = folder / "parts"
-        parts.mkdir(parents=True, exist_ok=True)
+        parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
         def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
             path = parts / f"{side}_{what}.npy"
@@ -98,6 +101,37 @@ class Part:
         except (OSError, ValueError, EOFError):  # not there, or just being made
             return None
         return Part(*arrays)
+
+
+def keep_in_memory(folder: Path, ticks: int) -> None:
+    """Have the parts of a run lie in memory until they are merged, if there is room.
+
+    A page of a file on a disk is write-protected while it is written back: a loop that touches it
+    waits for the disk. ``folder``/parts becomes a link, so that what was recorded by a run that
+    nobody could end is still found.
+    """
+    columns = (PLANT_COLUMNS, CONTROLLER_COLUMNS, PLANT_TIMES, CONTROLLER_TIMES)
+    needed = 8 * ticks * sum(map(len, columns))
+    if not _MEMORY.is_dir() or shutil.disk_usage(_MEMORY).free < 2 * needed:
+        return
+    place = Path(tempfile.mkdtemp(prefix="gfmhil-parts-", dir=_MEMORY))
+    try:
+        (folder / "parts").symlink_to(place)
+    except FileExistsError:  # the other side was first
+        place.rmdir()
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what the sides recorded, wherever it lies."""
+    parts = folder / "parts"
+    if not parts.is_dir():
+        return
+    for path in parts.glob("*.npy"):
+        path.unlink()
+    place = parts.resolve()
+    if parts.is_symlink():
+        parts.unlink()
+    place.rmdir()
 
 
 def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
@@ -126,7 +160,5 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
     signals = {"tick": np.arange(done), "t": np.arange(done) * T_s, **signals}
     np.savez(folder / "signals.npz", laws=np.array(laws), **signals)  # type: ignore[arg-type]
     np.savez(folder / "timing.npz", **timing)  # type: ignore[arg-type]
-    for path in (folder / "parts").glob("*.npy"):
-        path.unlink()
-    (folder / "parts").rmdir()
+    remove_parts(folder)
     return signals

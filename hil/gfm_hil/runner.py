@@ -12,7 +12,7 @@ from gfm_hil.errors import UserError
 from gfm_hil.inproc import compile_loop, run_inproc
 from gfm_hil.links.base import SIDES
 from gfm_hil.processes import Processes, Progress
-from gfm_hil.recording import Part
+from gfm_hil.recording import Part, remove_parts
 from gfm_hil.run_folder import Run, check_free, finish
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario_model import INPROC
@@ -57,6 +57,7 @@ def run_scenario(
             try:
                 began, outside = Processes(scenario, folder, progress, notice, interrupt).run()
             except UserError:
+                remove_parts(folder)
                 shutil.rmtree(folder)
                 raise
     wall_s = time.monotonic() - began

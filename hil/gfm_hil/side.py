@@ -16,7 +16,7 @@ from gfm_hil.loops.drive import compile_loops
 from gfm_hil.loops.thread import run_compiled
 from gfm_hil.plant_side import run_plant
 from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, ordinary_priority
-from gfm_hil.recording import Part, record_controller, record_plant
+from gfm_hil.recording import Part, keep_in_memory, record_controller, record_plant
 from gfm_hil.scenario import Scenario
 from gfm_hil.stopping import Interrupt
 from gfm_hil.timeline import Outcome, Timeline
@@ -52,6 +52,8 @@ def _run(
 ) -> Outcome:
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
+    if scenario.mode == "realtime":
+        keep_in_memory(folder, scenario.ticks)
     part = Part.create(folder, side, scenario.ticks)
     compile_side(side, bench, part)
     rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
