@@ -31,7 +31,7 @@ def gammas() -> str:
     columns = [_channels(law, given) for _, law, given in _COLUMNS]
     lines = [f"| | {' | '.join(head for head, *_ in _COLUMNS)} |", "|---" * 6 + "|"]
     for row in zip(*columns, strict=True):
-        cells = " | ".join(f"{c.norm:.4f} ({c.omega:.3g})" for c in row)
+        cells = " | ".join(f"{c.norm:.4f} ({_short(c.omega)})" for c in row)
         lines.append(f"| $W_{{{row[0].i}{row[0].j}}} T_{{{row[0].i}{row[0].j}}}$ | {cells} |")
     worst = " | ".join(f"**{max(c.norm for c in column):.4f}**" for column in columns)
     return "\n".join([*lines, f"| **γ** | {worst} |"])
@@ -45,6 +45,10 @@ def weights() -> str:
         rest, far = w.num[-1] / w.den[-1], w.num[0] / w.den[0]
         lines.append(f"| $W_{{{w.i}{w.j}}}$ | {rest:.4g} | {zeros} | {poles} | {far:.4g} |")
     return "\n".join(lines)
+
+
+def _short(omega: float) -> str:
+    return f"{omega:.0f}" if omega >= 1e3 else f"{omega:.3g}"
 
 
 def _roots(coefficients: tuple[float, ...]) -> str:
