@@ -63,6 +63,7 @@ def both_sides(
     endpoint: str,
     touch: Callable[[Side, Link], Link] = lambda side, link: link,
     name: str = "zmq",
+    options: dict[str, Any] | None = None,
 ) -> dict[str, np.ndarray]:
     """Run a scenario over a link; returns the signals and leaves the logs in ``folder``."""
     benches = {side: make_bench(scenario) for side in SIDES}
@@ -71,7 +72,7 @@ def both_sides(
         compile_side(side, benches[side], parts[side])
 
     def call(side: Side) -> None:
-        link = open_link(name, side, endpoint)
+        link = open_link(name, side, endpoint, options)
         timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
         try:
             t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,8 +30,23 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--mode", choices=["lockstep", "realtime"], help="override mode")
     command.add_argument("--link", help="override link.type: zmq, inproc or another link there is")
     command.add_argument("--endpoint", help="override link.endpoint, e.g. tcp://127.0.0.1:5555")
+    command.add_argument(
+        "--option", action="append", default=[], metavar="KEY=VALUE", type=_link_option,
+        help="override a key of link.options, e.g. curve=keys; may be repeated",
+    )  # fmt: skip
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
+
+
+def _link_option(text: str) -> tuple[str, Any]:
+    """KEY=VALUE with the value as in TOML, or as text where it is none."""
+    key, equals, value = text.partition("=")
+    if not (key.isidentifier() and equals):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be KEY=VALUE")
+    try:
+        return key, tomllib.loads(f"x = {value}")["x"]
+    except tomllib.TOMLDecodeError:
+        return key, value
 
 
 def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
@@ -49,6 +65,7 @@ def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
         link__endpoint=options.endpoint,
         duration=options.duration,
         seed=options.seed,
+        **{f"link__options__{key}": value for key, value in options.option},
         **more,
     )
 

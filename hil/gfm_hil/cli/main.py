@@ -27,6 +27,7 @@ MODULES = {
     "laws": "laws",
     "design": "design",
     "scenarios": "scenarios",
+    "keys": "keys",
     "controller": "sides",
     "plant": "sides",
 }

@@ -1,10 +1,18 @@
-"""ZeroMQ link: a PAIR socket at each end, the controller binds, the plant connects."""
+"""ZeroMQ link: a PAIR socket at each end, the controller binds, the plant connects.
+
+PAIR, because it takes one peer and no other: a stranger that connects to a DEALER would get every
+second frame. libzmq's I/O thread is started here and inherits the scheduling of the thread that
+opens the link, priority and processor. Leave it at that: with a higher priority than the loop's,
+each wake-up preempts the loop, and a round trip takes twice as long.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import socket
 import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zmq
 
@@ -13,9 +21,19 @@ from gfm_hil.links.base import Side
 from gfm_hil.links.port import Port
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.links.zeromq.options import ZmqOptions
+from gfm_hil.links.zeromq.reach import refuse_open
+
+if TYPE_CHECKING:
+    from gfm_hil.links.zeromq.curve import Curve
 
 _LAST_WORDS = 500  # ms
-_ROOM = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
+
+# What a stalled peer leaves unread is bounded, and more is dropped: at each end so many messages,
+_ROOM = 64
+# and in the kernel about 600 more: a Unix socket takes no more by itself, tcp is told (bytes; by
+# itself it takes 40,000). A frame's tick says how old it is; PAIR ignores CONFLATE.
+_KERNEL_ROOM = 16384
+
 _DEFAULT = ZmqOptions()
 
 
@@ -32,23 +50,35 @@ class ZmqLink:
             if it has no library that could be called (it says so).
 
     Raises:
-        UserError: it cannot be bound, as when it is in use.
+        UserError: it cannot be bound, as when it is in use; it goes beyond this machine and
+            neither is it encrypted nor meant to be plain; keys are missing.
     """
 
     port: Port | None = None
 
     def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
+        refuse_open(endpoint, options)
         if side == "controller" and endpoint.startswith("ipc://"):
             _refuse_if_served(endpoint)
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
         self._socket.set(zmq.SNDHWM, _ROOM)
         self._socket.set(zmq.RCVHWM, _ROOM)
+        self._socket.set(zmq.SNDBUF, _KERNEL_ROOM)
+        self._socket.set(zmq.RCVBUF, _KERNEL_ROOM)
+        self._curve: Curve | None = None
         try:
+            if options.curve is not None:
+                from gfm_hil.links.zeromq.curve import Curve  # 0.1 s, most runs need none
+
+                self._curve = Curve(self._socket, side, Path(options.curve))
             if side == "controller":
                 self._socket.bind(endpoint)
             else:
                 self._socket.connect(endpoint)
+        except UserError:
+            self.close()
+            raise
         except zmq.ZMQError as problem:
             self.close()
             verb = "bound" if side == "controller" else "connected to"
@@ -82,6 +112,8 @@ class ZmqLink:
         if self.port is not None:
             self.port.handle[:] = 0  # its functions then do nothing
         self._socket.close(linger=_LAST_WORDS)
+        if self._curve is not None:
+            self._curve.close()
         self._context.term()
 
 

@@ -1,0 +1,33 @@
+"""gfmhil keys: key pairs for a link between two machines."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.links.base import SIDES
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "keys",
+        help="make a key pair per side, for ZeroMQ between two machines",
+        description="Make a key pair per side, for ZeroMQ between two machines (CURVE).",
+    )
+    command.add_argument("--out", default="keys", help="folder (%(default)s)")
+    command.add_argument("--force", action="store_true", help="replace the keys that are there")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Write them and say where each belongs."""
+    from gfm_hil.links.zeromq.curve import write_keys
+
+    folder = Path(options.out)
+    write_keys(folder, options.force)
+    for side, other in zip(SIDES, SIDES[::-1], strict=True):
+        print(f"the {side}'s machine: {folder / side}.key_secret {folder / other}.key")
+    print(f"on both: link.options.curve = {str(folder)!r}, or --option curve={folder}")
+    return 0

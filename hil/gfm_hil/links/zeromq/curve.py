@@ -1,0 +1,113 @@
+"""CURVE: keys for both sides, frames that nobody reads or forges, and one plant that gets in.
+
+A folder of keys holds ``<side>.key``, the public one, and ``<side>.key_secret`` in pyzmq's format.
+A side needs its own secret and the other's public key.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+import zmq
+import zmq.auth
+from zmq.auth.thread import ThreadAuthenticator
+from zmq.utils import z85
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES, Side
+
+_KEY_BYTES = 32
+
+
+def key_files(folder: Path) -> list[Path]:
+    """Every file of a folder of keys."""
+    return [folder / f"{side}.{kind}" for side in SIDES for kind in ("key", "key_secret")]
+
+
+def write_keys(folder: Path, force: bool = False) -> list[Path]:
+    """Write a fresh key pair per side, readable by the user alone.
+
+    Raises:
+        UserError: a key is there already and ``force`` is not set, or it cannot be written.
+    """
+    _need_curve()
+    files = key_files(folder)
+    for file in files:
+        if file.exists() and not force:
+            raise UserError(f"{file}: is there already; --force replaces all keys of the folder")
+    before = os.umask(0o077)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in files:
+            file.unlink(missing_ok=True)  # one that others may read would stay so
+        for side in SIDES:
+            zmq.auth.create_certificates(folder, side)
+    except OSError as problem:
+        raise UserError(f"{folder}: {problem.strerror}") from None
+    finally:
+        os.umask(before)
+    return files
+
+
+class Curve:
+    """Encryption of one side's socket; at the controller also who may come in.
+
+    Args:
+        socket: not yet bound or connected.
+        side, folder: whose keys, and where they are.
+
+    Raises:
+        UserError: a key is missing or is none.
+    """
+
+    def __init__(self, socket: zmq.Socket[bytes], side: Side, folder: Path) -> None:
+        _need_curve()
+        public, secret = _key(folder / f"{side}.key_secret")
+        other = "plant" if side == "controller" else "controller"
+        self._peer, _ = _key(folder / f"{other}.key")
+        self._door: ThreadAuthenticator | None = None
+        socket.curve_publickey, socket.curve_secretkey = public, secret
+        if side == "controller":
+            socket.curve_server = True
+            self._door = ThreadAuthenticator(socket.context)
+            self._door.start()  # without it libzmq would let in whoever knows our public key
+            self._door.configure_curve_callback(credentials_provider=self)
+        else:
+            socket.curve_serverkey = self._peer
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Whether the owner of a public key may come in; asked by the authenticator."""
+        return key == self._peer
+
+    def close(self) -> None:
+        """Stop answering; before the context ends."""
+        if self._door is not None:
+            self._door.stop()
+
+
+def _key(file: Path) -> tuple[bytes, bytes | None]:
+    """Public and, if the file has it, secret key, Z85.
+
+    Raises:
+        UserError: no such file, or no keys in it.
+    """
+    where = f"link.options.curve = {str(file.parent)!r}: {file.name}"
+    try:
+        public, secret = zmq.auth.load_certificate(file)
+        if len(z85.decode(public)) != _KEY_BYTES:
+            raise ValueError
+        if file.suffix == ".key_secret" and (not secret or zmq.curve_public(secret) != public):
+            raise ValueError
+    except OSError as problem:
+        why = problem.strerror or "no such file"
+        raise UserError(f"{where}: {why}; gfmhil keys makes one") from None
+    except (ValueError, KeyError, struct.error, zmq.ZMQError):  # whatever Z85 finds amiss
+        raise UserError(f"{where}: holds no key that fits; gfmhil keys makes one") from None
+    return public, secret
+
+
+def _need_curve() -> None:
+    if not zmq.has("curve"):
+        raise UserError("this libzmq cannot encrypt: it was built without CURVE")

@@ -1,0 +1,54 @@
+"""Whether an endpoint can be reached from, or reaches, another machine."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from pathlib import Path
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.zeromq.options import ZmqOptions
+
+_IFF_LOOPBACK = 0x8  # of linux/if.h
+
+
+def refuse_open(endpoint: str, options: ZmqOptions) -> None:
+    """See that frames leave this machine encrypted, or because somebody said so.
+
+    Raises:
+        UserError: neither.
+    """
+    if options.curve is None and not options.plain and beyond_loopback(endpoint):
+        raise UserError(
+            f"link.endpoint = {endpoint!r}: goes beyond this machine, unencrypted: set "
+            "link.options.curve to a folder of keys (gfmhil keys makes one), or "
+            "link.options.plain = true if that is meant"
+        )
+
+
+def beyond_loopback(endpoint: str) -> bool:
+    """False for ipc, and for tcp where the host is nothing but this machine's loopback.
+
+    Whatever cannot be told (a name that does not resolve, ``*``) counts as beyond.
+    """
+    if not endpoint.startswith("tcp://"):
+        return False
+    host = endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+    return not (_interface_is_loopback(host) or _addresses_are_loopback(host))
+
+
+def _interface_is_loopback(name: str) -> bool:
+    """``tcp://lo:5555``: libzmq takes the names of interfaces too."""
+    try:
+        flags = (Path("/sys/class/net") / name / "flags").read_text("ascii")
+    except (OSError, ValueError):
+        return False
+    return bool(int(flags, 16) & _IFF_LOOPBACK)
+
+
+def _addresses_are_loopback(host: str) -> bool:
+    try:
+        found = {str(info[4][0]) for info in socket.getaddrinfo(host, None)}
+    except (OSError, UnicodeError):
+        return False
+    return bool(found) and all(ipaddress.ip_address(a).is_loopback for a in found)
