@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import platform
+import re
 import secrets
 import struct
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,9 +17,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 
 from gfm_hil.errors import UserError
-from gfm_hil.links import open_link
+from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.shm import ring, segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_runtime import law_names
@@ -104,3 +112,193 @@ def test_a_message_that_does_not_fit_is_dropped(size, pair):
     assert not sender.send(bytes(size))
     assert sender.send(b"next")
     assert receiver.receive() == b"next"
+
+
+def test_a_message_too_long_for_its_reader_is_gone(pair):
+    sender, receiver = pair
+    assert sender.send(b"x" * 100)
+    assert sender.send(b"next")
+    port, message = receiver.port, np.zeros(99, np.uint8)
+    assert ring.take(port.handle, message) == 100
+    assert not message.any()
+    assert ring.take(port.handle, message) == 4
+    assert message[:5].tobytes() == b"next\0"
+
+
+def test_what_was_sent_last_is_there_after_the_controller_has_gone(pair, endpoint):
+    controller, plant = pair
+    assert controller.send(b"last")
+    controller.close()
+    assert not segment_of(endpoint).exists()
+    assert plant.receive() == b"last"
+    assert plant.receive() is None
+
+
+def test_a_closed_end_is_deaf_and_dumb(pair):
+    controller, plant = pair
+    plant.close()
+    plant.close()
+    controller.send(b"x")
+    assert (plant.send(b"x"), plant.receive(), plant.wait(0.001)) == (False, None, False)
+    assert ring.put(plant.port.handle, np.ones(4, np.uint8)) == 0
+    assert ring.take(plant.port.handle, np.ones(4, np.uint8)) == 0
+
+
+def test_a_plant_that_comes_first_waits_for_the_controller(endpoint):
+    plant = ShmLink("plant", endpoint)
+    assert not plant.send(b"x")
+    assert plant.receive() is None
+    assert not plant.wait(0.001)
+    controller = ShmLink("controller", endpoint)
+    assert plant.send(b"hello")
+    assert controller.wait(0.001)
+    assert controller.receive() == b"hello"
+    plant.close()
+    controller.close()
+
+
+def test_waiting_ends_when_a_message_comes(pair):
+    sender, receiver = pair
+    thread = threading.Timer(0.05, sender.send, [b"x"])
+    thread.start()
+    begin = time.monotonic()
+    assert receiver.wait(60)
+    assert time.monotonic() - begin < 50  # it was the message, not the time
+    thread.join()
+
+
+def test_the_next_plant_goes_on_where_the_last_one_stopped(endpoint):
+    controller, plant = ShmLink("controller", endpoint), ShmLink("plant", endpoint)
+    for k in range(100):
+        assert plant.send(b"%d" % k)
+        assert controller.send(b"%d" % k)
+        assert (controller.receive(), plant.receive()) == (b"%d" % k,) * 2
+    plant.send(b"by the first")
+    plant.close()
+    plant = ShmLink("plant", endpoint)
+    assert plant.send(b"by the second")
+    assert [controller.receive() for _ in range(3)] == [b"by the first", b"by the second", None]
+    assert controller.send(b"x")
+    assert plant.receive() == b"x"
+    plant.close()
+    controller.close()
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../x", "a b", "ä", "x" * 201, "x\n"])
+@pytest.mark.parametrize("side", ["controller", "plant"])
+def test_a_name_that_is_none(side, name):
+    with pytest.raises(UserError, match="must be shm://name, the name of 1 to 200 letters"):
+        open_link("shm", side, f"shm://{name}")
+
+
+def test_the_longest_name_and_a_fresh_one_are_good(tmp_path):
+    kind = link_kind("shm")
+    for endpoint in ("shm://" + "x" * 200, kind.fresh(tmp_path)):
+        kind.check_endpoint(endpoint)
+        open_link("shm", "controller", endpoint).close()
+        assert not segment_of(endpoint).exists()
+
+
+def header(version: int, owner: segment.Identity) -> bytes:
+    return struct.pack("<8sq3q", segment.MAGIC, version, *owner).ljust(segment.SIZE, b"\0")
+
+
+def test_a_memory_of_another_layout_is_refused(endpoint):
+    path = segment_of(endpoint)
+    path.write_bytes(header(segment.VERSION + 1, segment.myself()))
+    with pytest.raises(UserError, match=r"another version \(layout 2, ours is 1\)"):
+        ShmLink("plant", endpoint)
+    with pytest.raises(UserError, match="occupied by another run"):
+        ShmLink("controller", endpoint)
+    path.unlink()
+
+
+def test_a_file_that_is_none_of_ours_is_refused_and_kept(endpoint):
+    path = segment_of(endpoint)
+    path.write_bytes(b"somebody's")
+    for side in ("controller", "plant"):
+        with pytest.raises(UserError, match="is no link of ours"):
+            ShmLink(side, endpoint)
+    assert path.read_bytes() == b"somebody's"
+    path.unlink()
+
+
+@pytest.mark.parametrize("shift", [(0, 1, 0), (2**30, 0, 0)])
+def test_an_owner_is_known_by_its_start_too(shift, endpoint):
+    """A process number is used again some day."""
+    owner = tuple(np.add(segment.myself(), shift).tolist())
+    segment_of(endpoint).write_bytes(header(segment.VERSION, owner))
+    ShmLink("controller", endpoint).close()
+
+
+def test_an_owner_in_another_container_counts_as_alive(endpoint):
+    pid, start, namespace = segment.myself()
+    segment_of(endpoint).write_bytes(header(segment.VERSION, (pid, start, namespace + 1)))
+    with pytest.raises(UserError, match="occupied"):
+        ShmLink("controller", endpoint)
+    segment_of(endpoint).unlink()
+
+
+def test_a_maker_that_was_killed_at_it_is_no_hindrance(endpoint):
+    segment_of(endpoint).write_bytes(b"")
+    ShmLink("controller", endpoint).close()
+
+
+def test_no_room_is_told_and_leaves_nothing(endpoint, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(UserError, match="cannot be created: No space left on device"):
+        ShmLink("controller", endpoint)
+    assert not segment_of(endpoint).exists()
+
+
+def test_of_many_that_replace_a_dead_one_at_a_time_one_wins(endpoint):
+    pid, start, namespace = segment.myself()
+    segment_of(endpoint).write_bytes(header(segment.VERSION, (pid, start + 1, namespace)))
+    won: list[ShmLink] = []
+    lost: list[UserError] = []
+
+    def one() -> None:
+        try:
+            won.append(ShmLink("controller", endpoint))
+        except UserError as problem:
+            lost.append(problem)
+
+    threads = [threading.Thread(target=one) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(won), len(lost)) == (1, 7)
+    won[0].close()
+
+
+def emitted(function: object) -> tuple[str, str]:
+    """LLVM's code after optimisation and the machine's, of a function compiled anew: what comes
+    from the cache cannot be inspected."""
+    fresh = njit(PORT_CALL)(function.py_func)  # type: ignore[attr-defined]
+    (signature,) = fresh.signatures
+    return fresh.inspect_llvm(signature), fresh.inspect_asm(signature)
+
+
+@pytest.mark.parametrize("function", [ring.put, ring.take])
+def test_the_emitted_code_keeps_the_order(function):
+    code, machine = emitted(function)
+    load = re.search(r"load atomic i64, .* acquire, align 8", code)
+    copy = re.search(r"call void @llvm\.memcpy", code)
+    store = re.search(r"store atomic i64 .* release, align 8", code)
+    assert load
+    assert copy
+    assert store
+    assert copy.start() < store.start()
+    assert "cmpxchg" not in code.split("define")[1]
+    if platform.machine() == "x86_64":
+        own = machine.split(".Lfunc_end0")[0]
+        assert "NRT_" not in own  # no counting of references
+        assert "mfence" not in own
+        assert "lock" not in own  # both orders are plain moves on x86
+        after_copy = own[own.index("callq") :]
+        assert re.search(r"movq\s+%r\w+, (0\(|\(%)", after_copy)
+        assert ("pause" in own) == (function is ring.take)

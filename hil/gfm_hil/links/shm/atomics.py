@@ -11,7 +11,9 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core.cgutils import raw_memcpy
-from numba.extending import intrinsic
+from numba.extending import intrinsic as _numba_intrinsic
+
+intrinsic: Any = _numba_intrinsic  # its stubs count typingctx among the caller's arguments
 
 _WORD = ir.IntType(64)
 _BYTES = ir.IntType(8).as_pointer()

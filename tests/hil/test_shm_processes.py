@@ -1,0 +1,107 @@
+"""The shared-memory link between processes: nothing torn, and what a killed one leaves."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.shm.link import ShmLink
+
+from .test_shm import endpoint, segment_of
+
+__all__ = ["endpoint"]
+
+Peer = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def peer(endpoint: str) -> Iterator[Peer]:
+    """Start a side as a process, and wait until it has opened its end."""
+    started = []
+
+    def call(side: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:
+        script = Path(__file__).with_name("shm_peer.py")
+        process = subprocess.Popen(
+            [sys.executable, str(script), side, endpoint, what, str(n)],
+            text=True,
+            stdout=subprocess.PIPE,
+        )
+        started.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    yield call
+    for process in started:
+        kill(process)
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+
+
+def test_nothing_is_torn_lost_or_doubled_in_a_million_messages_each_way(peer):
+    controller, plant = (peer(side, "flood", 1_000_000) for side in ("controller", "plant"))
+    for process in (controller, plant):
+        assert process.communicate(timeout=110)[0] == "1000000 0\n"
+
+
+def test_a_name_is_had_by_one_controller_and_one_plant(peer, endpoint):
+    controller = peer("controller")
+    with pytest.raises(UserError) as found:
+        ShmLink("controller", endpoint)
+    assert str(found.value) == (
+        f"link.endpoint = {endpoint!r}: cannot be created: "
+        f"occupied by another run (process {controller.pid})"
+    )
+    plant = peer("plant")
+    with pytest.raises(UserError, match=rf"another plant has joined it \(process {plant.pid}\)"):
+        ShmLink("plant", endpoint)
+    kill(controller)
+    ShmLink("controller", endpoint).close()
+
+
+def test_a_killed_controller_is_not_joined_and_its_name_is_free(peer, endpoint):
+    kill(peer("controller"))
+    assert segment_of(endpoint).exists()
+    plant = ShmLink("plant", endpoint)
+    assert not plant.send(b"to the dead")
+    controller = ShmLink("controller", endpoint)
+    assert plant.send(b"to the living")
+    assert controller.receive() == b"to the living"
+    plant.close()
+    controller.close()
+
+
+def test_a_killed_plant_leaves_its_place_to_the_next(peer, endpoint):
+    controller = ShmLink("controller", endpoint)
+    kill(peer("plant"))
+    plant = ShmLink("plant", endpoint)
+    assert controller.send(b"hello")
+    assert plant.receive() == b"hello"
+    controller.close()
+    assert not segment_of(endpoint).exists()
+    plant.close()
+
+
+def test_what_killed_runs_left_is_swept_by_a_run_of_another_name(peer, endpoint):
+    controller, plant = peer("controller"), peer("plant")
+    kill(controller)
+    kill(plant)
+    other = ShmLink("controller", endpoint + "-other")
+    assert not segment_of(endpoint).exists()
+    other.close()
+
+
+def test_a_living_run_is_not_swept(peer, endpoint):
+    controller = peer("controller")
+    ShmLink("controller", endpoint + "-other").close()
+    assert segment_of(endpoint).exists()
+    kill(controller)
+    ShmLink("controller", endpoint).close()
