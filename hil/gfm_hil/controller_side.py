@@ -38,7 +38,7 @@ def run_controller(
 
     def leave(status: str, reason: str, state: int, code: int) -> None:
         timeline.end(status, reason, tick)  # type: ignore[arg-type]
-        send_last(link, writer.pack(tick, state, code, bench.u))
+        send_last(link, writer, tick, state, code, bench.u)
 
     while timeline.running:
         wait_ns = T_ns if realtime else patience_ns
@@ -58,9 +58,9 @@ def run_controller(
             continue
         heard = now
         try:
-            tick = reader.unpack(frame, bench.y)
+            newest = reader.unpack(frame, bench.y)
         except FrameError:
-            continue  # counted; in lockstep the plant repeats nothing and both will time out
+            continue  # counted; in lockstep the plant will ask again
         if reader.state == SAFE:
             leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
             break
@@ -70,6 +70,10 @@ def run_controller(
             else:
                 timeline.end("completed", "", tick)
             break
+        if done and newest <= tick:  # the plant asks again: our answer was lost
+            link.send(writer.pack(tick, int(c.ctl["state"][0]), int(c.ctl["reason"][0]), bench.u))
+            continue
+        tick = newest
         timeline.carry_out(tick)
         c.step(bench.y, bench.u)
         computed = time.monotonic_ns()

@@ -36,6 +36,8 @@ class _Plant:
         self.reader, self.writer = FrameReader("u"), FrameWriter("y")
         self.T_ns = round(self.bench.scenario.T_s * 1e9)
         self.patience_ns = int(self.bench.scenario.link.peer_timeout_s * 1e9)
+        self.repeat_ns = int(self.bench.scenario.link.repeat_s * 1e9)
+        self.u_last = self.u_before = self.bench.u.copy()  # the newest two that came in time
         self.misses = 0
         self.late = 0  # misses in a row
 
@@ -67,11 +69,16 @@ class _Plant:
 
     def lockstep(self, tick: int) -> None:
         self.sample(tick)
-        deadline = time.monotonic_ns() + self.patience_ns
+        now = time.monotonic_ns()
+        deadline, again = now + self.patience_ns, now + self.repeat_ns
         while True:
-            frame = await_message(self.link, deadline, self.stopped)
+            frame = await_message(self.link, min(deadline, again), self.stopped)
             if frame is None:
-                break
+                if again >= deadline or self.stopped():
+                    break
+                again += self.repeat_ns  # y[k] or u[k] was lost: ask again
+                self.link.send(self.writer.pack(tick, 0, 0, self.bench.y))
+                continue
             # a controller that leaves says so under the last tick it saw
             if self.take(frame) == tick or self.reader.state in (SAFE, STOPPED):
                 self.part.times[tick, 3] = time.monotonic_ns()
@@ -96,6 +103,10 @@ class _Plant:
                 break
             else:
                 os.sched_yield()
+        if newest == tick:
+            self.u_before, self.u_last = self.u_last, self.bench.u.copy()
+        elif self.late < self.bench.scenario.late_policy.extrapolate:
+            self.bench.u[:] = self.u_last + (self.late + 1) * (self.u_last - self.u_before)
         self.late = 0 if newest == tick else self.late + 1
         self.misses += newest != tick
         self.part.progress[1] = self.misses
@@ -136,5 +147,5 @@ def run_plant(
     assert timeline.outcome is not None
     state = SAFE if timeline.outcome.status == "tripped" else STOPPED
     failed = int(timeline.outcome.status != "completed")
-    send_last(link, p.writer.pack(tick, state, failed, bench.y))
+    send_last(link, p.writer, tick, state, failed, bench.y)
     return p.reader

@@ -81,16 +81,20 @@ def finish(
         timing = dict(file)
     logs = sorted(folder.glob("events_*.jsonl"))
     log = read_log(*logs)
-    faults = {}
+    faults, injected = {}, {}
     for path in sorted(folder.glob("link_*.json")):
         content = json.loads(path.read_text())
         faults[content["side"]] = {k: v for k, v in content["faults"].items() if v}
+        if "injected" in content:
+            injected[content["side"]] = content["injected"]
         path.unlink()
     outcome = worst(log, outside)
     (folder / "events.jsonl").write_text("".join(json.dumps(e) + "\n" for e in log), "utf-8")
     for path in logs:
         path.unlink()
     summary = summarise(scenario, signals, timing, log, outcome, faults, wall_s)
+    if injected:
+        summary["injected"] = injected
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
     if figures and len(signals["tick"]):
         pictures = draw_run(folder, scenario, signals, timing, summary, laws)

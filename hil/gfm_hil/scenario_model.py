@@ -16,6 +16,7 @@ from gfm_hil.events import (
     check_reference,
 )
 from gfm_hil.links import link_kind, link_names
+from gfm_hil.links.impaired.settings import Impairment
 from gfm_plant import Plant, load_converter
 from gfm_runtime import law_file
 from gfm_runtime.signals import REF_NAMES, table_hash
@@ -40,6 +41,10 @@ class Link(_Model):
     peer_timeout_s: float = Field(
         0.5, gt=0, le=60, description="silence after which the other side counts as gone"
     )
+    repeat_s: float = Field(
+        0.002, gt=0, le=60, description="lockstep: silence after which the plant sends y[k] again"
+    )
+    impairment: Impairment | None = Field(None, description="faults on purpose")
     start_timeout_s: float = Field(60.0, gt=0, description="how long to wait for it at the start")
 
     @model_validator(mode="after")
@@ -84,6 +89,20 @@ class LatePolicy(_Model):
     """Real time: what to do about frames that are not there at their deadline."""
 
     hold: int = Field(200, ge=0, description="ticks in a row to hold the last value, then SAFE")
+    extrapolate: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="the first of them, over which the plant goes on along u's trend",
+    )
+
+    @model_validator(mode="after")
+    def _within_hold(self) -> LatePolicy:
+        if self.extrapolate > self.hold:
+            raise ValueError(
+                f"extrapolate = {self.extrapolate}: must be at most hold = {self.hold}"
+            )
+        return self
 
 
 class Scenario(_Model):

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from gfm_hil.bench import Bench, make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import PeerLost, UserError
 from gfm_hil.handshake import shake_hands
-from gfm_hil.links import open_link
+from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import Side
+from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.loops.drive import compile_loops
 from gfm_hil.loops.thread import run_compiled
 from gfm_hil.plant_side import run_plant
@@ -57,7 +59,7 @@ def _run(
     part = Part.create(folder, side, scenario.ticks)
     compile_side(side, bench, part)
     rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
-    link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
+    link: Link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
     if rights is not None:
         if link.port is None:  # a loop in Python never sleeps
@@ -70,13 +72,17 @@ def _run(
     try:
         no_collector_pauses()
         t0_ns = shake_hands(side, link, scenario, stopped, notice)
+        if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
+            link = ImpairedLink(link, scenario.link.impairment, side)
         if link.port is not None:
             reader = run_compiled(side, bench, link, part, timeline, t0_ns, stopped)
         else:
             run = run_controller if side == "controller" else run_plant
             reader = run(bench, link, part, timeline, t0_ns, stopped)
-        faults = {"side": side, "faults": reader.faults}
-        (folder / f"link_{side}.json").write_text(json.dumps(faults))
+        seen: dict[str, Any] = {"side": side, "faults": reader.faults}
+        if isinstance(link, ImpairedLink):
+            seen["injected"] = link.injected
+        (folder / f"link_{side}.json").write_text(json.dumps(seen))
     except PeerLost as problem:
         timeline.end("interrupted" if stopped() else "safe", str(problem), 0)
     finally:

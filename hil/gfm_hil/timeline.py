@@ -15,7 +15,7 @@ from gfm_hil.bench import Bench
 from gfm_hil.events import CONTROLLER_EVENTS, LawChange, Reference, apply_grid_event
 from gfm_hil.links.base import Side
 from gfm_plant import trip_reason
-from gfm_runtime.controller import BAD_U, BAD_Y, REASONS, SAFE
+from gfm_runtime.controller import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
 Status = Literal["completed", "tripped", "safe", "interrupted"]
@@ -136,9 +136,10 @@ def read_log(*paths: Path) -> list[dict[str, Any]]:
 
 def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     """The outcome that counts among those the sides wrote and the one seen from outside: the most
-    severe, and of two such the one seen from outside, which knows why."""
+    severe, and of two such the one seen from outside, or of the side that it happened to."""
     ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
     found = [outside, *ends] if outside else ends
     if not found:
         return Outcome("safe", "both sides ended without a word", 0)
-    return max(found, key=lambda o: SEVERITY.index(o.status))
+    hearsay = REASONS[PLANT_TRIP]  # what the controller says; the plant knows of what
+    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason != hearsay))

@@ -6,11 +6,15 @@ import os
 import time
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.frames import FrameWriter
 from gfm_hil.links import Link
 
 _SPIN_NS = 50_000  # longer takes processor time from the very threads that bring the answer
 
-_LAST_NS = 500_000_000
+_LAST_NS, _LAST_TIMES = 500_000_000, 3
 
 
 def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
@@ -32,11 +36,16 @@ def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> 
             link.wait(min(0.02, (deadline_ns - now) * 1e-9))
 
 
-def send_last(link: Link, message: bytes) -> None:
-    """Hand over the message that ends a run, which the other side waits for.
+def send_last(
+    link: Link, writer: FrameWriter, tick: int, state: int, reason: int, values: NDArray[np.float64]
+) -> None:
+    """Send the frame that ends a run, which the other side waits for, and some more like it.
 
-    Where there is no room, because the other side is behind, it gets a while to make some.
+    One alone might be lost. Where there is no room, because the other side is behind, it gets a
+    while to make some.
     """
     give_up = time.monotonic_ns() + _LAST_NS
-    while not link.send(message) and time.monotonic_ns() < give_up:
-        time.sleep(0.001)
+    for _ in range(_LAST_TIMES):
+        message = writer.pack(tick, state, reason, values)
+        while not link.send(message) and time.monotonic_ns() < give_up:
+            time.sleep(0.001)

@@ -174,10 +174,21 @@ class Tampering:
         return getattr(self._link, name)
 
 
-def test_a_frame_lost_in_lockstep_is_silence_and_silence_ends_the_run(make, tmp_path, endpoint):
+@pytest.mark.parametrize("loser", SIDES)
+def test_a_frame_lost_in_lockstep_is_asked_for_again(loser, make, run, tmp_path, endpoint):
+    def touch(side: Side, link: Link) -> Any:
+        if side == loser:
+            return Tampering(link, lambda k, m: None if k in (20, 21, 40) else m)
+        return link
+
+    apart = both_sides(make(link=PATIENT), tmp_path, endpoint, touch)
+    assert_same(apart, run(link=PATIENT).signals)
+
+
+def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
     def touch(side: Side, link: Link) -> Any:
         if side == "plant":
-            return Tampering(link, lambda k, m: None if k == 20 else m)
+            return Tampering(link, lambda k, m: None if k >= 20 else m)
         return link
 
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
@@ -343,14 +354,15 @@ def test_the_last_word_waits_for_room(endpoint):
         heard: list[bytes] = []
 
         def listen() -> None:
-            while b"last" not in heard and controller.wait(30):
+            while (not heard or heard[-1] == b"frame") and controller.wait(30):
                 heard.append(controller.receive())
 
         thread = threading.Thread(target=listen)
         thread.start()
-        send_last(plant, b"last")
+        send_last(plant, FrameWriter("y"), 7, SAFE, 0, np.ones(5))
         thread.join()
-        assert heard[-1] == b"last"
+        reader = FrameReader("y")
+        assert reader.unpack(heard[-1], np.zeros(5)) == 7 and reader.state == SAFE
     finally:
         plant.close()
         controller.close()

@@ -38,6 +38,6 @@ class Port:
     spins: int
 
 
-def port_function(function: Callable[[Any, Any], int]) -> Any:
-    """Compile a function of (handle, message) for a ``Port``; cached on disk."""
-    return cfunc(PORT_CALL, cache=True)(function)
+def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> Any:
+    """Compile a function of (handle, message) for a ``Port``; kept on disk unless told not to."""
+    return cfunc(PORT_CALL, cache=cached)(function)

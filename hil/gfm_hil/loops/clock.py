@@ -15,6 +15,7 @@ from gfm_hil.links.shm.atomics import pause as _pause
 
 _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
 _NS = 1_000_000_000
+_SIGKILL = 9
 
 # numba's own annotation has the typing context among the caller's arguments
 _intrinsic: Any = intrinsic
@@ -81,6 +82,16 @@ def give_way(typingctx):
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.call(_libc(builder, "sched_yield", []), [])
+
+    return types.int32(), make
+
+
+@_intrinsic
+def end_this_process(typingctx):
+    """Die as if killed: SIGKILL to oneself."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.call(_libc(builder, "raise", [_I32]), [_I32(_SIGKILL)])
 
     return types.int32(), make
 

@@ -41,11 +41,17 @@ def controller_ticks(
     sequence, frame, message = out
     while True:
         if not r.pending:
+            before = r.tick
             why = _next_frame(
                 receive, handle, spins, into, reader, r, stop, ctl, y, times, len(rows)
             )
             if why >= 0:
                 return why
+            if r.tick <= before:  # the plant asks again: our answer was lost
+                r.tick = before
+                pack(sequence, frame, message, before, ctl[0].state, ctl[0].reason, u)
+                send(handle, message)
+                continue
             if r.tick >= event:
                 r.pending = 1
                 return EVENT
@@ -110,8 +116,9 @@ def _next_frame(
         return PEER_STOPPED
     if r.realtime:
         _lock(r, k, now)
-    times[k, 0] = r.t0 + k * r.T
-    times[k, 1], times[k, 4] = now, gap
+    if k > r.tick:
+        times[k, 0] = r.t0 + k * r.T
+        times[k, 1], times[k, 4] = now, gap
     r.tick = k
     return -1
 

@@ -50,10 +50,7 @@ class _Loop:
         self.bench, self.link, self.stop = bench, link, stop
         own: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
         self.writer, self.reader = FrameWriter(own[0]), FrameReader(own[1])
-        self.loop = make_loop(
-            scenario.mode == "realtime", 0 if plant else -1, t0_ns, scenario.T_s,
-            scenario.link.peer_timeout_s, scenario.late_policy.hold,
-        )  # fmt: skip
+        self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         w, r, c = self.writer, self.reader, bench.controller
         records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
         self._arguments: tuple[Any, ...] = (
@@ -74,7 +71,7 @@ class _Loop:
 
     def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
         """Tell the other side how this one ends."""
-        send_last(self.link, self.writer.pack(max(self.tick, 0), state, reason, values))
+        send_last(self.link, self.writer, max(self.tick, 0), state, reason, values)
 
 
 def drive_plant(
@@ -82,6 +79,7 @@ def drive_plant(
 ) -> FrameReader:
     """Run the plant's side of a scenario after the handshake; returns its frame counters."""
     loop, ticks = _Loop("plant", bench, link, part, t0_ns, stop), bench.scenario.ticks
+    loop.loop["u_last"] = loop.loop["u_before"] = bench.u
     while timeline.running:
         timeline.carry_out(loop.tick)
         why = loop.go(min(timeline.next_tick(), ticks))

@@ -13,8 +13,10 @@ from gfm_hil.loops.records import DONE, LATE, LOOK, PEER_SAFE, PEER_STOPPED, SIL
 from gfm_hil.recording import record_plant
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.controller import SAFE, STOPPED
+from gfm_runtime.signals import NU
 
 _U_ID = 2
+FRESH, OVERDUE, LEAVING = range(3)
 _CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
 
 
@@ -53,21 +55,36 @@ def plant_ticks(
         sent = now_ns()
         times[k, 2] = sent
         until = due + r.T if r.realtime else sent + r.patience
-        fresh, silent, gap = _answer(
-            receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k, until, gap
-        )
+        again = sent + (r.patience if r.realtime else r.repeat)
+        while True:
+            came, gap = _answer(
+                receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k,
+                min(until, again), gap,
+            )  # fmt: skip
+            if came != OVERDUE or again >= until:
+                break
+            again += r.repeat
+            r.repeats += 1
+            pack(sequence, frame, message, k, 0, 0, y)
+            send(handle, message)
+        if came == FRESH:
+            for j in range(NU):
+                r.u_before[j], r.u_last[j] = r.u_last[j], u[j]
+        elif r.realtime and r.late < r.extrapolate:
+            for j in range(NU):
+                u[j] = r.u_last[j] + (r.late + 1) * (r.u_last[j] - r.u_before[j])
         record_plant(rows[k], y, u, par, st)
         progress[0] = k + 1
         if reader[0].state == SAFE:
             return PEER_SAFE
         if reader[0].state == STOPPED:
             return PEER_STOPPED
-        if not fresh:
+        if came != FRESH:
             if not r.realtime:
-                return SILENT if silent else STOPPED_HERE
+                return SILENT if came == OVERDUE else STOPPED_HERE
             r.misses += 1
             progress[1] = r.misses
-        r.late = 0 if fresh else r.late + 1
+        r.late = 0 if came == FRESH else r.late + 1
         times[k, 4] = gap
         plant_advance(par, st, u)
         r.tick = k + 1
@@ -84,7 +101,8 @@ def plant_ticks(
 def _answer(
     receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k, until, gap
 ):  # fmt: skip
-    """Wait for u[k]: whether it came, whether the time ran out, the longest gap between looks."""
+    """Wait for u[k]: whether it is FRESH, OVERDUE or not awaited any more (LEAVING), and the
+    longest gap between two looks at the clock."""
     before = times[k, 2]
     looks = 0
     while True:
@@ -93,16 +111,18 @@ def _answer(
             tick = unpack(reader, _U_ID, got, got_bytes, size, u)
             # a controller that leaves says so under the last tick it saw
             if tick == k or reader[0].state == SAFE or reader[0].state == STOPPED:
-                times[k, 3] = now_ns()
-                return tick == k, False, max(gap, times[k, 3] - before)
+                now = now_ns()
+                if tick == k:
+                    times[k, 3] = now
+                return FRESH if tick == k else LEAVING, max(gap, now - before)
         looks += 1
         if r.realtime or looks % _CLOCK_EVERY == 0:
             now = now_ns()
             gap = max(gap, now - before)
             before = now
             if now >= until:
-                return False, True, gap
+                return OVERDUE, gap
         if size <= 0:
             if not r.realtime and stop[0] != 0:
-                return False, False, gap
+                return LEAVING, gap
             between_looks(looks, spins, not r.realtime)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfm_hil.scenario_model import Scenario
+from gfm_runtime.signals import NU
+
 #: why a loop returned
 DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT = range(8)
 
@@ -15,11 +18,16 @@ loop_dtype = np.dtype(
         ("T", "i8"),  # sampling time, ns
         ("patience", "i8"),  # silence after which the other side is gone, ns
         ("hold", "i8"),  # misses in a row that the plant allows
+        ("extrapolate", "i8"),  # plant: misses in a row over which u goes on along its trend
+        ("repeat", "i8"),  # lockstep: silence after which the plant sends y again, ns
+        ("repeats", "i8"),  # how often it did
         ("late", "i8"),  # misses in a row
         ("misses", "i8"),
         ("heard", "i8"),  # when the last message came, ns
         ("pending", "i8"),  # a frame was taken but not yet computed
         ("done", "i8"),  # ticks computed
+        ("u_last", "f8", (NU,)),  # the two newest u that came in time
+        ("u_before", "f8", (NU,)),
         ("expected", "f8"),  # arrival of the next frame by the phase lock, ns after t0
         ("period", "f8"),  # of the other side's ticks by our clock, ns
     ],
@@ -27,12 +35,12 @@ loop_dtype = np.dtype(
 )
 
 
-def make_loop(
-    realtime: bool, tick: int, t0_ns: int, T_s: float, patience_s: float, hold: int
-) -> np.ndarray:
-    """A loop before its first tick; see ``loop_dtype``."""
+def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
+    """A scenario's loop before its first tick; see ``loop_dtype``."""
     loop = np.zeros(1, loop_dtype)
-    loop["realtime"], loop["tick"], loop["t0"], loop["hold"] = realtime, tick, t0_ns, hold
-    loop["T"] = loop["period"] = round(T_s * 1e9)
-    loop["patience"] = int(patience_s * 1e9)
+    link, policy = scenario.link, scenario.late_policy
+    loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
+    loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
+    loop["T"] = loop["period"] = round(scenario.T_s * 1e9)
+    loop["patience"], loop["repeat"] = int(link.peer_timeout_s * 1e9), int(link.repeat_s * 1e9)
     return loop

@@ -1,0 +1,6 @@
+"""A stage of faults on purpose, for any link."""
+
+from gfm_hil.links.impaired.link import ImpairedLink
+from gfm_hil.links.impaired.settings import Impairment
+
+__all__ = ["ImpairedLink", "Impairment"]

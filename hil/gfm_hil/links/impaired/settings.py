@@ -1,0 +1,47 @@
+"""What can be done to a link's messages, as the table ``link.impairment`` of a scenario."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from gfm_hil.links.base import LinkOptions, Side
+
+
+class Impairment(LinkOptions):
+    """Faults that a link is given on purpose, drawn from a seed for every frame that arrives.
+
+    Probabilities are those of a frame; times are in s.
+    """
+
+    towards: Literal["both", "controller", "plant"] = Field(
+        "both", description="the side whose incoming frames are hit"
+    )
+    seed: int = Field(1, ge=1, lt=2**32)
+    loss: float = Field(0.0, ge=0, le=1, description="a frame is lost")
+    burst: float = Field(1.0, ge=1, le=1e6, description="frames lost in a row, on average")
+    corrupt: float = Field(0.0, ge=0, le=1, description="bits of a frame are flipped")
+    bits: int = Field(1, ge=1, le=64, description="how many of them")
+    duplicate: float = Field(0.0, ge=0, le=1, description="a frame arrives twice")
+    reorder: float = Field(0.0, ge=0, le=1, description="a frame arrives after the next one")
+    delay: float = Field(0.0, ge=0, le=10, description="every frame is late by that, s")
+    jitter: float = Field(0.0, ge=0, le=10, description="and by up to that more, drawn evenly, s")
+    pause_at: int | None = Field(None, ge=0, description="frame from which the link is silent")
+    pause: float = Field(0.1, gt=0, le=60, description="for so long, s")
+    kill_at: int | None = Field(None, ge=0, description="frame at which the process is killed")
+
+    @model_validator(mode="after")
+    def _something(self) -> Impairment:
+        faults = self.loss, self.corrupt, self.duplicate, self.reorder, self.delay, self.jitter
+        if not any(faults) and self.pause_at is None and self.kill_at is None:
+            raise ValueError("nothing: give loss, corrupt, duplicate, reorder, delay, jitter, ...")
+        if sum(faults[:4]) > 1:
+            raise ValueError(
+                f"loss + corrupt + duplicate + reorder = {sum(faults[:4]):g}: must be at most 1"
+            )
+        return self
+
+    def hits(self, side: Side) -> bool:
+        """Whether frames that come in at this side are hit."""
+        return self.towards in ("both", side)
