@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from gfm_hil.errors import PeerLost
@@ -20,26 +22,43 @@ from gfm_runtime.signals import TABLE_VERSION
 
 _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
+_LEAD_NS = 20_000_000  # from START to tick 0
+_BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux; CLOCK_MONOTONIC counts from that boot
 
 Notice = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Start:
+    """What both sides agreed on.
+
+    Attributes:
+        t0_ns: time of tick 0 by our own CLOCK_MONOTONIC; where the other side has another one,
+            the controller's is late by the time that START took to come.
+        one_clock: both sides run on one machine.
+    """
+
+    t0_ns: int
+    one_clock: bool
+
+
 def shake_hands(
     side: Side, link: Link, scenario: Scenario, stopped: Callable[[], bool], notice: Notice
-) -> int:
-    """Meet the other side; returns the time of tick 0 (CLOCK_MONOTONIC of the plant, ns).
+) -> Start:
+    """Meet the other side and agree on the time of tick 0.
 
     ``notice`` is told, within a second and then every five, that the other side is awaited.
 
     Raises:
         PeerLost: nobody came within ``link.start_timeout_s``, or they run something else.
     """
-    mine = {"side": side, "table": TABLE_VERSION, "digest": scenario.digest()}
+    boot = _boot()
+    mine = {"side": side, "table": TABLE_VERSION, "digest": scenario.digest(), "boot": boot}
     begin = time.monotonic_ns()
     deadline = begin + int(scenario.link.start_timeout_s * 1e9)
     say_at = begin + 500_000_000
     other = "plant" if side == "controller" else "controller"
-    met = False
+    met = one_clock = False
     while not stopped():
         if side == "plant":
             link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
@@ -51,15 +70,16 @@ def shake_hands(
                 if side == "controller" and not met:  # answer first: both shall see a misfit
                     link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
                 _compare(mine, content)
+                one_clock = bool(boot) and content["boot"] == boot
                 if not met:  # from here on it is there, so that silence means what it always does
                     met, deadline = True, now + int(scenario.link.peer_timeout_s * 1e9)
                 if side == "plant":
-                    start = now + 20_000_000
+                    start = now + _LEAD_NS
                     go: dict[str, Any] = {"kind": "start", "t0": start}
                     link.send(_PREFIX + json.dumps(go).encode())
-                    return start
+                    return Start(start, one_clock)
             elif content["kind"] == "start":
-                return int(content["t0"])
+                return Start(int(content["t0"]) if one_clock else now + _LEAD_NS, one_clock)
         if now >= deadline:
             break
         if now >= say_at and not met:
@@ -75,10 +95,17 @@ def shake_hands(
     )
 
 
+def _boot() -> str:
+    try:
+        return _BOOT.read_text("ascii").strip()
+    except OSError:
+        return ""
+
+
 def _read(message: bytes) -> dict[str, Any]:
     try:
         content = json.loads(message[len(_PREFIX) :])
-        expected = {"hello": ("side", "table", "digest"), "start": ("t0",)}[content["kind"]]
+        expected = {"hello": ("side", "table", "digest", "boot"), "start": ("t0",)}[content["kind"]]
         return {"kind": content["kind"], **{key: content[key] for key in expected}}
     except (ValueError, KeyError, TypeError):
         raise PeerLost(f"the other side speaks another language: {message[:60]!r}") from None

@@ -81,10 +81,11 @@ def finish(
         timing = dict(file)
     logs = sorted(folder.glob("events_*.jsonl"))
     log = read_log(*logs)
-    faults, injected = {}, {}
+    faults, injected, one_clock = {}, {}, True
     for path in sorted(folder.glob("link_*.json")):
         content = json.loads(path.read_text())
         faults[content["side"]] = {k: v for k, v in content["faults"].items() if v}
+        one_clock &= content["one_clock"]
         if "injected" in content:
             injected[content["side"]] = content["injected"]
         path.unlink()
@@ -92,7 +93,7 @@ def finish(
     (folder / "events.jsonl").write_text("".join(json.dumps(e) + "\n" for e in log), "utf-8")
     for path in logs:
         path.unlink()
-    summary = summarise(scenario, signals, timing, log, outcome, faults, wall_s)
+    summary = summarise(scenario, signals, timing, log, outcome, faults, wall_s, one_clock)
     if injected:
         summary["injected"] = injected
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")

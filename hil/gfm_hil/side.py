@@ -71,15 +71,15 @@ def _run(
 
     try:
         no_collector_pauses()
-        t0_ns = shake_hands(side, link, scenario, stopped, notice)
+        start = shake_hands(side, link, scenario, stopped, notice)
         if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
             link = ImpairedLink(link, scenario.link.impairment, side)
         if link.port is not None:
-            reader = run_compiled(side, bench, link, part, timeline, t0_ns, stopped)
+            reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped)
         else:
             run = run_controller if side == "controller" else run_plant
-            reader = run(bench, link, part, timeline, t0_ns, stopped)
-        seen: dict[str, Any] = {"side": side, "faults": reader.faults}
+            reader = run(bench, link, part, timeline, start.t0_ns, stopped)
+        seen: dict[str, Any] = {"side": side, "faults": reader.faults, "one_clock": start.one_clock}
         if isinstance(link, ImpairedLink):
             seen["injected"] = link.injected
         (folder / f"link_{side}.json").write_text(json.dumps(seen))

@@ -12,6 +12,8 @@ from gfm_hil.scenario import Scenario
 from gfm_hil.timeline import Outcome
 from gfm_plant import load_converter
 
+_BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
+
 
 def nominal_frequency(scenario: Scenario) -> float:
     """Nominal frequency of the scenario's converter, Hz."""
@@ -26,6 +28,7 @@ def summarise(
     outcome: Outcome,
     faults: dict[str, dict[str, int]],
     wall_s: float,
+    one_clock: bool = True,
 ) -> dict[str, Any]:
     """The summary of one run as plain data."""
     done = len(signals["tick"])
@@ -43,7 +46,7 @@ def summarise(
         if "true_p" in signals:
             entry.update(event_metrics(signals, e["tick"], stop, scenario.T_s, f_n))
         events.append(entry)
-    return {
+    summary = {
         "title": scenario.title,
         "status": outcome.status,
         "reason": outcome.reason,
@@ -61,6 +64,9 @@ def summarise(
         "bump_pu": [e["bump_pu"] for e in changes],
         "events": events,
     }
+    if not one_clock and scenario.mode == "realtime":
+        summary["clock_drift_ppm"] = clock_drift(timing, scenario.T_s)
+    return summary
 
 
 def misses(timing: dict[str, NDArray[Any]], done: int) -> int:
@@ -68,6 +74,21 @@ def misses(timing: dict[str, NDArray[Any]], done: int) -> int:
     if "plant_scheduled" not in timing or (timing["plant_scheduled"] < 0).all():
         return 0
     return int(np.sum(timing["plant_received"][:done] < 0))
+
+
+def clock_drift(timing: dict[str, NDArray[Any]], T_s: float) -> float | None:
+    """How fast the plant's clock runs against the controller's, ppm; None if that is unknown.
+
+    The slope of the earliest arrivals: what is late was late on the way, the earliest was not.
+    """
+    received = timing.get("controller_received")
+    if received is None or (received >= 0).sum() < 2 * _BLOCKS:
+        return None
+    k = np.flatnonzero(received >= 0)
+    away = received[k] - received[k[0]] - np.round((k - k[0]) * (T_s * 1e9)).astype(np.int64)
+    first = [block[np.argmin(away[block])] for block in np.array_split(np.arange(len(k)), _BLOCKS)]
+    slope = np.polyfit((k[first] - k[0]) * T_s, away[first] * 1e-3, 1)[0]  # us a second: ppm
+    return round(-float(slope), 3)
 
 
 def round_trip(timing: dict[str, NDArray[Any]]) -> dict[str, float] | None:

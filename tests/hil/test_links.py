@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gfm_hil.plant_side import run_plant
 from gfm_hil.recording import Part, merge
 from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
+from gfm_hil.summary import clock_drift
 from gfm_hil.timeline import Timeline, read_log, worst
 from gfm_hil.waiting import send_last
 from gfm_runtime import law_names
@@ -75,7 +77,7 @@ def both_sides(
         link = open_link(name, side, endpoint, options)
         timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
         try:
-            t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None)
+            t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None).t0_ns
             run = run_controller if side == "controller" else run_plant
             run(benches[side], touch(side, link), parts[side], timeline, t0, lambda: False)
         finally:
@@ -228,7 +230,7 @@ def test_a_repeated_frame_is_used_once(make, run, tmp_path, endpoint):
 def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
     """Shake hands with a scenario each."""
 
-    def call(side: Side) -> int:
+    def call(side: Side) -> Any:
         link = ZmqLink(side, endpoint)
         try:
             return shake_hands(side, link, scenarios[side], lambda: False, lambda text: None)
@@ -241,7 +243,28 @@ def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
 def test_both_sides_agree_on_the_start(make, endpoint):
     scenario = make(link=PATIENT)
     found = meet(dict.fromkeys(SIDES, scenario), endpoint)
-    assert found["controller"] == found["plant"] > 0
+    assert found["controller"] == found["plant"]
+    assert found["plant"].t0_ns > 0 and found["plant"].one_clock
+
+
+def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):
+    """The plant's boot differs: tick 0 is told by when START came, and the drift is measured."""
+    boots = iter(["one", "another"])
+    monkeypatch.setattr("gfm_hil.handshake._boot", lambda: next(boots))
+    before = time.monotonic_ns()
+    found = meet(dict.fromkeys(SIDES, make(link=PATIENT)), endpoint)
+    assert not found["plant"].one_clock and not found["controller"].one_clock
+    assert before < found["controller"].t0_ns < time.monotonic_ns() + 20_000_000
+
+
+def test_the_drift_of_two_clocks_is_read_off_the_earliest_arrivals():
+    """A plant 37 ppm fast, frames 0 to 400 us on their way."""
+    k = np.arange(20_000)
+    way = np.random.default_rng(1).exponential(4e4, len(k)).astype(np.int64)
+    received = 5_000_000 + np.round(k * 1e5 / (1 + 37e-6)).astype(np.int64) + way
+    assert clock_drift({"controller_received": received}, 1e-4) == pytest.approx(37, abs=0.1)
+    assert clock_drift({"controller_received": received[:10]}, 1e-4) is None
+    assert clock_drift({}, 1e-4) is None
 
 
 def test_a_misfit_of_scenarios_is_refused_on_both_sides(make, endpoint):
