@@ -16,7 +16,7 @@ from gfm_hil.links.base import Link, LinkKind, Side
 
 GROUP = "gfmhil.links"
 
-_OURS = {"shm": "gfm_hil.links.shm", "zmq": "gfm_hil.links.zeromq"}
+_OURS = {"can": "gfm_hil.links.can", "shm": "gfm_hil.links.shm", "zmq": "gfm_hil.links.zeromq"}
 
 
 def link_names() -> list[str]:

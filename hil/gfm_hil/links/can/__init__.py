@@ -1,0 +1,54 @@
+"""CAN and CAN FD through python-can, and a bus on the loopback device."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from importlib.util import find_spec
+from pathlib import Path
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import Link, LinkKind, Side
+from gfm_hil.links.can.options import LOOPBACK, CanOptions
+
+_PLACES = 4  # of a loopback bus, UDP ports in a row
+
+
+def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
+    if find_spec("cantools") is None:
+        raise UserError("link.type = 'can': needs cantools: pip install 'gfmhil[can]'")
+    from gfm_hil.links.can.link import CanLink
+
+    return CanLink(side, endpoint, options)
+
+
+def _fresh(folder: Path) -> str:
+    """A loopback bus of free ports, below those that the kernel gives to others."""
+    begin = secrets.randbelow(2500)  # two runs that start at a time shall not meet
+    for k in range(2500):
+        first = 20_000 + _PLACES * ((begin + k) % 2500)
+        probes = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(_PLACES)]
+        try:
+            for place, probe in enumerate(probes):
+                probe.bind(("127.0.0.1", first + place))
+            return f"{LOOPBACK}://127.0.0.1:{first}"
+        except OSError:
+            continue
+        finally:
+            for probe in probes:
+                probe.close()
+    raise UserError("link: no free UDP ports for a loopback bus between 20000 and 30000")
+
+
+_PORT = r"(102[4-9]|10[3-9]\d|1[1-9]\d\d|[2-9]\d{3}|[1-5]\d{4}|6[0-4]\d{3}|65[0-4]\d\d|655[0-2]\d)"
+
+KIND = LinkKind(
+    name="can",
+    text="CAN and CAN FD, values in 16 bits",
+    pattern=rf"can://[^/\s]+|{LOOPBACK.replace('+', '[+]')}://127\.0\.0\.1:{_PORT}",
+    form=f"can://channel (as can://can0) or {LOOPBACK}://127.0.0.1:port, 1024 to 65529",
+    fresh=_fresh,
+    open=_open,
+    options=CanOptions,
+    exact=False,
+)

@@ -1,0 +1,156 @@
+"""The DBC: what travels on the bus, written from the signal table.
+
+Every frame that carries values begins with two bytes of end-to-end protection (``e2e``), then
+values as int16, little-endian. A value travels in counts of its ``scale``; -32768 stands for one
+that is not a number. CAN FD takes a vector in one frame, classic CAN in as many as it needs.
+A lower identifier wins the bus: states first, then commands, then measurements, then messages of
+the handshake, cut into segments.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+from cantools.database import load_string
+from cantools.database.can import Database, Message, Node, Signal
+from cantools.database.can.formats.dbc.dbc_attribute import DbcAttribute
+from cantools.database.can.formats.dbc.dbc_attribute_definition import DbcAttributeDefinition
+from cantools.database.can.formats.dbc.dbc_specifics import DbcSpecifics
+from cantools.database.conversion import BaseConversion
+
+from gfm_hil.links.base import Side
+from gfm_runtime.controller import REASONS, STATES
+from gfm_runtime.signals import Group, group, table_hash
+from gfm_runtime.signals import Signal as Row
+
+INT16 = 32767  # largest count; the range is symmetric
+INVALID = -32768
+SENDERS: dict[Group, Side] = {"y": "plant", "u": "controller"}
+#: names of the frames of each vector; a vector in several frames appends _1, _2 …
+VECTORS: dict[Group, str] = {"y": "Measurements", "u": "Commands"}
+STATUS: dict[Side, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
+SEGMENT: dict[Side, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
+CRC, COUNTER = "Crc", "Counter"
+
+_HEADER = 2  # bytes of end-to-end protection
+_IDS = {"PlantStatus": 0x100, "ControllerStatus": 0x101, "Commands": 0x110, "Measurements": 0x120,
+        "PlantSegment": 0x700, "ControllerSegment": 0x701}  # fmt: skip
+_NODES = {"plant": "Plant", "controller": "Controller"}
+
+
+def offset(row: Row) -> float:
+    """Value of count 0: 0 where the range fits about it, else the middle of the range.
+
+    Raises:
+        ValueError: the range does not fit 16 bits at this scale.
+    """
+    if max(abs(row.low), abs(row.high)) <= INT16 * row.scale:
+        return 0.0
+    if row.high - row.low <= 2 * INT16 * row.scale:
+        return (row.low + row.high) / 2
+    raise ValueError(f"signal {row.name}: {row.low:g} to {row.high:g} needs more than 16 bits")
+
+
+def _value(row: Row, start: int) -> Signal:
+    conversion = BaseConversion.factory(
+        scale=row.scale,
+        offset=offset(row),
+        choices=OrderedDict({INVALID: "invalid"}),
+        is_float=False,
+    )
+    unit, comment = f"{row.unit} ({row.base})", row.description
+    return Signal(
+        row.name, 8 * start, 16, is_signed=True, conversion=conversion,
+        minimum=row.low, maximum=row.high, unit=unit, comment=comment,
+    )  # fmt: skip
+
+
+def _number(
+    name: str, start: int, size: int, comment: str | None, meanings: tuple[str, ...] = ()
+) -> Signal:
+    conversion = BaseConversion.factory(choices=OrderedDict(enumerate(meanings)) or None)
+    return Signal(name, 8 * start, 8 * size, conversion=conversion, comment=comment)
+
+
+def _protection() -> list[Signal]:
+    return [
+        _number(CRC, 0, 1, "CRC-8 SAE J1850 over data id and all bytes after this one"),
+        _number(COUNTER, 1, 1, "bits 0-5: sequence, bits 6-7: sequence - tick"),
+    ]
+
+
+def _vector(name: Group, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
+    """Name, identifier, length and signals of every frame of a vector."""
+    rows = group(name)
+    room = len(rows) if fd else (8 - _HEADER) // 2
+    parts = [rows[k : k + room] for k in range(0, len(rows), room)]
+    frames = []
+    for k, part in enumerate(parts):
+        title = VECTORS[name] + (f"_{k + 1}" if len(parts) > 1 else "")
+        values = [_value(row, _HEADER + 2 * j) for j, row in enumerate(part)]
+        length = _HEADER + 2 * len(part)
+        frames.append((title, _IDS[VECTORS[name]] + k, length, [*_protection(), *values]))
+    return frames
+
+
+def _status() -> list[Signal]:
+    return [
+        *_protection(),
+        _number("State", 2, 1, "the controller's; of the plant INIT while it runs", STATES),
+        _number("Reason", 3, 1, "why the controller is in that state", REASONS),
+        _number("Tick", 4, 4, "of the values that follow"),
+    ]
+
+
+def _segment(fd: bool) -> list[Signal]:
+    length = 64 if fd else 8
+    return [
+        _number("Message", 0, 1, "number of the message that this is a part of"),
+        _number("Index", 1, 1, "of this segment, from 0"),
+        _number("Segments", 2, 1, "that the message has"),
+        _number("Used", 3, 1, "bytes of data in this segment"),
+        *(_number(f"Data_{k}", 4 + 4 * k, 4, None) for k in range((length - 4) // 4)),
+    ]
+
+
+def write_dbc(fd: bool) -> str:
+    """The text of the DBC file for CAN FD, or for classic CAN."""
+    frames: list[tuple[str, int, int, list[Signal], Side]] = []
+    for side in ("plant", "controller"):
+        frames.append((STATUS[side], _IDS[STATUS[side]], 8, _status(), side))
+        signals = _segment(fd)
+        frames.append((SEGMENT[side], _IDS[SEGMENT[side]], 64 if fd else 8, signals, side))
+    for name, side in SENDERS.items():
+        frames += [(*frame, side) for frame in _vector(name, fd)]
+    other = {"plant": "Controller", "controller": "Plant"}
+    messages = []
+    for title, number, length, signals, side in sorted(frames, key=lambda f: f[1]):
+        for signal in signals:
+            signal.receivers = [other[side]]
+        messages.append(Message(number, title, length, signals, senders=[_NODES[side]], is_fd=fd))
+    database = Database(
+        messages,
+        nodes=[Node(name) for name in _NODES.values()],
+        version=f"gfmhil {table_hash()}",
+        dbc_specifics=_bus_type("CAN FD") if fd else None,
+    )
+    return str(database.as_dbc_string())
+
+
+def _bus_type(value: str) -> DbcSpecifics:
+    """Without this attribute the file would silently describe classic CAN."""
+    definition = DbcAttributeDefinition(
+        "BusType", default_value="CAN", kind=None, type_name="STRING"
+    )
+    definitions: Any = OrderedDict(BusType=definition)
+    specifics = DbcSpecifics(attribute_definitions=definitions)
+    specifics.attributes["BusType"] = DbcAttribute(value, definition)
+    return specifics
+
+
+def read_dbc(text: str) -> Database:
+    """A database as a tool that is given the file has it."""
+    database = load_string(text, "dbc")
+    assert isinstance(database, Database)
+    return database

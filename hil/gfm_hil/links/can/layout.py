@@ -1,0 +1,185 @@
+"""Where each value lies in each frame, taken from a loaded DBC, and packing by it, compiled.
+
+cantools reads the DBC once, at the start; the loop never calls it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from cantools.database.can import Database, Message
+from numba import njit
+from numpy.typing import NDArray
+
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.can.dbc import COUNTER, CRC, INT16, INVALID, SEGMENT, STATUS, VECTORS
+from gfm_hil.links.can.e2e import crc8
+from gfm_runtime.signals import Group, names
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One frame of the DBC.
+
+    Attributes:
+        name, number, length: as in the DBC; the length in bytes.
+        dtype: a record with a field a signal.
+        data_id: 16 bits that depend on all of the definition.
+        index: which elements of the vector it carries, shape (n,); none for other frames.
+        start: their first bytes, shape (n,).
+        scale, offset: value = count × scale + offset, shape (n,), p.u.
+    """
+
+    name: str
+    number: int
+    length: int
+    dtype: np.dtype
+    data_id: int
+    index: NDArray[np.int64]
+    start: NDArray[np.int64]
+    scale: NDArray[np.float64]
+    offset: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All frames of a DBC.
+
+    Attributes:
+        vectors: the frames of each vector, in the order of their identifiers.
+        status, segment: of each sender.
+        digest: over all definitions; both sides compare it.
+        fd: CAN FD rather than classic.
+    """
+
+    vectors: dict[Group, list[Layout]]
+    status: dict[Side, Layout]
+    segment: dict[Side, Layout]
+    digest: int
+    fd: bool
+
+
+def _definition(message: Message) -> str:
+    signals = sorted(
+        (s.name, s.start, s.length, s.byte_order, s.is_signed, float(s.scale), float(s.offset))
+        for s in message.signals
+    )
+    return repr((message.name, message.frame_id, message.length, message.is_fd, signals))
+
+
+def _digest(text: str, size: int) -> int:
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:size], "little")
+
+
+def dtype_of(message: Message) -> np.dtype:
+    """A record that lies as the DBC says.
+
+    Raises:
+        ValueError: a signal is not whole bytes, little-endian.
+    """
+    for s in message.signals:
+        if s.start % 8 or s.length not in (8, 16, 32) or s.byte_order != "little_endian":
+            raise ValueError(
+                f"{message.name}.{s.name}: must be 1, 2 or 4 whole bytes, little-endian"
+            )
+    parts: Any = {
+        "names": [s.name for s in message.signals],
+        "formats": [f"<{'i' if s.is_signed else 'u'}{s.length // 8}" for s in message.signals],
+        "offsets": [s.start // 8 for s in message.signals],
+        "itemsize": message.length,
+    }
+    return np.dtype(parts)
+
+
+def _layout(message: Message, vector: tuple[str, ...] = ()) -> Layout:
+    dtype = dtype_of(message)
+    fields: Any = dtype.fields
+    carried = [name for name in vector if name in fields]
+    for name in carried:
+        if fields[name][0] != np.dtype("<i2"):
+            raise ValueError(f"{message.name}.{name}: must be a signed 16-bit value")
+    signals = {s.name: s for s in message.signals}
+    return Layout(
+        message.name,
+        message.frame_id,
+        message.length,
+        dtype,
+        _digest(_definition(message), 2),
+        np.array([vector.index(name) for name in carried], np.int64),
+        np.array([fields[name][1] for name in carried], np.int64),
+        np.array([float(signals[name].scale) for name in carried]),
+        np.array([float(signals[name].offset) for name in carried]),
+    )
+
+
+def plan_of(database: Database) -> Plan:
+    """What the link needs of a DBC.
+
+    Raises:
+        ValueError: a frame or a signal is missing or lies where it may not.
+    """
+    messages = {m.name: m for m in database.messages}
+    missing = sorted({*STATUS.values(), *SEGMENT.values()} - set(messages))
+    if missing:
+        raise ValueError(f"frames {missing} are missing")
+    vectors: dict[Group, list[Layout]] = {}
+    for group, title in VECTORS.items():
+        mine = [m for name, m in messages.items() if name == title or name.startswith(f"{title}_")]
+        vectors[group] = [_layout(m, names(group)) for m in sorted(mine, key=lambda m: m.frame_id)]
+        found = sorted(k for layout in vectors[group] for k in layout.index.tolist())
+        if found != list(range(len(names(group)))):
+            raise ValueError(f"frames {title}…: must carry each of {list(names(group))} once")
+    plan = Plan(
+        vectors,
+        {side: _layout(messages[STATUS[side]]) for side in SIDES},
+        {side: _layout(messages[SEGMENT[side]]) for side in SIDES},
+        _digest("".join(sorted(map(_definition, database.messages))), 4),
+        any(m.is_fd for m in database.messages),
+    )
+    for layout in [*vectors["y"], *vectors["u"], *plan.status.values()]:
+        fields: Any = layout.dtype.fields
+        if [fields.get(name, (None, -1))[1] for name in (CRC, COUNTER)] != [0, 1]:
+            raise ValueError(f"{layout.name}: must begin with {CRC} and {COUNTER}")
+    return plan
+
+
+@njit(cache=True, nogil=True)
+def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
+    """Write values in counts, to the nearest, and protect them.
+
+    Args:
+        values: the whole vector, p.u.; the rest as in ``Layout``.
+        counter: the frame's second byte.
+        payload: bytes of the frame, written.
+
+    Returns:
+        How many values lay outside what 16 bits can say and were set to the end they passed.
+    """
+    saturated = 0
+    for k in range(len(index)):
+        nearest = np.rint((values[index[k]] - offset[k]) / scale[k])
+        if np.isnan(nearest):
+            count = INVALID
+        elif abs(nearest) > INT16:
+            count = INT16 if nearest > 0 else -INT16
+            saturated += 1
+        else:
+            count = int(nearest)
+        payload[start[k]] = count & 0xFF
+        payload[start[k] + 1] = (count >> 8) & 0xFF
+    payload[1] = counter
+    payload[0] = crc8(data_id, payload)
+    return saturated
+
+
+@njit(cache=True, nogil=True)
+def unpack_vector(payload, index, start, scale, offset, values):
+    """Write the values that a frame carries into the vector; NaN for an invalid one."""
+    for k in range(len(index)):
+        count = np.int64(payload[start[k]]) | np.int64(payload[start[k] + 1]) << 8
+        if count >= 0x8000:
+            count -= 0x10000
+        values[index[k]] = np.nan if count == INVALID else count * scale[k] + offset[k]

@@ -1,0 +1,131 @@
+"""A CAN bus between processes of one machine whose kernel has no CAN: UDP on 127.0.0.1.
+
+A python-can backend (``interface="gfmhil-udp"``, ``channel="127.0.0.1:port"``). The bus has four
+places, UDP ports ``port`` to ``port + 3``; a node takes one and sends each frame to the others
+that are there, as one datagram that holds Linux' ``struct canfd_frame``. Like ``vcan`` it takes no
+time and loses nothing but what overflows a receiver's buffer; it never leaves the machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import select
+import socket
+import struct
+import time
+from typing import Any
+
+import can
+
+NODES = 4
+_HOST = "127.0.0.1"
+_HEAD = struct.Struct("=IBB2x")  # can_id with flags, length, FD flags: canfd_frame of linux/can.h
+_EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+_BRS, _ESI, _FD = 0x01, 0x02, 0x04
+_BUFFER = 1 << 20  # bytes, or as many as the kernel allows
+_RECHECK_S = 0.05  # how long a place found empty is passed over
+
+
+class LoopbackBus(can.BusABC):
+    """One node of the bus.
+
+    Args:
+        channel: ``"127.0.0.1:port"``.
+        place: which of the places to take; None takes the last free one.
+
+    Raises:
+        can.CanInitializationError: the place is occupied, or all of them are.
+    """
+
+    def __init__(self, channel: Any, place: int | None = None, **more: Any) -> None:
+        self._is_shutdown = True  # until there is something to shut down
+        first = int(str(channel).removeprefix(f"{_HOST}:"))
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        taken = self._take(first, reversed(range(NODES)) if place is None else [place])
+        self._peers = [_Peer(first + k) for k in range(NODES) if k != taken]
+        self.channel_info = f"loopback bus at {_HOST}:{first}, place {taken}"
+        self._can_protocol = can.CanProtocol.CAN_FD
+        super().__init__(channel=channel, **more)
+        self._is_shutdown = False
+
+    def _take(self, first: int, places: Any) -> int:
+        for place in places:
+            with contextlib.suppress(OSError):
+                self._socket.bind((_HOST, first + place))
+                return int(place)
+        self._socket.close()
+        raise can.CanInitializationError(f"occupied: {_HOST}:{first}")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send to every other node that is there."""
+        flags = msg.is_fd and (_FD | msg.bitrate_switch * _BRS | msg.error_state_indicator * _ESI)
+        number = msg.arbitration_id | (
+            msg.is_extended_id * _EXTENDED
+            | msg.is_remote_frame * _REMOTE
+            | msg.is_error_frame * _ERROR
+        )
+        datagram = _HEAD.pack(number, len(msg.data), flags) + msg.data
+        for peer in self._peers:
+            peer.send(datagram)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        while True:
+            try:
+                datagram = self._socket.recv(128)
+                break
+            except BlockingIOError:
+                if timeout == 0 or not select.select([self._socket], [], [], timeout)[0]:
+                    return None, False
+        number, length, flags = _HEAD.unpack_from(datagram)
+        message = can.Message(
+            timestamp=time.time(),
+            arbitration_id=number & 0x1FFF_FFFF,
+            is_extended_id=bool(number & _EXTENDED),
+            is_remote_frame=bool(number & _REMOTE),
+            is_error_frame=bool(number & _ERROR),
+            is_fd=bool(flags & _FD),
+            bitrate_switch=bool(flags & _BRS),
+            error_state_indicator=bool(flags & _ESI),
+            data=datagram[_HEAD.size : _HEAD.size + length],
+        )
+        return message, False
+
+    def fileno(self) -> int:
+        """For select."""
+        return self._socket.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        if not self._is_shutdown:
+            super().shutdown()
+            for peer in self._peers:
+                peer.close()
+            self._socket.close()
+
+
+class _Peer:
+    """Another place of the bus; one that is empty is asked again only every now and then."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.connect((_HOST, port))
+        self._empty_until = 0.0
+
+    def send(self, datagram: bytes) -> None:
+        if self._empty_until and time.monotonic() < self._empty_until:
+            return
+        try:
+            self._socket.send(datagram)
+            self._empty_until = 0.0
+        except ConnectionRefusedError:  # says so of the datagram before this one
+            self._empty_until = time.monotonic() + _RECHECK_S
+        except OSError as problem:  # its buffer is full: what a controller's overrun is
+            if problem.errno not in (errno.EAGAIN, errno.ENOBUFS):
+                raise can.CanOperationError(str(problem), problem.errno) from problem
+
+    def close(self) -> None:
+        self._socket.close()

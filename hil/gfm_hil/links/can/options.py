@@ -1,0 +1,26 @@
+"""Options of the CAN link, the table ``link.options`` of a scenario."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from gfm_hil.links.base import LinkOptions
+
+LOOPBACK = "can+udp"
+
+
+class CanOptions(LinkOptions):
+    """How to reach the bus and how fast it is.
+
+    SocketCAN takes the bit rates that its interface was set up with (``ip link``); they are given
+    here so that the period can be checked against what the bus needs.
+    """
+
+    interface: str = Field("socketcan", description="python-can's name of the backend")
+    fd: bool = Field(True, description="CAN FD, or classic CAN")
+    bitrate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="of arbitration, bit/s")
+    data_bitrate: int = Field(
+        8_000_000, ge=10_000, le=8_000_000, description="of a CAN FD frame's data, bit/s"
+    )
+    dbc: str | None = Field(None, description="DBC file in place of the one of `gfmhil dbc`")
+    heartbeat: int = Field(10_000, ge=1, description="vectors after which a state is said again")

@@ -1,0 +1,156 @@
+"""Between the bench's frames and the bus: a vector becomes CAN frames, and a frame again.
+
+A frame of the bench has a sequence (one more for every frame sent) and a tick (the same in one
+that was sent again). On the bus a vector carries the low six bits of its sequence and the low two
+of how far the tick is behind it, both in the byte ``Counter``; the receiver counts on from what it
+had. A state travels in a frame of its own ahead of the values, with 32 bits of the tick: twice when
+the state or that lag has changed, and every ``heartbeat`` vectors. Whoever lost more than 58
+vectors in a row takes new values for older ones until then, and misses multiples of 64 in the
+count of the lost. New values for a tick sent again could pass for newer ones only after four of
+them in a row and then their states got lost; the other side then does not accept the answer.
+
+What fails its check here is made a frame that fails its own, so that its reader counts it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gfm_hil.codec import buffer, crc32
+from gfm_hil.frames import DATA_IDS
+from gfm_hil.links.can.dbc import COUNTER, CRC, SENDERS
+from gfm_hil.links.can.e2e import crc8
+from gfm_hil.links.can.layout import Layout, Plan, pack_vector, unpack_vector
+from gfm_runtime.signals import Group, names
+
+#: a CAN frame: identifier and payload
+CanFrame = tuple[int, bytes]
+
+_SEQUENCES, _LAGS = 64, 4  # that a counter tells apart
+_BEHIND = 4  # how many of the sequences mean an older vector
+_CRC_BYTES = 4  # at the end of a frame of the bench
+
+
+class VectorSender:
+    """Makes CAN frames of one side's vectors.
+
+    Args:
+        plan: of the DBC.
+        group: ``"y"`` or ``"u"``.
+        heartbeat: vectors after which the state is said again.
+    """
+
+    def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
+        self._frame, self._message = buffer(len(names(group)), DATA_IDS[group])
+        self._parts = [(part, np.zeros(part.length, np.uint8)) for part in plan.vectors[group]]
+        self._status = plan.status[SENDERS[group]]
+        self._heartbeat, self._since = heartbeat, 0
+        self._told: tuple[int, int, int] | None = None
+        self.saturated = 0  # values that lay outside 16 bits
+
+    def fits(self, message: bytes) -> bool:
+        """Whether a message is a frame of this vector."""
+        head = self._message[:4]  # magic, version, data id
+        return len(message) == len(self._message) and message[:4] == head.tobytes()
+
+    def frames(self, message: bytes) -> list[CanFrame]:
+        """The CAN frames of a frame of the bench, in the order in which to send them."""
+        self._message[:] = np.frombuffer(message, np.uint8)
+        f = self._frame[0]
+        sequence, tick = int(f["sequence"]), int(f["tick"])
+        told = (int(f["state"]), int(f["reason"]), (sequence - tick) & 0xFFFF_FFFF)
+        counter = sequence % _SEQUENCES | (sequence - tick) % _LAGS * _SEQUENCES
+        good = int(f["crc"]) == crc32(self._message, len(message) - _CRC_BYTES)
+        out: list[CanFrame] = []
+        if good and told != self._told:
+            self._told, self._since = told, 0
+        if good and (self._since < 2 or self._since % self._heartbeat == 0):
+            out.append((self._status.number, self._state(counter, tick, *told[:2])))
+        self._since += 1
+        for part, payload in self._parts:
+            self.saturated += pack_vector(
+                f["values"], part.index, part.start, part.scale, part.offset, part.data_id,
+                counter, payload,
+            )  # fmt: skip
+            if not good:  # damaged before it came here, and so it shall arrive
+                payload[0] ^= 0xFF
+            out.append((part.number, payload.tobytes()))
+        return out
+
+    def _state(self, counter: int, tick: int, state: int, reason: int) -> bytes:
+        record = np.zeros(1, self._status.dtype)
+        record["State"], record["Reason"] = state, reason
+        record["Tick"], record[COUNTER] = tick & 0xFFFF_FFFF, counter
+        record[CRC] = crc8(self._status.data_id, record.view(np.uint8))
+        return record.tobytes()
+
+
+class VectorReceiver:
+    """Makes the frames of the bench again.
+
+    Args:
+        plan, group: as of the sender.
+    """
+
+    def __init__(self, plan: Plan, group: Group) -> None:
+        self._frame, self._message = buffer(len(names(group)), DATA_IDS[group])
+        self._parts = {part.number: (k, part) for k, part in enumerate(plan.vectors[group])}
+        self._status = plan.status[SENDERS[group]]
+        self._sequence, self._lag = -1, 0  # of the newest frame; lag = sequence - tick
+        self._counter, self._have = -1, 0  # of the vector being put together, and its parts
+        self.incomplete = 0  # vectors of which a part never came
+
+    def knows(self, number: int) -> bool:
+        """Whether an identifier is one of this vector or its sender's state."""
+        return number in self._parts or number == self._status.number
+
+    def take(self, number: int, payload: bytes) -> bytes | None:
+        """A CAN frame of this vector: the bench's frame that it completes, if it does."""
+        k, layout = self._parts.get(number, (-1, self._status))
+        data = np.frombuffer(payload, np.uint8)
+        if len(data) != layout.length or data[0] != crc8(layout.data_id, data):
+            return self._made(damaged=True)
+        if k < 0:
+            self._learn(data.view(layout.dtype)[0])
+            return None
+        return self._put(k, layout, data)
+
+    def _learn(self, status: np.void) -> None:
+        sequence = self._count_on(int(status[COUNTER]))
+        if sequence < self._sequence:
+            return
+        tick = self._sequence - self._lag
+        tick += (int(status["Tick"]) - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+        self._lag = sequence - tick
+        self._frame["state"], self._frame["reason"] = status["State"], status["Reason"]
+
+    def _count_on(self, counter: int) -> int:
+        """The whole sequence of which the low bits came."""
+        ahead = (counter - self._sequence + _BEHIND) % _SEQUENCES - _BEHIND
+        return self._sequence + ahead
+
+    def _put(self, k: int, layout: Layout, data: np.ndarray) -> bytes | None:
+        counter = int(data[1])
+        if counter != self._counter:
+            self.incomplete += self._have != 0
+            self._counter, self._have = counter, 0
+        unpack_vector(
+            data, layout.index, layout.start, layout.scale, layout.offset, self._frame["values"][0]
+        )
+        self._have |= 1 << k
+        if self._have != (1 << len(self._parts)) - 1:
+            return None
+        self._have = 0
+        sequence = self._count_on(counter)
+        # of a state that got lost: a tick sent again is known as such, a skip passes for older
+        lag = self._lag + (counter // _SEQUENCES - self._lag) % _LAGS
+        if sequence > self._sequence:
+            self._sequence, self._lag = sequence, lag
+        f = self._frame[0]
+        f["sequence"], f["tick"] = sequence & 0xFFFF_FFFF, max(sequence - lag, 0)
+        return self._made(damaged=False)
+
+    def _made(self, damaged: bool) -> bytes:
+        crc = crc32(self._message, len(self._message) - _CRC_BYTES)
+        self._frame["crc"] = crc ^ (0xFFFF_FFFF if damaged else 0)
+        return self._message.tobytes()

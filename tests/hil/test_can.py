@@ -1,0 +1,353 @@
+"""Both sides over a CAN bus on the loopback device, in two threads of this process."""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from gfm_hil.bench import make_bench
+from gfm_hil.controller_side import run_controller
+from gfm_hil.errors import PeerLost, UserError
+from gfm_hil.frames import FrameWriter
+from gfm_hil.handshake import shake_hands
+from gfm_hil.links import Link, link_kind, open_link
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.can.dbc import read_dbc, write_dbc
+from gfm_hil.links.can.loopback import LoopbackBus
+from gfm_hil.plant_side import run_plant
+from gfm_hil.recording import PLANT_COLUMNS, Part, merge, record_plant
+from gfm_hil.scenario import Scenario
+from gfm_hil.timeline import Timeline
+from gfm_plant import plant_advance, plant_sample
+from gfm_runtime.signals import Group, names
+
+from .test_links import in_threads
+
+KIND = link_kind("can")
+PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
+RIG = {
+    "delay": {"samples": 1, "fraction": 0.3},
+    "adc": "DS2004",
+    "dac": "DS2101",
+    "sensors": {"bandwidth_hz": 300.0, "noise_std": {"p": 1e-4, "V": 1e-4}},
+}
+EVENTS = [
+    {"tick": 50, "type": "reference", "P_ref": 0.55},
+    {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},
+]
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return KIND.fresh(tmp_path)
+
+
+@pytest.fixture
+def stranger(endpoint: str) -> Iterator[LoopbackBus]:
+    """A third node on the same bus."""
+    bus = LoopbackBus(endpoint.partition("://")[2])
+    yield bus
+    bus.shutdown()
+
+
+def both_sides(
+    scenario: Scenario,
+    folder: Path,
+    endpoint: str,
+    touch: Callable[[Side, Link], Link] = lambda side, link: link,
+    **options: Any,
+) -> tuple[dict[str, np.ndarray], dict[Side, tuple[dict, dict]]]:
+    """Run a scenario over CAN: the signals, and each side's faults and counters."""
+    benches = {side: make_bench(scenario) for side in SIDES}
+    parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
+
+    def call(side: Side) -> tuple[dict, dict]:
+        link = open_link("can", side, endpoint, options)
+        timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
+        try:
+            t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None).t0_ns
+            run = run_controller if side == "controller" else run_plant
+            reader = run(benches[side], touch(side, link), parts[side], timeline, t0, lambda: False)
+            return reader.faults, link.counters
+        finally:
+            link.close()
+            timeline.close()
+
+    found = in_threads(call)
+    for outcome in found.values():
+        if isinstance(outcome, Exception):
+            raise outcome
+    return merge(folder, scenario.T_s, benches["controller"].controller.labels), found
+
+
+def through_cantools(name: Group, values: np.ndarray) -> None:
+    """What is left of a vector that went over CAN FD, by cantools alone."""
+    title = {"y": "Measurements", "u": "Commands"}[name]
+    message = DBC.get_message_by_name(title)
+    physical = dict(zip(names(name), values.tolist(), strict=True))
+    payload = message.encode({**physical, "Crc": 0, "Counter": 0}, strict=False)
+    decoded = message.decode(payload, decode_choices=False)
+    values[:] = [decoded[n] for n in names(name)]
+
+
+DBC = read_dbc(write_dbc(True))
+
+
+def quantised_run(scenario: Scenario, folder: Path) -> dict[str, np.ndarray]:
+    """The same run in one process, y and u through cantools on their way."""
+    b = make_bench(scenario)
+    timeline = Timeline(b, folder / "events.jsonl", SIDES)
+    rows = np.full((scenario.ticks, len(PLANT_COLUMNS)), np.nan)
+    for tick in range(scenario.ticks):
+        timeline.carry_out(tick)
+        plant_sample(b.par, b.st, b.y)
+        read, command = b.y.copy(), b.u.copy()
+        through_cantools("y", read)
+        b.controller.step(read, command)
+        b.u[:] = command
+        applied = command.copy()
+        through_cantools("u", applied)
+        record_plant(rows[tick], b.y, applied, b.par, b.st)
+        plant_advance(b.par, b.st, applied)
+    timeline.close()
+    return {name: rows[:, j] for j, name in enumerate(PLANT_COLUMNS)}
+
+
+@pytest.mark.parametrize(
+    ("law", "plant"), [("mimo-gfm", {}), ("vsg-2", {}), ("mimo-gfm-deployable", RIG)]
+)
+def test_lockstep_over_can_is_a_run_in_process_in_counts(law, plant, make, run, tmp_path, endpoint):
+    content = {"law": law, "plant": plant, "duration": 0.03, "seed": 7}
+    content |= {"link": PATIENT, "events": EVENTS}
+    scenario = make(**content)
+    apart, found = both_sides(scenario, tmp_path, endpoint)
+    expected = quantised_run(scenario, tmp_path)
+    assert np.ptp(apart["true_p"]) > 0
+    for name, column in expected.items():
+        assert apart[name].tobytes() == column.tobytes(), name
+    for faults, counters in found.values():  # on a busy machine a tick may be asked for again
+        assert not any(count for fault, count in faults.items() if fault != "repeated")
+        assert not any(counters.values())
+    if not plant:  # a rig's 12-bit D/A is coarser, and the rounding of one meets that of the other
+        exact = run(**content).signals
+        assert 0 < np.abs(exact["true_p"] - apart["true_p"]).max() < 2e-3
+
+
+def test_any_backend_of_python_can(make, tmp_path):
+    """Here the one for tests of python-can itself, on classic CAN: a vector in two frames."""
+    scenario = make(duration=0.02, link=PATIENT, events=EVENTS)
+    options = {"interface": "virtual", "fd": False}
+    apart, found = both_sides(scenario, tmp_path, "can://test", **options)
+    assert len(apart["tick"]) == scenario.ticks
+    assert not any(found["plant"][0].values())
+
+
+def test_a_flood_of_frames_of_others_changes_nothing(make, tmp_path, endpoint, stranger):
+    scenario = make(duration=0.05, link=PATIENT, events=EVENTS)
+    over = threading.Event()
+
+    def flood() -> None:
+        number = 0
+        while not over.wait(1e-4):  # no bus carries more
+            number = (number + 7) % 0x7FF
+            if not 0x100 <= number <= 0x120 and number < 0x700:
+                stranger.send(can.Message(arbitration_id=number, is_extended_id=False, data=b"?"))
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    try:
+        apart, found = both_sides(scenario, tmp_path, endpoint)
+    finally:
+        over.set()
+        thread.join()
+    assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()
+    for faults, counters in found.values():
+        assert not any(faults.values())
+        assert counters["foreign"] > 100
+
+
+def test_frames_in_our_name_without_our_check_are_refused(make, tmp_path, endpoint, stranger):
+    """Each fault under its own name; the good frames go on, and so does the run."""
+    scenario = make(duration=0.02, link=PATIENT, events=EVENTS)
+    sent: dict[int, int] = {}
+
+    def touch(side: Side, link: Any) -> Any:
+        if side == "controller":
+            return link
+
+        class Disturbed:
+            def send(self, message: bytes) -> bool:
+                tick = len(sent)
+                sent[tick] = 1
+                if tick % 10 == 5:
+                    stranger.send(
+                        can.Message(
+                            arbitration_id=0x120, is_extended_id=False, is_fd=True, data=bytes(12)
+                        )
+                    )
+                return link.send(message)
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(link, name)
+
+        return Disturbed()
+
+    apart, found = both_sides(scenario, tmp_path, endpoint, touch)
+    assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()
+    faults, _ = found["controller"]
+    assert faults["crc"] == scenario.ticks // 10
+    assert sum(faults.values()) == faults["crc"]
+    # to the plant they are frames of a vector that is not for it
+    assert found["plant"][1]["foreign"] == scenario.ticks // 10
+
+
+@pytest.fixture
+def pair(endpoint: str) -> Iterator[dict[Side, Any]]:
+    """Both ends of a link."""
+    ends = {side: open_link("can", side, endpoint) for side in SIDES}
+    yield ends
+    for end in ends.values():
+        end.close()
+
+
+def frame(name: Group, tick: int) -> bytes:
+    writer = FrameWriter(name)
+    writer.sequence[0] = tick
+    return writer.pack(tick, 2, 0, np.array([1.0] * len(names(name))))
+
+
+def test_whole_messages_in_order(pair):
+    for text in (b"", b"x", bytes(300)):
+        assert pair["plant"].send(text)
+        assert pair["controller"].wait(5)
+        assert pair["controller"].receive() == text
+    assert pair["controller"].receive() is None
+    assert not pair["controller"].wait(0.001)
+    pair["plant"].send(frame("y", 0))
+    assert pair["controller"].wait(5)
+    assert pair["controller"].receive() == frame("y", 0)
+
+
+def test_bus_off_ends_it(pair, stranger):
+    stranger.send(can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False))
+    stranger.send(can.Message(arbitration_id=0x04, is_error_frame=True, is_extended_id=False))
+    for end in pair.values():
+        with pytest.raises(PeerLost, match=r"the CAN controller of 127\.0\.0\.1:\d+ went bus off"):
+            while end.wait(5):
+                end.receive()
+        assert end.receive() is None
+        assert end.counters["error_frames"] == 2
+
+
+def test_a_bus_that_goes_away_ends_it(pair, monkeypatch):
+    def down(*arguments: Any) -> None:
+        raise can.CanOperationError("Network is down", errno.ENETDOWN)
+
+    end = pair["plant"]
+    monkeypatch.setattr(end._bus, "recv", down)
+    monkeypatch.setattr(end._bus, "send", down)
+    for call in (end.receive, lambda: end.wait(1), lambda: end.send(frame("y", 0))):
+        with pytest.raises(PeerLost, match=r"the CAN bus 127.* is gone: Network is down"):
+            call()
+
+
+@pytest.mark.parametrize("number", [errno.ENOBUFS, None])
+def test_a_full_buffer_is_said_and_counted(pair, monkeypatch, number):
+    def full(message: can.Message) -> None:
+        raise can.CanOperationError("full", number)
+
+    end = pair["plant"]
+    monkeypatch.setattr(end._bus, "send", full)
+    assert not end.send(frame("y", 0))
+    assert end.counters["dropped"] == 2  # the state and the values
+    assert not end.send(b"a message")
+
+
+def test_another_dbc_is_refused_on_both_sides(make, tmp_path, endpoint):
+    other = tmp_path / "other.dbc"
+    other.write_text(write_dbc(True).replace("(0.0002,0.0)", "(0.0004,0.0)"))
+
+    def call(side: Side) -> None:
+        link = open_link("can", side, endpoint, {"dbc": str(other)} if side == "plant" else {})
+        try:
+            shake_hands(side, link, make(link=PATIENT), lambda: False, lambda text: None)
+        finally:
+            link.close()
+
+    found = in_threads(call)
+    assert "the plant uses another DBC" in str(found["controller"])
+    assert "the controller uses another DBC" in str(found["plant"])
+    assert all(isinstance(problem, PeerLost) for problem in found.values())
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "options", "fault"),
+    [
+        ("can+udp://127.0.0.1:80", {}, r"endpoint = 'can\+udp://127.0.0.1:80': must be can://"),
+        ("can+udp://192.168.0.1:5000", {}, r"must be can://channel"),
+        ("can://", {}, "must be can://channel"),
+        ("can://can0", {"interface": "pigeon"}, "cannot be opened: .*pigeon"),
+        ("can://nocan", {}, "'can://nocan': cannot be opened: "),
+        ("can://x", {"bitrate": 5}, "bitrate"),
+        ("can://x", {"dbc": "nowhere.dbc"}, "dbc = 'nowhere.dbc': No such file"),
+        ("can://x", {"dbc": __file__}, "dbc = .*test_can.py': "),
+    ],
+)
+def test_what_is_not_to_be_had_is_said(endpoint, options, fault):
+    with pytest.raises(UserError, match=fault):
+        open_link("can", "plant", endpoint, options)
+
+
+def test_a_dbc_of_the_other_kind_of_bus(tmp_path, endpoint):
+    classic = tmp_path / "classic.dbc"
+    classic.write_text(write_dbc(False))
+    with pytest.raises(UserError, match=r"describes classic CAN; link\.options\.fd must agree"):
+        open_link("can", "plant", endpoint, {"dbc": str(classic)})
+
+
+def test_an_endpoint_that_is_taken(pair, endpoint):
+    with pytest.raises(UserError, match="cannot be opened: occupied"):
+        open_link("can", "plant", endpoint)
+
+
+def test_the_loopback_bus_is_a_backend_of_python_can(endpoint):
+    channel = endpoint.partition("://")[2]
+    nodes = [can.Bus(interface="gfmhil-udp", channel=channel) for _ in range(4)]
+    try:
+        with pytest.raises(can.CanInitializationError, match="occupied"):
+            can.Bus(interface="gfmhil-udp", channel=channel)
+        sent = can.Message(
+            arbitration_id=0x12345678, is_fd=True, bitrate_switch=True, data=bytes(range(64))
+        )
+        nodes[2].send(sent)
+        for k in (0, 1, 3):
+            heard = nodes[k].recv(5)
+            assert heard is not None
+            assert heard.equals(sent, timestamp_delta=None)
+        assert nodes[2].recv(0) is None
+        nodes[0].send(can.Message(arbitration_id=5, is_remote_frame=True, is_extended_id=False))
+        assert nodes[1].recv(5).is_remote_frame
+    finally:
+        for node in nodes:
+            node.shutdown()
+
+
+def test_a_place_found_empty_is_asked_again(endpoint):
+    channel = endpoint.partition("://")[2]
+    with LoopbackBus(channel, 0) as one:
+        ping = can.Message(arbitration_id=1)
+        for _ in range(3):
+            one.send(ping)
+        with LoopbackBus(channel, 1) as other:
+            until = time.monotonic() + 5
+            while other.recv(0.02) is None:
+                assert time.monotonic() < until
+                one.send(ping)
