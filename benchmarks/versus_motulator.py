@@ -8,15 +8,16 @@ documentation: a 12.5 kVA converter under reference-feedforward power-synchroniz
 
 from __future__ import annotations
 
+import argparse
+import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-from benchmarks.loop import Loop
-from benchmarks.timing import Spread, arguments, machine, ratio, seconds, show, take_turns
+from gfm_hil.benchmark.inproc_loop import Loop
+from gfm_hil.benchmark.turns import Spread, ratio, seconds, take_turns
+from gfm_hil.environment import environment
 
 try:
     from motulator.grid import control, model
@@ -81,7 +82,10 @@ class Example:
 
 
 def main() -> None:
-    parser = arguments(__doc__ or "", turns=5)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--turns", type=int, default=5, help="turns of each (%(default)s)")
+    parser.add_argument("--quick", action="store_true", help="hardly any work: only try it out")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--law", default="psc-2", help="of gfmhil's loop (default: %(default)s)")
     parser.add_argument("--duration", type=float, default=1.5, help="s of each (%(default)s)")
     args = parser.parse_args()
@@ -94,18 +98,16 @@ def main() -> None:
         )
     rates = {name: Spread.of(values) for name, values in found.items()}
     faster = ratio(found["gfmhil"], found["motulator"])
-    table = Table(title=f"simulated seconds per second: median (min–max) of {turns} turns")
-    for column in (f"gfmhil, {args.law}", "motulator, its GFM example", "ratio"):
-        table.add_column(column, justify="right")
-    table.add_row(rates["gfmhil"].text(1), rates["motulator"].text(3), faster.text(0))
-    result = {
-        **rates,
-        "ratio": faster,
-        "motulator_p_pu": theirs.p,
-        "remarks": [f"{faster.median:.0f} times as fast (target {TARGET:g})", *REMARKS],
-        "machine": machine("scipy", "motulator"),
-    }
-    show(result, [table], args.json)
+    if args.json:
+        result = {name: spread.plain() for name, spread in {**rates, "ratio": faster}.items()}
+        about = {"motulator_p_pu": theirs.p, "remarks": REMARKS, "environment": environment()}
+        print(json.dumps(result | about, indent=2))
+        return
+    print(f"simulated seconds per second: median (min-max) of {turns} turns")
+    print(f"  gfmhil, {args.law}: {rates['gfmhil'].text(1)}")
+    print(f"  motulator, its grid-forming example: {rates['motulator'].text(3)}")
+    print(f"{faster.text(0)} times as fast (target {TARGET:g})")
+    print(*(f"- {remark}" for remark in REMARKS), sep="\n")
 
 
 if __name__ == "__main__":

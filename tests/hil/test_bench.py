@@ -9,7 +9,10 @@ from typing import Any
 
 import pytest
 
+from gfm_hil.benchmark.kernel import compare
+from gfm_hil.benchmark.kernel_twin import compile_twin
 from gfm_hil.cli import main
+from gfm_runtime import law_names
 
 KEYS = {
     "link", "peer", "code", "mode", "load", "policy", "payload", "n", "ratio_to_baseline_p50",
@@ -17,9 +20,9 @@ KEYS = {
 }  # fmt: skip
 
 
-def bench(tmp_path: Path, capsys: Any, *options: str) -> dict[str, Any]:
+def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, Any]:
     """A benchmark with hardly any work; what it prints."""
-    line = ["bench", *options, "--rounds", "2", "--out", str(tmp_path / "bench"), "--json"]
+    line = ["bench", kind, "--rounds", "2", *options, "--out", str(tmp_path / "bench"), "--json"]
     assert main(line) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "bench" / "bench.json").read_text("utf-8"))
@@ -46,6 +49,73 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path: Path, capsys: Any) -
     assert found["environment"]["cpus"] == len(os.sched_getaffinity(0))
 
 
+@pytest.mark.apt
+def test_kernel_is_its_twin_in_c_bit_for_bit(tmp_path: Path) -> None:
+    """All laws, float64 and float32, on inputs that drive each output into its limits."""
+    limited: list[tuple[int, ...]] = []
+    for real in ("float64", "float32"):
+        twin = compile_twin(tmp_path, real)
+        found = {name: compare(name, real, twin, rounds=2) for name in law_names()}
+        assert {name: one.ulps for name, one in found.items()} == dict.fromkeys(found, 0)
+        limited += [one.limited for one in found.values()]
+    assert all(any(row) for row in zip(*limited, strict=True))
+
+
+@pytest.mark.apt
+def test_kernel_is_timed_beside_c(tmp_path: Path, capsys: Any) -> None:
+    rows = bench(tmp_path, capsys, "kernel", "--laws", "mimo-gfm,droop-1")["kernel"]
+    assert {(r["law"], r["real"]) for r in rows} == {
+        (law, real) for law in ("mimo-gfm", "droop-1") for real in ("float64", "float32")
+    }
+    for row in rows:
+        assert row["ulps"] == 0
+        assert row["numba_ns"]["median"] > 0
+        assert row["ratio"]["median"] > 0
+
+
+def test_kernel_without_a_compiler(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    found = bench(tmp_path, capsys, "kernel", "--laws", "droop-1")
+    assert all(r["numba_ns"]["median"] > 0 and r["ratio"] is None for r in found["kernel"])
+    assert any("no C compiler" in remark for remark in found["remarks"])
+
+
+def test_jitter_shows_every_way_to_wait(tmp_path: Path, capsys: Any) -> None:
+    options = ("jitter", "--seconds", "0.02", "--policy", "other", "--load", "idle")
+    rows = bench(tmp_path, capsys, *options)["jitter"]
+    assert {r["wait"] for r in rows} == {"sleep+spin", "spin", "nanosleep"}
+    for row in rows:
+        assert row["n"] == 2 * row["ticks"] == 2 * 2 * 200  # processors, rounds
+        assert row["lost"] == sum(length * count for length, count in row["bursts"])
+        assert row["lost_pct"] == pytest.approx(100 * row["lost"] / row["ticks"], abs=1e-3)
+
+
+def test_loop_runs_the_product_over_a_link(tmp_path: Path, capsys: Any) -> None:
+    loop = bench(
+        tmp_path, capsys, "loop", "--links", "shm", "--laws", "mimo-gfm", "--seconds", "0.3",
+        "--load", "idle", "--rounds", "1",
+    )["loop"]  # fmt: skip
+    assert {r["link"] for r in loop["lockstep"]} == {"inproc", "shm"}
+    assert all(r["ticks_per_s"]["median"] > 0 for r in loop["lockstep"])
+    (row,) = loop["realtime"]
+    assert row["ticks"] == 3_000
+    assert row["n"] == row["ticks"] - row["missed"]
+    assert sum(row["causes"].values()) == row["missed"]
+    assert sum(length * count for length, count in row["bursts"]) == row["missed"]
+    assert {r["law"] for r in loop["laws"]} == {"mimo-gfm", "mimo-gfm, rig"}
+    for row in loop["laws"]:
+        assert row["substeps"] == 10
+        assert row["allocations_per_tick"] == 0
+
+
+def test_loop_that_trips_is_not_timed(tmp_path: Path, capsys: Any) -> None:
+    line = ["bench", "loop", "--laws", "dvoc", "--mode", "lockstep", "--rounds", "1"]
+    assert main([*line, "--out", str(tmp_path / "bench")]) == 2
+    assert capsys.readouterr().err.startswith("gfmhil: dvoc: tripped or safe at tick ")
+
+
 def test_without_a_compiler_the_links_are_measured_alone(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -68,6 +138,11 @@ def test_without_a_compiler_the_links_are_measured_alone(
         (["latency", "--payload", "0"], "--payload"),
         (["latency", "--seconds", "nan"], "--seconds"),
         (["latency", "--rounds", "0"], "--rounds"),
+        (["jitter", "--load", "idle,heavy"], "--load"),
+        (["kernel", "--laws", "vsg-99"], "vsg-99"),
+        (["loop", "--seconds", "0.01"], "--seconds"),
+        (["loop", "--laws", "droop-1,"], "--laws"),
+        (["all", "--links", "inproc"], "inproc"),
     ],
 )
 def test_wrong_input_starts_nothing(

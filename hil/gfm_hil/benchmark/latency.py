@@ -9,21 +9,19 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.benchmark.c_code import NoCompiler, compile_c
 from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
-from gfm_hil.benchmark.histogram import Counts, histogram, quantiles, sparse
 from gfm_hil.benchmark.hogs import Load, hogs
 from gfm_hil.benchmark.pair import Policy, pair
+from gfm_hil.benchmark.spread import REST, summary
 
 Mode = Literal["lockstep", "realtime"]
 MODES: tuple[Mode, ...] = ("lockstep", "realtime")
 PERIOD_NS = 100_000
 
-SHARES = {"p50": 0.5, "p90": 0.9, "p99": 0.99, "p99_9": 0.999, "p99_99": 0.9999, "max": 1.0}
 _FIRST_S = 0.02  # the round that is not kept
-_REST = 0.15  # of a round: the kernel takes from SCHED_FIFO 5 % of each second that it spins away
-_BY_ROUND = ("p50", "p90", "p99")  # there are enough times in a round
 
 Tell = Callable[[str, float], None]  # what is being done, and the share that is done
 
@@ -59,11 +57,8 @@ class _Cell:
     mode: Mode
     load: Load
     compiled: bool
-    rounds: dict[int, Counts] = field(default_factory=dict)
+    rounds: dict[int, NDArray[np.int64]] = field(default_factory=dict)
     silent: int = 0
-
-    def p50(self, number: int) -> float:
-        return quantiles(self.rounds[number], [0.5])[0]
 
 
 def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
@@ -96,9 +91,9 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
                 with load(cell.load):
                     seconds = plan.seconds if number >= 0 else _FIRST_S
                     times = two.round(cell.contender, period, seconds)
-                time.sleep(_REST * seconds)
+                time.sleep(REST * seconds)
                 if number >= 0 and len(times):
-                    cell.rounds[number] = histogram(times)
+                    cell.rounds[number] = times
                 cell.silent += not len(times)
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
     results = [_result(c, by_key.get((c.contender.baseline, c.mode, c.load)), plan) for c in cells]
@@ -107,7 +102,11 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
 
 def _result(cell: _Cell, baseline: _Cell | None, plan: Plan) -> dict[str, Any]:
     c = cell.contender
-    row: dict[str, Any] = {
+    both = sorted(cell.rounds.keys() & baseline.rounds.keys()) if baseline else []
+    ratios = [
+        float(np.median(cell.rounds[k]) / np.median(baseline.rounds[k])) for k in both if baseline
+    ]
+    return {
         "name": c.name,
         "link": c.link,
         "peer": c.peer,
@@ -116,30 +115,9 @@ def _result(cell: _Cell, baseline: _Cell | None, plan: Plan) -> dict[str, Any]:
         "load": cell.load,
         "policy": plan.policy,
         "payload": plan.payload,
-        "n": 0,
-        **{f"{name}_us": None for name in SHARES},
+        **summary(list(cell.rounds.values())),
         "baseline": c.baseline or None,
-        "ratio_to_baseline_p50": None,
+        "ratio_to_baseline_p50": round(float(np.median(ratios)), 4) if ratios else None,
+        "rounds_ratio": [round(ratio, 4) for ratio in ratios],
         "silent_rounds": cell.silent,
-        "rounds_p50_us": [],
-        "histogram": [],
     }
-    if not cell.rounds:
-        return row
-    each = (
-        np.array([quantiles(counts, list(SHARES.values())) for counts in cell.rounds.values()])
-        / 1e3
-    )
-    whole: Counts = np.sum([*cell.rounds.values()], axis=0)
-    over_all = np.array(quantiles(whole, list(SHARES.values()))) / 1e3
-    for k, name in enumerate(SHARES):
-        value = np.median(each[:, k]) if name in _BY_ROUND else over_all[k]
-        row[f"{name}_us"] = round(float(value), 3)
-    row["n"] = int(whole.sum())
-    row["rounds_p50_us"] = [round(float(x), 4) for x in each[:, 0]]
-    row["histogram"] = sparse(whole)
-    both = sorted(cell.rounds.keys() & baseline.rounds.keys()) if baseline else []
-    if baseline and both:
-        ratio = np.median([cell.p50(k) / baseline.p50(k) for k in both])
-        row["ratio_to_baseline_p50"] = round(float(ratio), 4)
-    return row

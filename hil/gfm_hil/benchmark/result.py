@@ -56,6 +56,15 @@ def read_result(path: Path) -> dict[str, Any]:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
         raise UserError(f"{file}: cannot be read: {problem}") from None
+    return check_result(content, str(file))
+
+
+def check_result(content: Any, source: str) -> dict[str, Any]:
+    """The content, if it is a result.
+
+    Raises:
+        UserError: it is none, or one of another version.
+    """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise UserError(f"{file}: not a result of `gfmhil bench` of format {FORMAT}")
+        raise UserError(f"{source}: not a result of `gfmhil bench` of format {FORMAT}")
     return content

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Table
 
 from gfm_hil.cli.common import new_folder
-from gfm_hil.errors import UserError
 from gfm_hil.links import link_names
+from gfm_hil.run_folder import check_free
 
 _WIDTH = 100  # columns: a table cut short is no use in a file
 
@@ -25,20 +27,57 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser("bench", help="measure links, clock, kernel and loop here")
     kinds = command.add_subparsers(dest="kind", required=True, metavar="WHAT")
-    latency = kinds.add_parser("latency", help="round trip of every link beside the limit in C")
-    _add_links(latency)
-    latency.add_argument(
-        "--mode", default="lockstep,realtime",
-        help="lockstep: one after the other; realtime: one every 100 µs (default: %(default)s)",
+
+    def kind(name: str, text: str, *options: Callable[[argparse.ArgumentParser], None]) -> None:
+        sub = kinds.add_parser(name, help=text)
+        for option in (*options, _add_output):
+            option(sub)
+        sub.set_defaults(call=call)
+
+    kind(
+        "latency", "round trip of every link beside the limit in C",
+        _add_links, _add_modes, _add_load, _add_policy, _add_payload, _add_seconds(0.2),
+        _add_rounds,
     )  # fmt: skip
-    _add_load(latency)
-    latency.add_argument(
-        "--payload", type=int, default=84,
-        help="bytes there; 84: the bench's frames, 84 there and 68 back (default: %(default)s)",
+    kind(
+        "jitter", "how late a loop that only paces begins its ticks",
+        _add_load, _add_policy, _add_seconds(0.3), _add_rounds,
     )  # fmt: skip
-    _add_rounds(latency, seconds=0.2)
-    _add_output(latency)
-    latency.set_defaults(call=call)
+    kind(
+        "kernel",
+        "ns a step of every law, beside the same in C",
+        _add_laws,
+        _add_cflags,
+        _add_rounds,
+    )
+    kind(
+        "loop", "closed loop: ticks a second in lockstep, misses in real time",
+        _add_links, _add_modes, _add_load, _add_laws, _add_seconds(3.0), _add_rounds,
+    )  # fmt: skip
+    kind("all", "all of it, in three minutes at most", _add_links)
+    _add_compare(kinds)
+
+
+def _add_compare(kinds: Any) -> None:
+    command = kinds.add_parser(
+        "compare",
+        help="tell a real change from noise, between two results or two installations",
+        description="Two results as they are, or with --interleave two installations, measured in "
+        "turn on this machine now, which alone is safe against a machine that changes meanwhile.",
+    )
+    command.add_argument("a", metavar="A", help="bench.json or its folder; a gfmhil command")
+    command.add_argument("b", metavar="B", help="the other one")
+    command.add_argument(
+        "--interleave", type=int, metavar="N", help="run the commands A and B so often, in turn"
+    )
+    command.add_argument(
+        "--what", default="latency --mode lockstep --load idle",
+        help="what they measure, with its options (default: %(default)s)",
+    )  # fmt: skip
+    command.add_argument("--out", help="folder for what was measured; runs/bench-compare-… else")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    command.set_defaults(call=compare_call)
 
 
 def _add_links(command: argparse.ArgumentParser) -> None:
@@ -46,21 +85,54 @@ def _add_links(command: argparse.ArgumentParser) -> None:
     command.add_argument("--links", default=names, help="by commas (default: %(default)s)")
 
 
+def _add_modes(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--mode", default="lockstep,realtime",
+        help="lockstep: as fast as it goes; realtime: every 100 µs (default: %(default)s)",
+    )  # fmt: skip
+
+
 def _add_load(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--load", default="idle,hogs",
         help="idle, or beside a busy process on each processor (default: %(default)s)",
     )  # fmt: skip
+
+
+def _add_policy(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--policy", choices=["auto", "fifo", "other"], default="auto",
-        help="SCHED_FIFO or as given; auto: fifo where the rights are there (%(default)s)",
+        help="SCHED_FIFO, or as any process; auto: fifo where the rights are there (%(default)s)",
     )  # fmt: skip
 
 
-def _add_rounds(command: argparse.ArgumentParser, seconds: float) -> None:
+def _add_payload(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--seconds", type=float, default=seconds, help="of a round (default: %(default)s)"
+        "--payload", type=int, default=84,
+        help="bytes there; 84: the bench's frames, 84 there and 68 back (default: %(default)s)",
+    )  # fmt: skip
+
+
+def _add_laws(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--laws", help="names, by commas (default: all that are stable there)")
+
+
+def _add_cflags(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--cflags", default="-O3", help="for the C compiler (default: %(default)s)"
     )
+
+
+def _add_seconds(seconds: float) -> Callable[[argparse.ArgumentParser], None]:
+    def add_seconds(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            "--seconds", type=float, default=seconds, help="of a round (default: %(default)s)"
+        )
+
+    return add_seconds
+
+
+def _add_rounds(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--rounds", type=int, default=5, help="of each, interleaved (default: %(default)s)"
     )
@@ -74,11 +146,13 @@ def _add_output(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry a measuring command out; returns the exit code."""
+    from gfm_hil.benchmark.plans import steps_of
     from gfm_hil.benchmark.result import Recorder, write_result
     from gfm_hil.benchmark.tables import tables
 
-    steps = _steps(options)
+    steps = steps_of(options)
     folder = new_folder(options.out, f"bench-{options.kind}")
+    check_free(folder, 0)
     recorder = Recorder(options.kind)
     with _bar(options.quiet) as tell:
         for step in steps:
@@ -91,7 +165,7 @@ def call(options: argparse.Namespace) -> int:
     console = Console()
     console.width = max(console.width, _WIDTH)
     for table in tables(content):
-        console.print(table)
+        console.print(_drawn(table))
         console.print()
     for remark in (*content["remarks"], *content["caveats"]):
         console.print(f"• {escape(remark)}", highlight=False)
@@ -99,71 +173,43 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _steps(options: argparse.Namespace) -> list[Callable[[dict[str, Any], Tell], None]]:
-    """What is to be measured, in order, every option checked."""
-    return [_latency(options)]
+def compare_call(options: argparse.Namespace) -> int:
+    """Carry the comparison out; returns the exit code."""
+    from gfm_hil.benchmark.compare import compare, comparison_table
+    from gfm_hil.benchmark.interleave import interleave
+    from gfm_hil.benchmark.result import read_result
+
+    remarks = []
+    if options.interleave is None:
+        a, b = read_result(Path(options.a)), read_result(Path(options.b))
+        remarks.append(
+            "Measured one after the other: what changed on the machine between them is a real "
+            "change too. Where both have limits in C, ratios to these are compared, which helps."
+        )
+    else:
+        folder = new_folder(options.out, "bench-compare")
+        check_free(folder, 0)
+        with _bar(options.quiet) as tell:
+            a, b = interleave(options.a, options.b, options.interleave, options.what, folder, tell)
+    rows = compare(a, b, by_limit=options.interleave is None)
+    if options.json:
+        print(json.dumps({"results": rows, "remarks": remarks}, indent=1))
+        return 0
+    console = Console()
+    console.width = max(console.width, _WIDTH)
+    console.print(_drawn(comparison_table(rows)))
+    for remark in remarks:
+        console.print(f"• {remark}", highlight=False)
+    return 0
 
 
-def _latency(options: argparse.Namespace) -> Callable[[dict[str, Any], Tell], None]:
-    from gfm_hil.benchmark.contenders import check_links
-    from gfm_hil.benchmark.hogs import LOADS
-    from gfm_hil.benchmark.latency import MODES, Plan, measure
-
-    plan = Plan(
-        links=check_links(split("--links", options.links)),
-        modes=split("--mode", options.mode, MODES),
-        loads=split("--load", options.load, LOADS),
-        policy=policy(options.policy),
-        payload=within("--payload", options.payload, 1, 504),
-        seconds=within("--seconds", options.seconds, 0.01, 60),
-        rounds=within("--rounds", options.rounds, 1, 1000),
-    )
-
-    def step(content: dict[str, Any], tell: Tell) -> None:
-        rows, remarks = measure(plan, tell)
-        content["results"] += rows
-        content["remarks"] += remarks
-
-    return step
-
-
-def split(option: str, text: str, allowed: Sequence[Any] | None = None) -> list[Any]:
-    """Names from a comma-separated list, each once.
-
-    Raises:
-        UserError: an empty one, or one that is not allowed.
-    """
-    names = list(dict.fromkeys(name.strip() for name in text.split(",")))
-    for name in names:
-        if not name or (allowed is not None and name not in allowed):
-            wanted = f"from {', '.join(allowed)}" if allowed is not None else "none empty"
-            raise UserError(f"{option} {text!r}: names separated by commas, {wanted}")
-    return names
-
-
-def within(option: str, value: Any, low: Any, high: Any) -> Any:
-    """The value, if it is in the range.
-
-    Raises:
-        UserError: it is not.
-    """
-    if not low <= value <= high:
-        raise UserError(f"{option} {value}: must be {low} to {high}")
-    return value
-
-
-def policy(wanted: str) -> Any:
-    """``fifo`` or ``other``.
-
-    Raises:
-        UserError: fifo is asked for without the rights.
-    """
-    from gfm_hil.environment import may_sched_fifo
-
-    allowed = may_sched_fifo()
-    if wanted == "fifo" and not allowed:
-        raise UserError("--policy fifo: no right to SCHED_FIFO here; use other or auto")
-    return wanted if wanted != "auto" else ("fifo" if allowed else "other")
+def _drawn(table: Any) -> Table:
+    drawn = Table(title=escape(table.heading), title_justify="left", box=None, pad_edge=False)
+    for k, column in enumerate(table.columns):
+        drawn.add_column(escape(column), justify="right" if k else "left")
+    for row in table.rows:
+        drawn.add_row(*map(escape, row))
+    return drawn
 
 
 @contextmanager

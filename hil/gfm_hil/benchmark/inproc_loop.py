@@ -8,18 +8,18 @@ processor, which the closed loop cannot, so the parts need not add up to the who
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
-from rich.table import Table
 
-from benchmarks.timing import Spread, arguments, machine, quickest, seconds, show, take_turns
 from gfm_hil.bench import Bench, make_bench
+from gfm_hil.benchmark.turns import Spread, quickest, seconds, take_turns
+from gfm_hil.errors import UserError
 from gfm_hil.inproc import run_ticks
 from gfm_hil.recording import Part, record_controller, record_plant
 from gfm_hil.scenario import load_scenario
@@ -34,7 +34,6 @@ LAWS = (
     "matching-1", "hybrid-angle",
 )  # fmt: skip
 RIG = "mimo-gfm, rig"
-TARGET = 50.0  # times real time
 
 
 @njit(cache=True)
@@ -90,7 +89,7 @@ class Loop:
         """ns per tick of the closed loop.
 
         Raises:
-            SystemExit: the run ended early, so that there is nothing to time.
+            UserError: the run ended early, so that there is nothing to time.
         """
         b, n = self.reset(), ticks or self.ticks
         c = b.controller
@@ -105,7 +104,7 @@ class Loop:
 
         time = seconds(run) / n * 1e9
         if done != n:
-            raise SystemExit(f"{c.active}: tripped or safe at tick {done - 1} of {n}")
+            raise UserError(f"{c.active}: tripped or safe at tick {done - 1} of {n}")
         return time
 
     def plant_part(self) -> float:
@@ -128,7 +127,9 @@ class Loop:
 
     def allocations_per_tick(self) -> float:
         """Of numba's runtime; a call's own, whatever its length, cancel."""
+        _nrt_python.memsys_enable_stats()
         short, long = self._allocations(self.ticks // 2), self._allocations(self.ticks)
+        _nrt_python.memsys_disable_stats()
         return (long - short) / (self.ticks - self.ticks // 2)
 
     def _allocations(self, ticks: int) -> int:
@@ -140,8 +141,31 @@ class Loop:
         return seconds(work) / self.ticks * 1e9
 
 
-def measure(loop: Loop, turns: int) -> dict[str, Any]:
-    """Everything that is printed of one loop."""
+def measure(
+    laws: Sequence[str], ticks: int, turns: int, folder: Path, tell: Callable[[str, float], None]
+) -> list[dict[str, Any]]:
+    """ns per tick of laws and of the rig, a row each.
+
+    Args:
+        laws: names.
+        ticks: of a short run, of which a turn has ``RUNS``.
+        turns: of each.
+        folder: to record into.
+        tell: told what is being done, and the share that is done.
+
+    Raises:
+        UserError: a run ended early, so that there is nothing to time.
+    """
+    jobs = {name: ("pref_step", name) for name in laws}
+    jobs[RIG] = ("rig_pref_step", "mimo-gfm")
+    rows = []
+    for k, (name, (scenario, law)) in enumerate(jobs.items()):
+        tell(f"loop in process, {name}", k / len(jobs))
+        rows.append({"law": name, **_measure(Loop(scenario, law, ticks, folder / name), turns)})
+    return rows
+
+
+def _measure(loop: Loop, turns: int) -> dict[str, Any]:
     found = take_turns(
         {
             "whole": lambda: quickest(loop.whole),
@@ -151,39 +175,9 @@ def measure(loop: Loop, turns: int) -> dict[str, Any]:
         },
         turns,
     )
-    return {name: Spread.of(times) for name, times in found.items()} | {
-        "times_real_time": Spread.of([loop.T_s * 1e9 / ns for ns in found["whole"]]),
+    rate = Spread.of([loop.T_s * 1e9 / ns for ns in found["whole"]])
+    return {f"{name}_ns": Spread.of(times).plain() for name, times in found.items()} | {
+        "times_real_time": rate.plain(),
         "allocations_per_tick": loop.allocations_per_tick(),
         "substeps": loop.substeps,
     }
-
-
-def main() -> None:
-    parser = arguments(__doc__ or "", turns=5)
-    parser.add_argument("--laws", default=",".join(LAWS), help="by commas (default: %(default)s)")
-    args = parser.parse_args()
-    ticks, turns = (200, 1) if args.quick else (2_000, args.turns)
-    jobs = {name: ("pref_step", name) for name in args.laws.split(",")}
-    jobs[RIG] = ("rig_pref_step", "mimo-gfm")
-    result: dict[str, Any] = {"loops": {}, "machine": machine()}
-    table = Table(title=f"ns per tick in one process: median (min–max) of {turns} turns")
-    columns = ("whole", "plant", "controller", "recording")
-    for column in ("law", *columns, "× real time", "allocations per tick"):
-        table.add_column(column, justify="left" if column == "law" else "right")
-    with tempfile.TemporaryDirectory() as place:
-        for name, (scenario, law) in jobs.items():
-            loop = Loop(scenario, law, ticks, Path(place) / name)
-            found = result["loops"][name] = measure(loop, turns)
-            table.add_row(
-                name,
-                *(found[column].text(0) for column in columns),
-                found["times_real_time"].text(1),
-                f"{found['allocations_per_tick']:g}",
-            )
-    slowest = min(found["times_real_time"].median for found in result["loops"].values())
-    result["remarks"] = [f"slowest: {slowest:.1f} times real time (target {TARGET:g})"]
-    show(result, [table], args.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -8,6 +8,7 @@ every output into its limits are put through both, and outputs and states are co
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,18 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import DTypeLike, NDArray
-from rich.table import Table
 
-from benchmarks.c_twin import FLAGS, Drive, compile_twin, version_line
-from benchmarks.timing import Spread, arguments, machine, quickest, ratio, seconds, show, take_turns
-from gfm_runtime import discretise, get_law, law_names
+from gfm_hil.benchmark.c_code import FLAGS, NoCompiler
+from gfm_hil.benchmark.kernel_twin import Drive, compile_twin
+from gfm_hil.benchmark.turns import Spread, quickest, ratio, seconds, take_turns
+from gfm_runtime import discretise, get_law
 from gfm_runtime.kernel import pack_law, state_dtype, step
 from gfm_runtime.signals import NU, NY, group
 
 T_S = 1e-4  # s
 ROWS = 256  # different measurements in turn
 FEEDBACK = 1e-6  # p.u. of y for one p.u. of u
-TARGET_NS, TARGET_RATIO = 100.0, 1.2
+REALS = ("float64", "float32")
 
 
 def io_dtype(real: DTypeLike) -> np.dtype[Any]:
@@ -121,67 +122,68 @@ def compare(name: str, real: DTypeLike, rival: Drive, rounds: int) -> Agreement:
 
 
 def time_laws(
-    names: list[str], real: DTypeLike, twin: Drive, steps: int, turns: int
-) -> dict[str, dict[str, Spread]]:
-    """ns per step of every law, by numba and by C, and their ratio."""
+    names: Sequence[str], real: DTypeLike, twin: Drive | None, steps: int, turns: int
+) -> dict[str, dict[str, Any]]:
+    """ns per step of every law by numba and by C, and their ratio; None without a twin."""
 
     def job(name: str, how: Drive) -> float:
         chain = Chain.make(name, real, scatter=1e-3)
         chain.run(how, ROWS)  # warm
         return quickest(lambda: seconds(lambda: chain.run(how, steps))) / steps * 1e9
 
-    ways: dict[str, Drive] = {"numba": drive, "c": twin}
+    ways: dict[str, Drive] = {"numba": drive} | ({"c": twin} if twin else {})
     jobs = {
         f"{n} {way}": (lambda n=n, how=how: job(n, how)) for n in names for way, how in ways.items()
     }
     found = take_turns(jobs, turns)
     return {
-        n: {way: Spread.of(found[f"{n} {way}"]) for way in ways}
-        | {"ratio": ratio(found[f"{n} numba"], found[f"{n} c"])}
+        n: {
+            "numba_ns": Spread.of(found[f"{n} numba"]).plain(),
+            "c_ns": Spread.of(found[f"{n} c"]).plain() if twin else None,
+            "ratio": ratio(found[f"{n} numba"], found[f"{n} c"]).plain() if twin else None,
+        }
         for n in names
     }
 
 
-def main() -> None:
-    parser = arguments(__doc__ or "", turns=5)
-    parser.add_argument("--laws", help="names, by commas (default: all)")
-    parser.add_argument("--cflags", default=FLAGS, help="for the C compiler (default: %(default)s)")
-    args = parser.parse_args()
-    names = args.laws.split(",") if args.laws else list(law_names())
-    steps, rounds = (500, 2) if args.quick else (10_000, 40)
-    result: dict[str, Any] = {"laws": {}, "machine": machine() | {"cc": version_line()}}
-    tables = []
-    for real in ("float64", "float32"):
+def measure(
+    names: Sequence[str],
+    steps: int,
+    turns: int,
+    tell: Callable[[str, float], None],
+    flags: str = FLAGS,
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Measure laws; returns (rows, remarks), a row a law and real type.
+
+    Args:
+        names: of laws.
+        steps: in one of the ``RUNS`` short runs of a turn.
+        turns: of each.
+        tell: told what is being done, and the share that is done.
+        flags: for the C compiler.
+    """
+    rows: list[dict[str, Any]] = []
+    remarks: list[str] = []
+    for k, real in enumerate(REALS):
+        tell(f"kernel, {real}", k / len(REALS))
         with tempfile.TemporaryDirectory() as place:
-            twin = compile_twin(Path(place), real, args.cflags)
-            agreements = {n: compare(n, real, twin, rounds) for n in names}
-            times = time_laws(names, real, twin, steps, 1 if args.quick else args.turns)
-        table = Table(title=f"ns per kernel step, {real}: median (min–max) of {args.turns} turns")
-        for column in ("law", "states", "numba", f"cc {args.cflags}", "ratio", "apart, ulp"):
-            table.add_column(column, justify="left" if column == "law" else "right")
+            twin: Drive | None = None
+            try:
+                twin = compile_twin(Path(place), real, flags)
+            except NoCompiler as problem:
+                remarks.append(f"kernel, {real}: {problem}; nothing to compare with")
+            agreements = {n: compare(n, real, twin, rounds=40) for n in names} if twin else {}
+            times = time_laws(names, real, twin, steps, turns)
         for n in names:
-            order = int(Chain.make(n, real, 0.0).law["n"][0])
-            result["laws"].setdefault(n, {})[real] = {
-                "states": order, **times[n], "ulps": agreements[n].ulps,
-                "limited": agreements[n].limited,
-            }  # fmt: skip
-            t = times[n]
-            table.add_row(
-                n, str(order), t["numba"].text(1), t["c"].text(1), t["ratio"].text(2),
-                str(agreements[n].ulps),
-            )  # fmt: skip
-        tables.append(table)
-    everything = [r for law in result["laws"].values() for r in law.values()]
-    slowest = max(r["numba"].median for r in everything)
-    worst = max(r["ratio"].median for r in everything)
-    result["remarks"] = [
-        f"slowest law {slowest:.1f} ns (target {TARGET_NS:g}), "
-        f"worst ratio {worst:.2f} (target {TARGET_RATIO:g})",
-        f"outputs and states of numba and C at most {max(r['ulps'] for r in everything)} ulp apart "
-        f"over {rounds * ROWS} steps each, limits included",
-    ]
-    show(result, tables, args.json)
-
-
-if __name__ == "__main__":
-    main()
+            same = agreements.get(n)
+            rows.append(
+                {
+                    "law": n,
+                    "real": real,
+                    "states": int(Chain.make(n, real, 0.0).law["n"][0]),
+                    **times[n],
+                    "ulps": same.ulps if same else None,
+                    "limited": list(same.limited) if same else None,
+                }
+            )
+    return rows, remarks

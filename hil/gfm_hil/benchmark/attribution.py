@@ -1,0 +1,100 @@
+"""Why ticks were missed, from the times that both sides recorded.
+
+A tick is missed if u[k] has not arrived at the plant by the next deadline. Its time went into four
+parts, and the one that took most beyond what it takes in a tick that was met is the cause:
+
+- late wake-up: the plant began after its deadline, though nothing kept it busy;
+- own work: the plant's or the controller's computing, or an event that fell on the tick;
+- stalled host: a side that was looking for a frame, or computing, did not run for a while: the
+  host of a virtual machine, the kernel or other work had its processor;
+- link: all else between y[k] sent and u[k] received.
+
+A tick that began while a side was still behind from the missed one before has the cause of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+CAUSES = ("own work", "link", "late wake-up", "stalled host")
+_OWN, _LINK, _WAKE, _STALL = range(len(CAUSES))
+
+_INTERRUPTED = 10.0  # times what one tick in a hundred computes: it was not the computing
+_AFTER_EVENT = 2  # ticks: an event is carried out between two of them
+
+Timing = Mapping[str, NDArray[np.int64]]
+
+
+def missed_ticks(timing: Timing) -> NDArray[np.int64]:
+    """Ticks of a run in real time whose u had not arrived by the next deadline."""
+    return np.flatnonzero(timing["plant_received"] < 0)
+
+
+def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> NDArray[np.int64]:
+    """The cause of each missed tick, as an index into ``CAUSES``; shape of ``missed_ticks``.
+
+    Args:
+        timing: arrays of ``timing.npz``, each (ticks,), ns; of a run in real time.
+        T_ns: sampling time.
+        events: ticks at which something was changed.
+    """
+    missed = missed_ticks(timing)
+    shares = _parts(timing, T_ns)
+    there = timing["plant_received"] >= 0
+    excess = np.zeros((len(CAUSES), len(missed)))
+    for cause, part in shares.items():
+        usual = np.median(part[there]) if there.any() else 0.0
+        excess[cause] = part[missed] - usual
+    own = shares[_OWN]
+    limit = _INTERRUPTED * (np.quantile(own, 0.99) if len(own) else 0.0)
+    interrupted = own[missed] > limit
+    excess[_STALL, interrupted] += excess[_OWN, interrupted]
+    excess[_OWN, interrupted] = 0.0
+    excess[_LINK] -= excess[_STALL].clip(min=0)  # a gap between looks is part of the wait
+    causes = np.argmax(excess, axis=0)
+
+    at_event = {k + after for k in events for after in range(_AFTER_EVENT)}
+    sent, answered = timing["plant_sent"], timing["controller_sent"]
+    for n, k in enumerate(missed):
+        follows = n > 0 and missed[n - 1] == k - 1
+        if follows and (causes[n] == _WAKE or answered[k - 1] > sent[k]):
+            causes[n] = causes[n - 1]
+        elif int(k) in at_event:
+            causes[n] = _OWN
+    return causes
+
+
+def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
+    """Time that each cause had in every tick, ns; a missed one lasts to the next deadline."""
+    due, woke = timing["plant_scheduled"], timing["plant_woke"]
+    sent, received = timing["plant_sent"], timing["plant_received"]
+    heard, answered = timing["controller_received"], timing["controller_sent"]
+    worked = np.where((heard >= 0) & (answered >= 0), answered - heard, 0)
+    end = np.where(received >= 0, received, np.maximum(due + T_ns, sent))
+    zero = np.zeros(len(due), np.int64)
+    gaps = [timing.get(f"{side}_stall", zero) for side in ("plant", "controller")]
+    parts = {
+        _OWN: sent - woke + worked,
+        _LINK: end - sent - worked,
+        _WAKE: woke - due,
+        _STALL: np.maximum(*gaps),
+    }
+    return {cause: part.clip(min=0).astype(float) for cause, part in parts.items()}
+
+
+def counts(causes: NDArray[np.int64]) -> dict[str, int]:
+    """How often each cause was found."""
+    return {name: int(np.sum(causes == k)) for k, name in enumerate(CAUSES)}
+
+
+def bursts(missed: NDArray[Any]) -> dict[int, int]:
+    """How many bursts of each length, from the ticks that were missed, ascending."""
+    if not len(missed):
+        return {}
+    ends = np.flatnonzero(np.diff(missed) != 1)
+    lengths = np.diff(np.concatenate([[-1], ends, [len(missed) - 1]]))
+    return {int(n): int(c) for n, c in zip(*np.unique(lengths, return_counts=True), strict=True)}

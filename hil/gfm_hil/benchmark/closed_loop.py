@@ -1,0 +1,214 @@
+"""The closed loop over every link, by the product itself: two processes, all that a run does.
+
+Lockstep: ticks a second, beside what the plant's arithmetic alone allows. Real time: ticks without
+a fresh u, why, and how many a loop that only paces would have lost on the same machine right
+before.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.benchmark.attribution import attribute, bursts, counts, missed_ticks
+from gfm_hil.benchmark.contenders import memory_folder
+from gfm_hil.benchmark.hogs import Load, hogs
+from gfm_hil.benchmark.inproc_loop import Loop
+from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
+from gfm_hil.benchmark.pair import Policy, pair
+from gfm_hil.benchmark.spread import summary
+from gfm_hil.benchmark.turns import Spread, quickest
+from gfm_hil.runner import Progress, run_scenario
+from gfm_hil.scenario import Scenario, check_scenario
+
+LAW = "mimo-gfm"
+T_S = 1e-4  # s
+_SETTLE = 1_000  # ticks after the hogs were let go that are left out
+_SHORT = 2_000  # ticks of one of the short runs in process
+
+Tell = Callable[[str, float], None]
+Timing = dict[str, NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked for: links, loads of real time, its policy, s and rounds of both modes."""
+
+    links: Sequence[str]
+    loads: Sequence[Load]
+    policy: Policy
+    lockstep_s: float
+    realtime_s: float
+    rounds: int
+
+
+@dataclass
+class _Run:
+    """What one run in real time showed, and the bare loop before it."""
+
+    timing: Timing
+    begin: int  # tick from which on it counts
+    scheduling: list[str]
+    late: NDArray[np.int64]
+
+
+@dataclass
+class _Cell:
+    """One link in real time under one load."""
+
+    link: str
+    load: Load
+    runs: list[_Run] = field(default_factory=list)
+
+
+def measure_lockstep(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
+    """Ticks a second over every link and in process; simulated, so as fast as it goes.
+
+    Raises:
+        UserError: a link is not to be had.
+    """
+    rates: dict[str, list[float]] = {"inproc": [], **{link: [] for link in plan.links}}
+    shares: dict[str, list[float]] = {name: [] for name in rates}
+    with ExitStack() as stack:
+        place = memory_folder(stack)
+        alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
+        for number in range(plan.rounds):
+            plant_ns = quickest(alone.plant_part)
+            for k, name in enumerate(list(rates)[:: -1 if number % 2 else 1]):
+                tell(f"lockstep, {name}", (number + k / len(rates)) / plan.rounds)
+                if name == "inproc":
+                    tick_ns = quickest(alone.whole)
+                else:
+                    scenario = _scenario(name, "lockstep", plan.lockstep_s)
+                    sent = _run(scenario, place)[0]["plant_sent"]
+                    tick_ns = float(sent[-1] - sent[0]) / (len(sent) - 1)
+                rates[name].append(1e9 / tick_ns)
+                shares[name].append(plant_ns / tick_ns)
+    return [
+        {
+            "link": name,
+            "mode": "lockstep",
+            "ticks_per_s": Spread.of(rates[name]).plain(),
+            "times_real_time": Spread.of([rate * T_S for rate in rates[name]]).plain(),
+            "share_of_plant_alone": Spread.of(shares[name]).plain(),
+        }
+        for name in rates
+    ]
+
+
+def measure_realtime(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
+    """Misses of 10 kHz in real time over every link under every load.
+
+    Raises:
+        UserError: a link is not to be had.
+    """
+    cells = [_Cell(link, load) for link in plan.links for load in plan.loads]
+    with ExitStack() as stack:
+        place = memory_folder(stack)
+        load_is = stack.enter_context(hogs())
+        two = stack.enter_context(pair(plan.policy, place))
+        two.both(pace_here, 0, 1, HYBRID, 1)
+        for number in range(plan.rounds):
+            for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
+                share = (number + k / len(cells)) / plan.rounds
+                tell(f"real time, {cell.link}, {cell.load}", share)
+                with load_is(cell.load):
+                    late = pace_both(two, round(T_S * 1e9), HYBRID, plan.realtime_s)
+                scenario = _scenario(cell.link, "realtime", plan.realtime_s)
+                beside = partial(load_is, cell.load) if cell.load != "idle" else None
+                cell.runs.append(_observe(scenario, place, late, beside))
+    return [_row(cell) for cell in cells]
+
+
+def _observe(
+    scenario: Scenario,
+    place: Path,
+    late: NDArray[np.int64],
+    beside: Callable[[], AbstractContextManager[None]] | None,
+) -> _Run:
+    """One run in real time; ``beside`` begins with its first ticks, not while it starts."""
+    begin = 0
+    with ExitStack() as during:
+
+        def progress(ticks: int, misses: int) -> None:
+            nonlocal begin
+            if ticks and not begin and beside is not None:
+                during.enter_context(beside())
+                begin = ticks + _SETTLE
+
+        timing, scheduling = _run(scenario, place, progress)
+    return _Run(timing, begin, scheduling, late)
+
+
+def _row(cell: _Cell) -> dict[str, Any]:
+    T_ns = round(T_S * 1e9)
+    trips: list[NDArray[np.int64]] = []
+    missed = ticks = host = host_ticks = 0
+    causes, lengths = Counter[str](), Counter[int]()
+    for run in cell.runs:
+        timing = {name: column[run.begin :] for name, column in run.timing.items()}
+        there = timing["plant_received"] >= 0
+        trip = (timing["plant_received"] - timing["plant_sent"])[there]
+        trips.append(trip)
+        gone = missed_ticks(timing)
+        missed += len(gone)
+        ticks += len(there)
+        causes.update(counts(attribute(timing, T_ns)))
+        lengths.update(bursts(gone))
+        allowed = T_ns - (float(np.median(trip)) if len(trip) else 0.0)
+        host += len(lost(run.late, allowed))
+        host_ticks += run.late.shape[1]
+    percent = 100 * missed / ticks if ticks else None
+    host_percent = 100 * host / host_ticks
+    return {
+        "link": cell.link,
+        "mode": "realtime",
+        "load": cell.load,
+        "policy": cell.runs[0].scheduling,
+        "T_s_us": T_S * 1e6,
+        "ticks": ticks,
+        "missed": missed,
+        "missed_pct": None if percent is None else round(percent, 4),
+        "host_pct": round(host_percent, 4),
+        "beyond_host_pct": None if percent is None else round(percent - host_percent, 4),
+        "causes": dict(causes),
+        "bursts": sorted(lengths.items()),
+        **summary(trips),
+    }
+
+
+def _scenario(link: str, mode: str, duration: float) -> Scenario:
+    content = {
+        "title": f"bench, {link}",
+        "duration": duration,
+        "T_s": T_S,
+        "mode": mode,
+        "law": LAW,
+        "link": {"type": link},
+        "late_policy": {"hold": 10**9},  # misses are counted, none ends the run
+    }
+    return check_scenario(content, "bench")
+
+
+def _run(
+    scenario: Scenario, place: Path, progress: Progress = lambda ticks, misses: None
+) -> tuple[Timing, list[str]]:
+    """Run a scenario; its timing and how its sides were scheduled."""
+    folder = place / f"run-{time.monotonic_ns()}"
+    run_scenario(scenario, folder, progress, figures=False)
+    with np.load(folder / "timing.npz") as file:
+        timing = dict(file)
+    log = [json.loads(line) for line in (folder / "events.jsonl").read_text("utf-8").splitlines()]
+    shutil.rmtree(folder)
+    return timing, [f"{e['side']}: {e['policy']}" for e in log if e["event"] == "scheduling"]

@@ -1,0 +1,122 @@
+"""Causes of missed ticks, on timing that is made up with one thing wrong at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gfm_hil.benchmark.attribution import CAUSES, attribute, bursts, counts, missed_ticks
+
+T = 100_000  # ns
+TICKS = 500
+
+
+def good() -> dict[str, np.ndarray]:
+    """Every tick on time: awake 300 ns late, 800 ns of work a side, 15 µs each way."""
+    due = 1_000_000 + T * np.arange(TICKS)
+    heard = due + 300 + 800 + 15_000
+    return {
+        "plant_scheduled": due,
+        "plant_woke": due + 300,
+        "plant_sent": due + 1_100,
+        "plant_received": heard + 800 + 15_000,
+        "plant_stall": np.full(TICKS, 200),
+        "controller_scheduled": due.copy(),
+        "controller_received": heard,
+        "controller_computed": heard + 500,
+        "controller_sent": heard + 800,
+        "controller_stall": np.full(TICKS, 200),
+    }
+
+
+def found(timing: dict[str, np.ndarray], *events: int) -> list[str]:
+    return [CAUSES[k] for k in attribute(timing, T, events)]
+
+
+def test_a_run_without_misses_has_no_causes() -> None:
+    assert found(good()) == []
+    assert counts(attribute(good(), T)) == dict.fromkeys(CAUSES, 0)
+
+
+def test_late_wake_up() -> None:
+    timing = good()
+    timing["plant_woke"][7] += 90_000
+    timing["plant_sent"][7] += 90_000
+    timing["controller_received"][7] += 90_000
+    timing["controller_sent"][7] += 90_000
+    timing["plant_received"][7] = -1
+    assert found(timing) == ["late wake-up"]
+
+
+def test_frame_that_never_came_is_the_links() -> None:
+    timing = good()
+    for name in ("controller_received", "controller_computed", "controller_sent", "plant_received"):
+        timing[name][7] = -1
+    assert found(timing) == ["link"]
+
+
+@pytest.mark.parametrize("side", ["plant", "controller"])
+def test_side_that_stood_still_while_it_looked(side: str) -> None:
+    timing = good()
+    timing[f"{side}_stall"][7] = 85_000
+    if side == "controller":
+        timing["controller_received"][7] += 85_000
+        timing["controller_sent"][7] += 85_000
+    timing["plant_received"][7] = -1
+    assert found(timing) == ["stalled host"]
+
+
+def test_work_that_is_too_long_for_the_tick() -> None:
+    timing = good()
+    timing["controller_sent"][::5] += 95_000  # of every fifth tick: no accident
+    timing["plant_received"][::5] = -1
+    assert found(timing) == ["own work"] * (TICKS // 5)
+
+
+def test_work_that_was_interrupted_is_a_stall() -> None:
+    timing = good()
+    timing["controller_sent"][7] += 95_000
+    timing["plant_received"][7] = -1
+    assert found(timing) == ["stalled host"]
+
+
+def test_event_on_the_tick_is_own_work() -> None:
+    timing = good()
+    timing["plant_woke"][7] += 90_000
+    timing["plant_sent"][7] += 90_000
+    timing["plant_received"][7] = -1
+    assert found(timing, 7) == ["own work"]
+
+
+def test_ticks_that_follow_have_the_cause_of_the_first() -> None:
+    """The controller stands still for three ticks, then works off what has queued."""
+    timing = good()
+    back = timing["plant_scheduled"][7] + 3 * T + 20_000
+    for k in (7, 8, 9, 10):
+        timing["controller_received"][k] = back + 900 * (k - 7)
+        timing["controller_sent"][k] = back + 900 * (k - 7) + 800
+    timing["controller_stall"][7] = 3 * T
+    timing["plant_received"][[7, 8, 9]] = -1
+    assert found(timing) == ["stalled host"] * 3
+
+
+def test_plant_that_is_behind_does_not_blame_its_timer() -> None:
+    timing = good()
+    timing["plant_stall"][7] = 2 * T
+    for k, late in ((8, 190_000), (9, 95_000)):
+        timing["plant_woke"][k] += late
+        timing["plant_sent"][k] += late
+    timing["plant_received"][[7, 8, 9]] = -1
+    assert found(timing) == ["stalled host"] * 3
+
+
+@given(st.sets(st.integers(0, TICKS - 1)))
+def test_every_miss_has_one_cause_and_is_in_one_burst(ticks: set[int]) -> None:
+    timing = good()
+    timing["plant_received"][sorted(ticks)] = -1
+    assert sum(counts(attribute(timing, T)).values()) == len(ticks)
+    lengths = bursts(missed_ticks(timing))
+    assert sum(n * c for n, c in lengths.items()) == len(ticks)
+    assert sum(lengths.values()) == len(ticks - {k + 1 for k in ticks})
