@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gfm_design.encoding import Encoding
 from gfm_design.gains import FreeGain, GainedLaw
 from gfm_design.linear import LinearPlant, hold, linearise_law, linearise_plant
-from gfm_design.operating_point import operating_point
+from gfm_design.operating_point import OperatingPoint, operating_point
 from gfm_design.performance import (
     PAPER_WEIGHTS,
     Channel,
@@ -82,6 +82,11 @@ class PaperProblem:
         return [(m, one - m) for m, one in zip(base, ones, strict=True)]
 
     @property
+    def op(self) -> OperatingPoint:
+        """Where plant and law rest."""
+        return self._rest[0]
+
+    @property
     def linear(self) -> LinearPlant:
         """The plant around its operating point."""
         return self._linear
@@ -123,11 +128,6 @@ class PaperProblem:
             )
         except np.linalg.LinAlgError:
             return point
-
-    def worst_mode(self, values: Vector) -> complex:
-        """The eigenvalue of the loop furthest right, 1/s and rad/s."""
-        poles = np.linalg.eigvals(self.loop(values)[0])
-        return complex(poles[np.argmax(poles.real)])
 
     def channels(self, values: Vector) -> tuple[Channel, ...]:
         """Every channel's norm, guaranteed. Raises ``Unstable``."""

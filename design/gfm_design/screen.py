@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.performance import StateSpace, Weight
+from gfm_design.sizes import Sizes
 
 Vector = NDArray[np.float64]
 
@@ -27,11 +28,8 @@ class Screen:
     def __init__(self, weights: tuple[Weight, ...]) -> None:
         self._rows = [w.i - 1 for w in weights]
         self._columns = [w.j - 1 for w in weights]
-        self._num, self._den = (
-            _stacked([_squared_size(c) for c in side])
-            for side in ([w.num for w in weights], [w.den for w in weights])
-        )
-        self._on_base = self._weight_squared(_BASE)
+        self._sizes = Sizes(weights)
+        self._on_base = self._sizes.squared(_BASE)
 
     def __call__(self, loops: StateSpace) -> tuple[Vector, Vector]:
         """(largest weighted gains, spectral abscissae in 1/s) of loops stacked on axis 0.
@@ -59,25 +57,6 @@ class Screen:
         near = np.abs(values.imag[:, :, None] + _ACROSS * values.real[:, :, None])
         near = near.reshape(len(good), -1)
         gains[good] = np.maximum(
-            largest(_BASE[None, :], self._on_base), largest(near, self._weight_squared(near))
+            largest(_BASE[None, :], self._on_base), largest(near, self._sizes.squared(near))
         )
         return gains, abscissae
-
-    def _weight_squared(self, omega: Vector) -> Vector:
-        powers = (omega * omega)[..., None] ** np.arange(self._num.shape[1])
-        more = (omega * omega)[..., None] ** np.arange(self._den.shape[1])
-        return (powers @ self._num.T) / (more @ self._den.T)
-
-
-def _squared_size(c: tuple[float, ...]) -> Vector:
-    """|c(j omega)|^2 as a polynomial in omega^2, ascending."""
-    ascending = np.asarray(c)[::-1]
-    signs = (-1.0) ** np.arange(len(c))
-    return np.convolve(ascending, ascending * signs)[::2] * signs
-
-
-def _stacked(polynomials: list[Vector]) -> Vector:
-    out = np.zeros((len(polynomials), max(len(p) for p in polynomials)))
-    for row, p in zip(out, polynomials, strict=True):
-        row[: len(p)] = p
-    return out

@@ -5,6 +5,9 @@ stable set has a hard edge. CMA-ES (N. Hansen, "The CMA evolution strategy", 201
 asks for no gradient, so both are no trouble to it; it is what did best among the optimisers tried.
 What it comes to is handed to a polish, if there is one, which follows the active peaks.
 
+With a polish that finds its way from afar, many short runs of CMA-ES find lower minima than a few
+long ones in the same time (``tune_paper``); without one, it is the long runs that count (``tune``).
+
 An unstable point costs more than any stable one, by its spectral abscissa: the search first
 stabilises, then improves.
 """
@@ -28,6 +31,8 @@ UNSTABLE = 1e6  # what an unusable point costs at least
 _STEP = 0.5  # CMA-ES's first step, in the coordinates of ``Encoding``
 _POPULATION = 32
 _SAMPLES = 400  # random points, of which the best is the start of a further run
+_HOPELESS = 6  # runs without a usable point after which no more are begun
+_STABILISE = 4000  # costs that a run may ask for, whatever its budget, before one is usable
 
 
 class Problem(Protocol):
@@ -92,7 +97,7 @@ def tune(
         problem: the cost.
         gains: with starts and bounds.
         seed: of the search.
-        evaluations: how many costs each start may ask for.
+        evaluations: how many costs each start may ask for once one of them is usable.
         starts: searches; the first from the gains' own start, the others from the best of some
             random points within the bounds.
         progress: told the evaluations done and the best cost so far.
@@ -122,9 +127,14 @@ def tune(
         cost = problem(code.values(found))
         if cost < best_cost:
             best, best_cost = found, cost
-    values = code.values(best)
+        if run + 1 == _HOPELESS and best_cost >= UNSTABLE:
+            break
     if best_cost >= UNSTABLE:
-        raise NotStabilised(values, done, best_cost)
+        raise NotStabilised(code.values(best), done, best_cost)
+    last = problem.polish(code, best)
+    if problem(code.values(last)) < best_cost:
+        best, best_cost = last, problem(code.values(last))
+    values = code.values(best)
     return Tuned(values, best_cost, done, time.perf_counter() - begin, seed)
 
 
@@ -150,19 +160,20 @@ def _search(
             "seed": seed,
             "verbose": -9,
             "popsize": _POPULATION,
-            "maxfevals": evaluations,
+            "maxfevals": max(evaluations, _STABILISE),
             "tolfun": 1e-5,
             "bounds": [[*code.low, *[-1.0] * idle], [*code.high, *[1.0] * idle]],
         },
     )
-    best, best_cost = start, np.inf
-    while not search.stop():
+    best, best_cost, usable = start, np.inf, 0
+    while not search.stop() and usable < evaluations:
         asked = search.ask()
         points = np.array(asked)[:, : len(start)]
         costs = problem.many(code.values(points))
         k = int(np.argmin(costs))
         if costs[k] < best_cost:
             best, best_cost = points[k], float(costs[k])
+        usable += len(costs) if best_cost < UNSTABLE else 0
         search.tell(asked, list(costs))
         tell(int(search.result.evaluations), best_cost)
     return best, int(search.result.evaluations)

@@ -7,8 +7,11 @@ import pytest
 
 from gfm_design.encoding import Encoding
 from gfm_design.gains import free_gains
+from gfm_design.league_modes import culprit
 from gfm_design.paper_problem import PaperProblem
-from gfm_design.polish import _peaks, polish
+from gfm_design.peaks import model, peaks
+from gfm_design.performance import StateSpace
+from gfm_design.polish import polish
 from gfm_design.synthesis import UNSTABLE
 from gfm_runtime import law_file
 
@@ -40,7 +43,7 @@ def test_unstable_points_are_ranked_by_their_growth() -> None:
     values[:, [g.name for g in GAINS].index("k_34")] = (50.0, 70.0, 90.0)
     costs = PROBLEM.many(values)
     assert (costs > UNSTABLE).all()
-    assert np.argmax(costs) == np.argmax([PROBLEM.worst_mode(v).real for v in values])
+    assert np.argmax(costs) == np.argmax([culprit(PROBLEM, v).mode.sigma for v in values])
 
 
 def test_slopes_of_peaks_against_differences() -> None:
@@ -50,12 +53,42 @@ def test_slopes_of_peaks_against_differences() -> None:
     def highest(x: np.ndarray) -> float:
         return gamma(code.values(x))
 
-    peak = max(_peaks(lambda x: PROBLEM.loops(code.values(x)), PROBLEM.weights, at))
-    assert peak.height == pytest.approx(highest(at), rel=1e-5)
+    def loops(x: np.ndarray) -> StateSpace:
+        return PROBLEM.loops(code.values(x))
+
+    found = peaks(loops(at), PROBLEM.weights)
+    assert found is not None
+    nearby = model(loops, PROBLEM.weights, at, found)
+    assert found.height[0] == pytest.approx(highest(at), rel=1e-6)
+    assert nearby.base[0] == pytest.approx(1 / highest(at), rel=1e-6)
     for k in range(len(at)):
         e = np.eye(len(at))[k] * h
-        slope = (highest(at + e) - highest(at - e)) / (2 * h)
-        assert peak.slope[k] == pytest.approx(slope, rel=1e-2, abs=1e-2)
+        slope = (1 / highest(at + e) - 1 / highest(at - e)) / (2 * h)
+        assert nearby.slope[0, k] == pytest.approx(slope, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("law", ["mimo-gfm", "vsg-12"])
+def test_curvature_of_peaks(law: str) -> None:
+    """A peak moves along the frequency: its model is held against peaks that are looked for."""
+    gains = free_gains(law_file(law))
+    problem, code = PaperProblem(law_file(law), gains), Encoding(gains)
+
+    def loops(x: np.ndarray) -> StateSpace:
+        return problem.loops(code.values(x))
+
+    at = problem.polish(code, code.start)  # where no peak is alone
+    found = peaks(loops(at), problem.weights)
+    assert found is not None
+    nearby = model(loops, problem.weights, at, found)
+    steepest = np.abs(nearby.slope).max(axis=0)
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        step = 0.01 * random.normal(size=len(at)) / (1 + 10 * steepest)
+        there = peaks(loops(at + step), problem.weights)
+        assert there is not None
+        true = 1 / there.height[0]
+        curved, flat = nearby(step).min(), (nearby.base + nearby.slope @ step).min()
+        assert abs(curved - true) < 0.1 * abs(flat - true) + 1e-8
 
 
 def test_polish_lowers_gamma_within_the_bounds() -> None:

@@ -9,8 +9,10 @@ import pytest
 
 from gfm_design.encoding import Encoding
 from gfm_design.gains import FreeGain, free_gains
+from gfm_design.league_modes import culprit
 from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.synthesis import UNSTABLE, NotStabilised, tune, unstable_cost
+from gfm_design.paper_tune import tune_paper
+from gfm_design.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
 from gfm_runtime import law_file
 
 pytest.importorskip("cma")
@@ -58,34 +60,52 @@ def test_none_to_be_found() -> None:
     assert none.value.values[0] == pytest.approx(10.0, rel=1e-3)
 
 
-def paper(law: str, seed: int, **options: int) -> tuple[float, np.ndarray]:
+def paper(law: str, seed: int = 0, start: dict[str, float] | None = None) -> Tuned:
     file = law_file(law)
-    free = free_gains(file, PAPER_START.get(law))
-    problem = PaperProblem(file, free)
-    found = tune(problem, free, seed, **options)
-    assert all(g.low <= v <= g.high for g, v in zip(free, found.values, strict=True))
-    return max(c.norm for c in problem.channels(found.values)), found.values
+    problem = PaperProblem(file, free_gains(file, start or PAPER_START.get(law)))
+    found = tune_paper(problem, seed)
+    assert all(g.low <= v <= g.high for g, v in zip(problem.gains, found.values, strict=True))
+    assert found.cost == max(c.norm for c in problem.channels(found.values))
+    return found
 
 
-def test_mimo_gfm_from_the_papers_start() -> None:
-    gamma, _ = paper("mimo-gfm", 2, starts=1)
-    assert gamma <= 1.43  # the printed gains: 2.02
+@pytest.mark.parametrize("seed", [0, 1])
+def test_mimo_gfm_from_the_papers_start(seed: int) -> None:
+    """The lower of two families of minima, one with k_pdc near 100, one near 6."""
+    assert paper("mimo-gfm", seed).cost == pytest.approx(1.338, rel=0.005)  # printed gains: 2.02
 
 
 def test_vsg_2_is_no_worse_than_printed() -> None:
-    gamma, values = paper("vsg-2", 0, starts=1)
-    assert gamma <= 15.975
-    assert values == pytest.approx([5.9801, 1.9048], rel=1e-3)  # the printed gains
+    found = paper("vsg-2")
+    assert found.cost <= 15.972806
+    assert found.values == pytest.approx([5.9801, 1.9048], rel=1e-4)  # the printed gains
 
 
 def test_the_same_for_a_seed() -> None:
-    once, again = (paper("vsg-2", 3, starts=2, evaluations=500)[1] for _ in range(2))
-    np.testing.assert_array_equal(once, again)
+    np.testing.assert_array_equal(paper("droop-5", 3).values, paper("droop-5", 3).values)
 
 
 def test_unstable_start_is_stabilised_first() -> None:
-    file = law_file("vsg-2")
-    free = free_gains(file, {"k_34": 50.0})
-    problem = PaperProblem(file, free)
-    assert problem(np.array([g.start for g in free])) > UNSTABLE
-    assert tune(problem, free, starts=1, evaluations=3000).cost < 16.0
+    start = {"k_34": 50.0}
+    problem = PaperProblem(law_file("vsg-2"), free_gains(law_file("vsg-2"), start))
+    assert problem(np.array([g.start for g in problem.gains])) > UNSTABLE
+    assert paper("vsg-2", start=start).cost < 16.0
+
+
+def test_gains_that_move_the_operating_point() -> None:
+    """E_u of droop-4 rests where k_34 puts it: gamma is that of the loop at rest there."""
+    found = paper("droop-4")
+    file = law_file("droop-4")
+    named = dict(zip([g.name for g in free_gains(file)], found.values.tolist(), strict=True))
+    own = PaperProblem(file, free_gains(file, named))
+    assert max(c.norm for c in own.channels(found.values)) == pytest.approx(found.cost, rel=1e-9)
+
+
+def test_the_reason_when_there_are_none() -> None:
+    file = law_file("psc-1")
+    problem = PaperProblem(file, free_gains(file))
+    with pytest.raises(NotStabilised, match="no stabilising gains") as none:
+        tune_paper(problem)
+    words = culprit(problem, none.value.values).words()
+    assert "mode at 50.7" in words
+    assert "i_o" in words  # of the grid's current

@@ -7,15 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gfm_design.full_order import Missing, full_order
 from gfm_design.gains import free_gains
-from gfm_design.hinf import Unstable
+from gfm_design.league_modes import culprit
 from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.synthesis import NotStabilised, Tuned, tune
+from gfm_design.paper_tune import EVALUATIONS, starts_for, tune_paper
+from gfm_design.synthesis import NotStabilised, Tuned
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
@@ -35,8 +35,12 @@ def add(kinds: Any) -> None:
     command = kinds.add_parser("tune", help="choose the free gains for the least gamma")
     add_law_options(command)
     command.add_argument("--seed", type=int, default=0, help="of the search")
-    command.add_argument("--evaluations", type=int, default=12000, help="of each start")
-    command.add_argument("--starts", type=int, default=2, help="the given start and random ones")
+    command.add_argument(
+        "--evaluations", type=int, default=EVALUATIONS, help="of each start, before its polish"
+    )
+    command.add_argument(
+        "--starts", type=int, help="the given start and random ones; 2, and 2 more a gain, if left"
+    )
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
     command.add_argument("--full-order", action="store_true", help="a bound from below besides")
     command.add_argument("--out", help="write the tuned law to this file")
@@ -48,7 +52,7 @@ def add(kinds: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Tune a law's free gains; exit code 3 if no stabilising ones are found."""
     for name in ("evaluations", "starts"):
-        if getattr(options, name) < 1:
+        if getattr(options, name) is not None and getattr(options, name) < 1:
             raise UserError(f"--{name} {getattr(options, name)}: must be at least 1")
     if options.seed < 0:
         raise UserError(f"--seed {options.seed}: must not be negative")
@@ -64,8 +68,10 @@ def call(options: argparse.Namespace) -> int:
     try:
         found = _searched(problem, options)
     except NotStabilised as none:
-        mode = problem.worst_mode(none.values)
-        reason = f"{none}; in the way: the mode at {abs(mode.imag) / (2 * np.pi):.4g} Hz"
+        reason = (
+            f"{none}; in the way, on the paper's converter at P_ref = {problem.references[1]:g}: "
+            f"{culprit(problem, none.values).words()}"
+        )
         if options.json:
             print(json.dumps({"law": file.name, "gamma": None, "reason": reason}))
         else:
@@ -73,12 +79,7 @@ def call(options: argparse.Namespace) -> int:
         return EXIT_OTHERWISE
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
-    named = problem.law.named(found.values)
-    problem.move_to(named)
-    try:
-        channels = problem.channels(found.values)
-    except Unstable as lost:
-        raise UserError(f"{file.name}: at the operating point of the tuned gains {lost}") from None
+    named, channels = problem.law.named(found.values), problem.channels(found.values)
     result = {
         "law": file.name,
         **channels_as_json(channels),
@@ -114,14 +115,14 @@ def _searched(problem: PaperProblem, options: argparse.Namespace) -> Tuned:
         console=Console(stderr=True, quiet=options.quiet),
         transient=True,
     ) as bar:
-        total = options.evaluations * options.starts
+        starts = options.starts or starts_for(len(problem.gains))
+        total = options.evaluations * starts
         task = bar.add_task(f"tuning {problem.file.name}", total=total, best="–")
-        return tune(
+        return tune_paper(
             problem,
-            problem.gains,
             options.seed,
             options.evaluations,
-            options.starts,
+            starts,
             lambda done, best: bar.update(task, completed=done, best=f"{best:.4g}"),
         )
 
