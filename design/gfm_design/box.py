@@ -13,6 +13,8 @@ from gfm_plant import Plant
 
 Matrix = NDArray[np.float64]
 
+Source = Literal["controlled", "regulated"]
+
 T_S = 1e-4  # s
 SENSORS_HZ = 300.0
 
@@ -33,7 +35,7 @@ class Point:
     L_g: float = 1.0
     delay: float = 1.0
     P_ref: float = 0.5
-    dc: Literal["controlled", "regulated"] = "controlled"
+    dc: Source = "controlled"
 
     def plant(self) -> Plant:
         """Options of this plant, its sensors included."""
@@ -67,7 +69,7 @@ class Box:
     L_g: tuple[float, ...] = (0.8, 3.0, 10.0, 20.0)
     delay: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0, 5.0)
     P_ref: tuple[float, ...] = (0.0, 0.5, 1.0)
-    dc: tuple[Literal["controlled", "regulated"], ...] = ("controlled", "regulated")
+    dc: tuple[Source, ...] = ("controlled", "regulated")
 
     def corners(self) -> list[Point]:
         """Every combination."""

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.box import Box, Point
+from gfm_design.box import Box, Point, Source
 from gfm_design.gains import FreeGain
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.robust import Loops, RobustProblem, Wanted
+from gfm_design.robust import Loops, RobustProblem, Wanted, paper_problem
 from gfm_design.synthesis import tune
 from gfm_runtime.lawfile import LawFile
 
@@ -29,12 +28,18 @@ LATE = (7.0, 9.0, 11.0)  # samples: the delays at which the nominal loop must ho
 
 @dataclass(frozen=True)
 class Round:
-    """What the search stands at after a round: gains, gamma, and the worst over the whole box."""
+    """What the search stands at after a round: gains, gamma, and the worst over the whole box.
+
+    ``slow`` [1/s] and ``beyond`` (a part of the step) are by how much sigma and the overshoot
+    break what is wanted, at worst; negative if all hold.
+    """
 
     values: Vector
     gamma: float
     sigma: float
     overshoot: float
+    slow: float
+    beyond: float
     points: int
     seconds: float
 
@@ -52,6 +57,7 @@ def deploy(
     seed: int = 0,
     rounds: int = 6,
     evaluations: int = 3000,
+    starts: int = 2,
     tell: Callable[[Round], None] = lambda found: None,
 ) -> Round:
     """The last round's gains; the same for a seed.
@@ -61,7 +67,7 @@ def deploy(
         box: what to hold in.
         wanted: the constraints.
         seed: of the search.
-        rounds, evaluations: how often, and how long each time.
+        rounds, evaluations, starts: how often, and as for ``tune`` each time.
         tell: told of every round.
     """
     begin = time.perf_counter()
@@ -70,24 +76,31 @@ def deploy(
     extremes = [p for p in corners if _is_extreme(p, box)]
     points = [*extremes, *corners[len(box.corners()) :]]
     over = [p for p in stepped if p.R_f == p.R_g and p.R_f >= 1.0 and p.delay == max(box.delay)]
+    over = over or stepped  # a box without such resistances
     everywhere, every_step = Loops(file, gains, corners), Loops(file, gains, stepped)
     allowed = np.array([wanted.sigma(p) for p in corners])
     limits = np.array([wanted.overshoot(p) for p in stepped])
     for k in range(rounds):
-        paper = PaperProblem(file, tuple(gains))
-        found = tune(RobustProblem(paper, points, over, wanted), gains, seed + k, evaluations)
+        # a law for the rig alone is tuned for the paper's problem on the rig
+        source: Source = "controlled" if "controlled" in box.dc else "regulated"
+        paper = paper_problem(file, gains, source)
+        found = tune(
+            RobustProblem(paper, points, over, wanted), gains, seed + k, evaluations, starts
+        )
         sigma, beyond = everywhere.sigma(found.values), every_step.overshoot(found.values)
+        joining = _worst(corners, sigma - allowed, points, _JOIN)
+        joining_steps = _worst(stepped, beyond - limits, over, _JOIN_STEPS)
         now = Round(
             found.values,
             paper(found.values),
             float(sigma.max()),
             float(beyond.max()),
+            float((sigma - allowed).max()),
+            float((beyond - limits).max()),
             len(points),
             time.perf_counter() - begin,
         )
         tell(now)
-        joining = _worst(corners, sigma - allowed, points, _JOIN)
-        joining_steps = _worst(stepped, beyond - limits, over, _JOIN_STEPS)
         if not joining and not joining_steps:
             break
         points, over = points + joining, over + joining_steps

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.box import T_S, Point
+from gfm_design.box import T_S, Point, Source
 from gfm_design.encoding import Encoding
 from gfm_design.gains import FreeGain, GainedLaw
 from gfm_design.operating_point import operating_point
@@ -40,26 +40,31 @@ class Wanted:
         gamma: no gain in gamma below this is worth a broken constraint.
         alpha: every mode decays at least so fast, 1/s.
         strong, weak: overshoot of p as a part of a step of P_ref, up to and beyond L_g x 3.
-        rig_alpha: as alpha, where the DC source regulates itself.
-        rig_weight: cost of the rig's largest overshoot by a whole step; it has no limit.
+        rig_alpha: as alpha, where the DC source regulates itself; None: alpha and the limits of
+            the overshoot hold there too.
+        rig_weight: with a rig_alpha, the cost of the rig's largest overshoot by a whole step.
     """
 
     gamma: float = 1.49
     alpha: float = 1.1
     strong: float = 0.025
     weak: float = 0.15
-    rig_alpha: float = 0.2
+    rig_alpha: float | None = 0.2
     rig_weight: float = 3.0
 
     def sigma(self, point: Point) -> float:
         """Largest sigma allowed at a point, 1/s."""
-        return -self.alpha if point.dc == "controlled" else -self.rig_alpha
+        return -self.alpha if self.rig_alpha is None or not _is_rig(point) else -self.rig_alpha
 
     def overshoot(self, point: Point) -> float:
-        """Largest overshoot allowed at a point; inf for a rig, which is weighed instead."""
-        if point.dc == "regulated":
+        """Largest overshoot allowed at a point; inf where it is weighed instead."""
+        if self.rig_alpha is not None and _is_rig(point):
             return np.inf
         return self.strong if point.L_g <= _SHORT else self.weak
+
+
+def _is_rig(point: Point) -> bool:
+    return point.dc == "regulated"
 
 
 class Loops:
@@ -89,6 +94,12 @@ class Loops:
         for stack in self._stacks:
             out[stack.members] = overshoot(stack, *stack.loops(laws[stack.controlled]))
         return out
+
+
+def paper_problem(file: LawFile, gains: Sequence[FreeGain], dc: Source) -> PaperProblem:
+    """The paper's problem with a DC source: with the rig's own, row 1 of the law is not in it."""
+    plant = Plant.model_validate({"dc_source": {"mode": dc}})
+    return PaperProblem(file, tuple(gains), plant)
 
 
 class RobustProblem:

@@ -35,11 +35,14 @@ class Stepped:
         point: the plant.
         ended: why the run ended early, or "".
         overshoot: of p beyond where it settles, as a part of the step; NaN after an early end.
+        ripple: how far p still swings beyond that at the end, where only the rounding of the
+            boards and the noise move it; a part of the step. The overshoot contains it.
     """
 
     point: Point
     ended: str
     overshoot: float
+    ripple: float
 
 
 def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
@@ -75,7 +78,9 @@ def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
         if bench.st["trip"][0] or c.ctl["state"][0] == SAFE:
             tripped = bool(bench.st["trip"][0])
             why = trip_reason(bench.st, bench.par) if tripped else safe_reason(c.ctl)
-            return Stepped(point, f"{why} at {done * T_S:.3f} s", np.nan)
+            return Stepped(point, f"{why} at {done * T_S:.3f} s", np.nan, np.nan)
     p = signals[_BEFORE:, _P]
-    settled = float(p[-_AFTER // 10 :].mean())
-    return Stepped(point, "", float((p.max() - settled) / (STEP[1] - STEP[0])))
+    rest, step = p[-_AFTER // 10 :], STEP[1] - STEP[0]
+    settled = rest.mean()
+    overshoot, ripple = (float((v - settled) / step) for v in (p.max(), rest.max()))
+    return Stepped(point, "", overshoot, ripple)

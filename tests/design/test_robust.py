@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gfm_design.box import T_S, Box, Point
+from gfm_design.deployable import Round, deploy, steps
 from gfm_design.gains import FreeGain, free_gains
 from gfm_design.linear import linearise_law, linearise_plant, sampled_loop
 from gfm_design.operating_point import operating_point
 from gfm_design.paper_problem import PaperProblem
-from gfm_design.robust import Loops, RobustProblem, Wanted
+from gfm_design.robust import Loops, RobustProblem, Wanted, paper_problem
 from gfm_design.synthesis import UNSTABLE
 from gfm_hil.box_bench import step_run
 from gfm_hil.cli.design.box import delay_margin
@@ -19,6 +22,8 @@ from gfm_runtime import discretise, get_law, law_file
 
 LAW = "mimo-gfm-deployable"
 CONTROLLED, RIG = Box(dc=("controlled",)), Box(dc=("regulated",))
+RIG_LAW = "mimo-gfm-deployable-rig"
+THIRD = (0.33, 1.0, 3.0)  # resistances that it is tuned for
 
 
 def gains(law: str = LAW) -> tuple[FreeGain, ...]:
@@ -101,6 +106,31 @@ def test_random_points_decay() -> None:
     assert sigma(RIG.random(100, seed=12)).max() < 0.0
 
 
+def test_the_rigs_law_holds_beside_its_source() -> None:
+    box = replace(RIG, R_f=THIRD, R_g=THIRD)
+    assert sigma(box.corners(), RIG_LAW).max() <= -1.0
+    assert sigma(box.random(100, seed=13), RIG_LAW).max() <= -1.0
+    stepped = steps(box)
+    beyond = Loops(law_file(RIG_LAW), gains(RIG_LAW), stepped).overshoot(start(RIG_LAW))
+    assert max(o for p, o in zip(stepped, beyond, strict=True) if p.L_g <= 3.0) <= 0.05
+    assert beyond.max() <= 0.20
+    assert delay_margin(RIG_LAW, "regulated") >= 1e-3
+    # what is given for it: gamma, and chokes of a tenth of their resistance
+    rig = paper_problem(law_file(RIG_LAW), gains(RIG_LAW), "regulated")
+    assert 1.5 < max(c.norm for c in rig.channels(start(RIG_LAW))) <= 3.6
+    assert sigma(RIG.corners(), RIG_LAW).max() > 0.0
+
+
+def test_the_rigs_problem_is_that_of_row_1_in_its_source() -> None:
+    """With a PI alone in row 1, what the source does is what the law would have it do."""
+    only_pi = {"k_pdc": 90.0, "k_idc": 400.0, "k_12": 0.0, "k_14": 0.0, "k_15": 0.0}
+    file = law_file("mimo-gfm")
+    named = free_gains(file, only_pi)
+    values = np.array([g.start for g in named])
+    own, rig = (paper_problem(file, named, dc).channels(values) for dc in CONTROLLED.dc + RIG.dc)
+    assert [c.norm for c in own] == pytest.approx([c.norm for c in rig], rel=1e-4)
+
+
 def test_printed_gains_do_not_hold() -> None:
     assert sigma(CONTROLLED.corners(), "mimo-gfm").max() > 100.0
 
@@ -119,8 +149,36 @@ def test_nonlinear_step(point: Point, limit: float) -> None:
     assert found.overshoot <= limit
 
 
+@pytest.mark.parametrize(
+    ("point", "limit"),
+    [
+        (Point(1.0, 1.0, 0.8, 5.0, dc="regulated"), 0.05),
+        (Point(3.0, 1.0, 3.0, 1.0, dc="regulated"), 0.05),
+        (Point(0.33, 0.33, 20.0, 1.0, dc="regulated"), 0.20),
+    ],
+)
+def test_nonlinear_step_beside_the_rigs_source(point: Point, limit: float) -> None:
+    found = step_run(point, RIG_LAW)
+    assert found.ended == ""
+    assert 0.0 < found.ripple < found.overshoot <= limit
+    assert step_run(point, LAW).overshoot > 0.2  # the law for the other source
+
+
 def test_nonlinear_bench_tells_a_trip() -> None:
     assert "over" in step_run(Point(0.1, 0.1, 0.8, 5.0), "mimo-gfm").ended
+
+
+def test_search_tells_what_breaks_and_demands_all_of_the_rig_alone() -> None:
+    box = Box((1.0,), (1.0,), (0.8, 20.0), (1.0, 5.0), (0.5,), ("regulated",))
+    rows_2_3 = free_gains(law_file(RIG_LAW), only=["k_21", "k_22", "k_31"])
+    hard = Wanted(gamma=np.inf, alpha=30.0, rig_alpha=None)
+    told: list[Round] = []
+    found = deploy(law_file(RIG_LAW), rows_2_3, box, hard, 1, 2, 64, 1, told.append)
+    assert told[-1] is found
+    assert found.slow == pytest.approx(found.sigma + 30.0) and found.slow > 0.0
+    assert found.beyond >= found.overshoot - hard.weak
+    assert hard.overshoot(Point(dc="regulated")) == hard.strong
+    assert np.isinf(Wanted().overshoot(Point(dc="regulated")))
 
 
 def test_cost_is_gamma_where_all_holds() -> None:

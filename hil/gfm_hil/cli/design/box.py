@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -13,28 +13,27 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from gfm_design.box import T_S, Box, Point
-from gfm_design.delays import overall_delay
+from gfm_design.box import T_S, Box, Point, Source
+from gfm_design.delays import longest, overall_delay
 from gfm_design.gains import free_gains
 from gfm_design.hinf import Unstable
-from gfm_design.linear import linearise_law, linearise_plant
+from gfm_design.linear import Mode, linearise_law, linearise_plant, loop_modes
 from gfm_design.operating_point import operating_point
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.robust import Loops
+from gfm_design.robust import Loops, paper_problem
 from gfm_design.sampled import SampledLoop
-from gfm_hil.box_bench import step_run
+from gfm_hil.box_bench import STEP, step_run
+from gfm_hil.cli.design.box_options import add_box, read_box
 from gfm_hil.cli.design.common import channels_as_json
 from gfm_plant import make_plant
 from gfm_runtime import discretise, law_file, load_law
 from gfm_runtime.lawfile import LawFile
-
-_NOMINAL = Point()
 
 
 def add(kinds: Any) -> None:
     """Add the command to the parser."""
     command = kinds.add_parser("box", help="whether a law holds in the box of real loops")
     command.add_argument("--law", required=True, help="catalogue name or law file")
+    add_box(command)
     command.add_argument("--random", type=int, default=1000, help="points inside, of either source")
     command.add_argument("--seed", type=int, default=0, help="of those points")
     command.add_argument("--bench", action="store_true", help="step P_ref on the nonlinear bench")
@@ -44,23 +43,26 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Report gamma, the delay margin, and the worst point of each kind."""
-    file = law_file(options.law)
+    file, whole = law_file(options.law), read_box(options.box)
     rows: list[dict[str, Any]] = []
-    for dc in Box().dc:
-        box = Box(dc=(dc,))
+    for dc in dict.fromkeys(whole.dc):
+        box = replace(whole, dc=(dc,))
         for where, points in (
             ("corners", box.corners()),
             ("random", box.random(options.random, options.seed)),
         ):
             sigma = _loops(file, points).sigma(_values(file))
             k = int(np.argmax(sigma))
-            rows.append(_row(dc, f"sigma, {where} [1/s]", len(points), sigma[k], points[k]))
+            row = _row(dc, f"sigma, {where} [1/s]", len(points), sigma[k], points[k])
+            rows.append(row | {"mode_hz": _slowest(options.law, points[k]).frequency_hz})
+        gamma = _gamma(file, dc)
+        rows.append(_row(dc, "gamma beside this source", 1, gamma["gamma"], Point(dc=dc)))
+        rows.append(_row(dc, "delay margin [s]", 1, delay_margin(options.law, dc), Point(dc=dc)))
         if options.bench:
             rows += _bench(options.law, box, options.json)
     result = {
         "law": file.name,
-        **_gamma(file),
-        "delay_margin_s": delay_margin(options.law),
+        **_gamma(file, "controlled"),
         "box": rows,
     }
     if options.json:
@@ -70,16 +72,35 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def delay_margin(law: str) -> float:
-    """What may be added to the nominal loop's one sample of delay, s; 0 if it does not hold."""
-    par, _ = make_plant(_NOMINAL.plant(), T_S)
+def delay_margin(law: str, dc: Source = "controlled") -> float:
+    """What may be added to the nominal loop's one sample of delay, s.
+
+    0 if it does not hold, inf if no loss is found (``gfm_design.delays``).
+    """
+    point = Point(dc=dc)
+    par, _ = make_plant(point.plant(), T_S)
     discrete = discretise(load_law(law).laws[0], T_S)
-    op = operating_point(par, discrete, _NOMINAL.references())
-    linear = linearise_law(discrete.law, discrete, op, _NOMINAL.references(), True)
-    loop = SampledLoop(linearise_plant(par, op), linear, T_S, _NOMINAL.delay * T_S)
+    op = operating_point(par, discrete, point.references())
+    linear = linearise_law(discrete.law, discrete, op, point.references(), dc == "controlled")
+    loop = SampledLoop(linearise_plant(par, op), linear, T_S, point.delay * T_S)
     if np.abs(np.linalg.eigvals(loop.closed())).max() >= 1.0:
         return 0.0
     return overall_delay(loop).seconds
+
+
+def margin_text(seconds: float) -> str:
+    """A delay margin for a reader."""
+    if np.isinf(seconds):
+        return f"> {1e3 * longest(T_S):g} ms"
+    return f"{1e3 * seconds:.2f} ms"
+
+
+def _slowest(law: str, point: Point) -> Mode:
+    """The mode of a point's sampled loop with the largest sigma."""
+    par, _ = make_plant(point.plant(), T_S)
+    discrete = discretise(load_law(law).laws[0], T_S)
+    op = operating_point(par, discrete, point.references())
+    return loop_modes(par, discrete, op, point.references())[0]
 
 
 def _values(file: LawFile) -> Any:
@@ -90,16 +111,17 @@ def _loops(file: LawFile, points: Sequence[Point]) -> Loops:
     return Loops(file, free_gains(file), points)
 
 
-def _gamma(file: LawFile) -> dict[str, Any]:
+def _gamma(file: LawFile, dc: Source) -> dict[str, Any]:
     try:
-        return channels_as_json(PaperProblem(file, free_gains(file)).channels(_values(file)))
+        problem = paper_problem(file, free_gains(file), dc)
+        return channels_as_json(problem.channels(_values(file)))
     except Unstable as problem:
         return {"gamma": None, "reason": str(problem)}
 
 
 def _bench(law: str, box: Box, quiet: bool) -> list[dict[str, Any]]:
     """Worst overshoot of each L_g on the nonlinear bench, and how many runs ended early."""
-    points = [p for p in box.corners() if p.P_ref == 0.5]
+    points = replace(box, P_ref=(STEP[0],)).corners()
     console = Console(stderr=True, quiet=quiet)
     runs = [step_run(p, law) for p in track(points, "P_ref steps", console=console, transient=True)]
     rows = []
@@ -109,26 +131,32 @@ def _bench(law: str, box: Box, quiet: bool) -> list[dict[str, Any]]:
         name = f"bench overshoot, L_g x {L_g:g}"
         if ended:
             text = f"{name}: {len(ended)} tripped, e.g. {ended[0].ended}"
-            rows.append(_row(box.dc[0], text, len(some), np.nan, ended[0].point))
+            rows.append(_row(box.dc[0], text, len(some), None, ended[0].point))
         else:
             worst = max(some, key=lambda r: r.overshoot)
-            rows.append(_row(box.dc[0], name, len(some), worst.overshoot, worst.point))
+            row = _row(box.dc[0], name, len(some), worst.overshoot, worst.point)
+            rows.append(row | {"ripple": worst.ripple})
     return rows
 
 
-def _row(dc: str, what: str, count: int, worst: float, at: Point) -> dict[str, Any]:
-    return {"dc": dc, "what": what, "points": count, "worst": float(worst), "at": asdict(at)}
+def _row(dc: str, what: str, count: int, worst: float | None, at: Point) -> dict[str, Any]:
+    number = None if worst is None or not np.isfinite(worst) else float(worst)
+    return {"dc": dc, "what": what, "points": count, "worst": number, "at": asdict(at)}
 
 
 def _print(result: dict[str, Any]) -> None:
     console = Console(highlight=False)
     gamma = "none" if result["gamma"] is None else f"{result['gamma']:.4f}"
-    margin = 1e3 * result["delay_margin_s"]
-    console.print(f"[bold]{result['law']}[/]: γ = {gamma}, delay margin {margin:.2f} ms")
+    console.print(f"[bold]{result['law']}[/]: γ = {gamma} of the paper's problem")
     table = Table("DC source", "what", "points", "worst", "at", box=None, pad_edge=False)
     for row in result["box"]:
         what = row["what"].replace("[", "\\[")
-        table.add_row(row["dc"], what, str(row["points"]), f"{row['worst']:.4g}", _at(row["at"]))
+        worst = "–" if row["worst"] is None else f"{row['worst']:.4g}"
+        if "mode_hz" in row:
+            worst += f" ({row['mode_hz']:.3g} Hz)"
+        if "ripple" in row:
+            worst += f" (ripple {row['ripple']:.2g})"
+        table.add_row(row["dc"], what, str(row["points"]), worst, _at(row["at"]))
     console.print(table)
 
 

@@ -26,7 +26,7 @@ def add_law_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="as JSON")
 
 
-def read_gains(text: str | None) -> dict[str, float]:
+def read_gains(text: str | None, option: str = "--gains") -> dict[str, float]:
     """``k_22=5,k_34=1`` as a dict.
 
     Raises:
@@ -40,9 +40,9 @@ def read_gains(text: str | None) -> dict[str, float]:
         except ValueError:
             number = np.nan
         if not name or not np.isfinite(number):
-            raise UserError(f"--gains {entry!r}: must be NAME=NUMBER, e.g. k_22=5.98")
+            raise UserError(f"{option} {entry!r}: must be NAME=NUMBER, e.g. k_22=5.98")
         if name in found:
-            raise UserError(f"--gains: {name} is given twice")
+            raise UserError(f"{option}: {name} is given twice")
         found[name] = number
     return found
 

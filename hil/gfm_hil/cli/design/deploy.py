@@ -7,16 +7,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
-from gfm_design.box import Box
+from gfm_design.box import Box, Source
 from gfm_design.deployable import Round, deploy
 from gfm_design.gains import free_gains, tied
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.robust import Wanted
+from gfm_design.robust import Wanted, paper_problem
 from gfm_design.synthesis import NotStabilised
-from gfm_hil.cli.design.box import delay_margin
+from gfm_hil.cli.design.box import delay_margin, margin_text
+from gfm_hil.cli.design.box_options import add_box, read_box, wanted
 from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
 from gfm_hil.errors import UserError
 from gfm_hil.toml_out import toml_text
@@ -28,6 +27,9 @@ def add(kinds: Any) -> None:
     """Add the command to the parser."""
     command = kinds.add_parser("deploy", help="choose the free gains to hold in the box")
     add_law_options(command)
+    add_box(command)
+    command.add_argument("--want", help="k=v,…: other demands, e.g. alpha=1.5,strong=0.04")
+    command.add_argument("--only", help="free gains to move, separated by commas; all by default")
     command.add_argument("--seed", type=int, default=0, help="of the search")
     command.add_argument("--rounds", type=int, default=6, help="how often corners may join")
     command.add_argument("--evaluations", type=int, default=2500, help="of each round")
@@ -38,7 +40,10 @@ def add(kinds: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Tune a law for the box; exit code 3 if no stabilising gains are found."""
     file = law_file(options.law)
-    gains = free_gains(file, read_gains(options.gains))
+    only = options.only.split(",") if options.only else None
+    gains = free_gains(file, read_gains(options.gains), only)
+    box = read_box(options.box)
+    demands = wanted(read_gains(options.want, "--want"), box)
     console = Console(stderr=True, highlight=False)
 
     def tell(found: Round) -> None:
@@ -49,29 +54,47 @@ def call(options: argparse.Namespace) -> int:
 
     try:
         found = deploy(
-            file, gains, Box(), Wanted(), options.seed, options.rounds, options.evaluations, tell
+            file, gains, box, demands, options.seed, options.rounds, options.evaluations, tell=tell
         )
     except NotStabilised as none:
         console.print(f"{file.name}: {none}")
         return 3
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
-    channels = PaperProblem(file, gains).channels(found.values)
+    source: Source = "controlled" if "controlled" in box.dc else "regulated"
+    channels = paper_problem(file, gains, source).channels(found.values)
     # seven digits: what the search resolves, and what a reader can compare
     values = [float(f"{v:.7g}") for v in found.values]
     named = tied(file, dict(zip([g.name for g in gains], values, strict=True)))
     result = channels_as_json(channels) | {"seed": options.seed, "seconds": found.seconds}
-    _write(Path(options.out), file, named, result)
+    _write(Path(options.out), file, named, result | {"source": source}, box, demands)
     print_channels(Path(options.out).stem, channels)
     return 0
 
 
-def _write(path: Path, file: LawFile, gains: dict[str, float], result: dict[str, Any]) -> None:
+def _demands(demands: Wanted) -> dict[str, float]:
+    """Those that count: beside one source alone nothing is relaxed."""
+    both = demands.rig_alpha is not None
+    return {k: v for k, v in asdict(demands).items() if both or not k.startswith("rig_")}
+
+
+def _beside(box: Box) -> str:
+    return "" if len(set(box.dc)) > 1 else f", DC source {box.dc[0]}"
+
+
+def _write(
+    path: Path,
+    file: LawFile,
+    gains: dict[str, float],
+    result: dict[str, Any],
+    box: Box,
+    demands: Wanted,
+) -> None:
     """The law file and, as comments, what its gains were tuned for."""
     content = file.model_dump(mode="json", exclude_none=True)
     content |= {
         "name": path.stem,
-        "title": "the paper's MIMO-GFM, gains that hold in the real loop",
+        "title": f"the paper's MIMO-GFM, gains that hold in the real loop{_beside(box)}",
         "source": "Eq. (36); gains by gfmhil design deploy, see the comments of the file\n",
     }
     for name, value in gains.items():
@@ -79,19 +102,22 @@ def _write(path: Path, file: LawFile, gains: dict[str, float], result: dict[str,
             "value": value,
             "source": f"gfmhil design deploy, seed {result['seed']}",
         }
-    box = {n: list(np.unique(v)) for n, v in asdict(Box()).items()}
     notes = [
-        f"gamma = {result['gamma']:.4f} of the paper's problem (Section III-B), P_ref = 0.5:",
+        f"gamma = {result['gamma']:.4f} of the paper's problem (Section III-B), P_ref = 0.5, "
+        f"DC source {result['source']}:",
         "  " + ", ".join(f"W_{c['i']}{c['j']} {c['norm']:.4f}" for c in result["channels"]),
         f"seed {result['seed']}, {result['seconds']:.0f} s, started from {file.name}",
-        "asked: " + ", ".join(f"{k} {v:g}" for k, v in asdict(Wanted()).items()),
+        "asked: " + ", ".join(f"{k} {v:g}" for k, v in _demands(demands).items()),
         "the box, sensors of 300 Hz, T_s = 100 us, delay in samples:",
-        *(f"  {name} {' '.join(map(str, values))}" for name, values in box.items()),
+        *(f"  {name} {' '.join(map(str, values))}" for name, values in asdict(box).items()),
     ]
     text = "".join(f"# {line}\n" for line in notes) + "\n" + toml_text(content)
     try:
         path.write_text(text, encoding="utf-8")
-        margin = delay_margin(str(path))
-        path.write_text(f"# delay margin {1e3 * margin:.2f} ms at nominal\n{text}", "utf-8")
+        margins = ", ".join(
+            f"{margin_text(delay_margin(str(path), dc))} (DC source {dc})"
+            for dc in dict.fromkeys(box.dc)
+        )
+        path.write_text(f"# delay margin at nominal {margins}\n{text}", "utf-8")
     except OSError as problem:
         raise UserError(f"--out {path}: {problem.strerror}") from None
