@@ -26,6 +26,7 @@ AS_SHIPPED = {
 #: laws without a row, and why
 LEFT_OUT = {
     "mimo-gfm-scheduled": "on the paper's grid its first stage is in force, which is mimo-gfm",
+    "mimo-gfm-deployable-rig": "beside a source that regulates itself; its row 1 is the paper's",
 }
 
 Row = dict[str, Any]
