@@ -53,8 +53,11 @@ class _Loop:
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         w, r, c = self.writer, self.reader, bench.controller
         records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
+        receive, spins = port.receive, port.spins
+        if scenario.mode == "lockstep" and port.patient is not None:
+            receive, spins = port.patient, _FAR  # it sleeps by itself
         self._arguments: tuple[Any, ...] = (
-            port.send, port.receive, port.handle, port.spins, (w.sequence, w.frame, w.message),
+            port.send, receive, port.handle, spins, (w.sequence, w.frame, w.message),
             (r.frame, r.message), r.record, self.loop, stop, *records, bench.y, bench.u,
             part.signals, part.times, part.progress,
         )  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.codec import pack, unpack
-from gfm_hil.loops.clock import between_looks, now_ns, wait_until
+from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until, wait_until
 from gfm_hil.loops.records import DONE, LATE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, STOPPED_HERE
 from gfm_hil.recording import record_plant
 from gfm_plant import plant_advance, plant_sample
@@ -17,6 +17,7 @@ from gfm_runtime.signals import NU
 
 _U_ID = 2
 FRESH, OVERDUE, LEAVING = range(3)
+_REST_NS = 8_000
 _CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
 
 
@@ -46,7 +47,9 @@ def plant_ticks(
         k = r.tick
         due = r.t0 + k * r.T
         gap = 0
+        rested = True
         if r.realtime:
+            rested = due - now_ns() > AHEAD_NS
             gap = wait_until(due, spins)
             times[k, 0], times[k, 1] = due, now_ns()
         plant_sample(par, st, y)
@@ -54,6 +57,8 @@ def plant_ticks(
         send(handle, message)
         sent = now_ns()
         times[k, 2] = sent
+        if not rested:  # or the kernel would have the whole loop rest, for 50 ms
+            sleep_until(sent + _REST_NS)
         until = due + r.T if r.realtime else sent + r.patience
         again = sent + (r.patience if r.realtime else r.repeat)
         while True:
