@@ -21,9 +21,10 @@ from gfm_design.hinf import Unstable
 from gfm_design.league_modes import Culprit, culprit
 from gfm_design.linear import Mode
 from gfm_design.paper_problem import PAPER_START, REFERENCES, PaperProblem
+from gfm_design.paper_tune import tune_paper
 from gfm_design.performance import PAPER_WEIGHTS, Channel
 from gfm_design.sampled import SampledLoop
-from gfm_design.synthesis import NotStabilised, tune
+from gfm_design.synthesis import NotStabilised
 from gfm_design.tolerance import Range, element_range, mode_of
 from gfm_plant import Plant
 from gfm_runtime.discretise import discretise
@@ -108,14 +109,14 @@ def search(
     free = tuple(g.name for g in problem.gains)
     began = time.perf_counter()
     try:
-        found = tune(problem, problem.gains, seed, evaluations, starts, progress)
+        found = tune_paper(problem, seed, evaluations, starts, progress)
     except NotStabilised as none:
         seconds = time.perf_counter() - began
         return Found(free, before, None, culprit(problem, none.values), False, 0, seconds)
     values, spent, fixed = found.values, found.evaluations, False
     if _by_droop(problem.channels(values)):
         others = PaperProblem(file, problem.gains, weights=_WITHOUT_DROOP)
-        again = tune(others, problem.gains, seed, evaluations, starts, progress)
+        again = tune_paper(others, seed, evaluations, starts, progress)
         spent += again.evaluations
         if gamma(problem.channels(again.values)) <= (1 + _SAME) * gamma(problem.channels(values)):
             values, fixed = again.values, True

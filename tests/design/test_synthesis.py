@@ -109,3 +109,16 @@ def test_the_reason_when_there_are_none() -> None:
     words = culprit(problem, none.value.values).words()
     assert "mode at 50.7" in words
     assert "i_o" in words  # of the grid's current
+
+
+def test_gains_that_cannot_move_gamma_are_chosen_for_the_rest() -> None:
+    """droop-2 holds p by V: two channels are 294 at rest whatever its gains."""
+    file = law_file("droop-2")
+    problem = PaperProblem(file, free_gains(file))
+    before = problem.channels(np.array([g.start for g in problem.gains]))
+    found = tune_paper(problem)
+    after = problem.channels(found.values)
+    fixed = {(1, 1), (4, 1)}
+    assert found.cost == pytest.approx(max(c.norm for c in before), rel=1e-6)
+    best, start = (max(c.norm for c in cs if (c.i, c.j) not in fixed) for cs in (after, before))
+    assert best < 0.8 * start

@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from gfm_design.paper_tune import EVALUATIONS
 from gfm_hil.campaign.execute import WorkerLost
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
 from gfm_hil.errors import UserError
@@ -30,8 +31,8 @@ def add(kinds: Any) -> None:
     command = kinds.add_parser("league", help="every law tuned for the same problem, in a table")
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
-    command.add_argument("--evaluations", type=int, default=12000, help="of each start")
-    command.add_argument("--starts", type=int, default=2, help="the given start and random ones")
+    command.add_argument("--evaluations", type=int, default=EVALUATIONS, help="of each start")
+    command.add_argument("--starts", type=int, default=24, help="the given start and random ones")
     command.add_argument("--out", help="folder to write, or to go on with; runs/league-<time>")
     command.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     command.add_argument("--json", action="store_true", help="print league.json, nothing else")
