@@ -21,7 +21,7 @@ from typing import Any
 from gfm_hil.links.shm.ring import RING
 
 FOLDER = Path("/dev/shm")  # of shm_open(3) on Linux
-PREFIX = "gfmhil-"
+PREFIX = "gfmhil-link-"
 
 MAGIC = b"GFMHILSM"
 VERSION = 1  # of everything below and of ring.py
