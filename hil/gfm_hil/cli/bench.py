@@ -146,6 +146,7 @@ def _add_output(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry a measuring command out; returns the exit code."""
+    from gfm_hil.benchmark.page import write_page
     from gfm_hil.benchmark.plans import steps_of
     from gfm_hil.benchmark.result import Recorder, write_result
     from gfm_hil.benchmark.tables import tables
@@ -159,6 +160,7 @@ def call(options: argparse.Namespace) -> int:
             step(recorder.content, tell)
     content = recorder.close()
     write_result(content, folder / "bench.json")
+    write_page(content, folder / "bench.html")
     if options.json:
         print(json.dumps(content, indent=1))
         return 0
@@ -169,7 +171,7 @@ def call(options: argparse.Namespace) -> int:
         console.print()
     for remark in (*content["remarks"], *content["caveats"]):
         console.print(f"• {escape(remark)}", highlight=False)
-    console.print(f"{content['seconds']:g} s · {folder / 'bench.json'}", highlight=False)
+    console.print(f"{content['seconds']:g} s · {folder / 'bench.html'}", highlight=False)
     return 0
 
 

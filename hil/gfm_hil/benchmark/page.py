@@ -1,0 +1,177 @@
+"""bench.html: a result in one file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.benchmark import tables
+from gfm_hil.benchmark.plots import figures
+
+_STYLE = """
+body{font:15px/1.55 system-ui,sans-serif;max-width:76rem;margin:2rem auto;padding:0 1.2rem;
+color:#222;background:#fff}
+h1{font-size:1.5rem;margin:0 0 .2rem} h2{font-size:1.15rem;margin:2.4rem 0 .3rem}
+p{max-width:52rem;margin:.4rem 0} .dim{color:#666;font-size:.9rem}
+.badge{display:flex;flex-wrap:wrap;gap:.4rem;margin:1rem 0}
+.badge span{border:1px solid #d8d8d8;border-radius:.4rem;padding:.1rem .55rem;font-size:.82rem}
+.badge b{font-weight:500;color:#666;margin-right:.35rem}
+.badge .warn{border-color:#d09000;background:#fff6e0}
+.cards{display:flex;flex-wrap:wrap;gap:.8rem;margin:1.2rem 0}
+.card{border:1px solid #e0e0e0;border-radius:.6rem;padding:.6rem 1rem;min-width:11rem}
+.card .v{font-size:1.45rem;font-variant-numeric:tabular-nums} .card .t{font-size:.82rem;color:#666}
+table{border-collapse:collapse;margin:.5rem 0 1.2rem;font-size:.88rem}
+caption{text-align:left;font-weight:600;padding:.2rem 0}
+th,td{padding:.18rem .9rem .18rem 0;text-align:right;border-bottom:1px solid #ececec;
+font-variant-numeric:tabular-nums;white-space:nowrap} th{font-weight:500;color:#666}
+th:first-child,td:first-child{text-align:left} td.limit{color:#888} .scroll{overflow-x:auto}
+img{max-width:100%;display:block;margin:.6rem 0} li{max-width:52rem}
+"""
+
+_BADGE = (
+    ("cpu", "CPU"), ("cpus", "CPUs"), ("kernel", "kernel"), ("preemption", "preemption"),
+    ("virtual_machine", "virtual machine"), ("container", "container"),
+    ("steal_pct", "stolen by the host, %"), ("sched_fifo", "SCHED_FIFO"), ("mlock", "mlock"),
+    ("rt_throttling", "real-time throttling"), ("isolated_cpus", "isolated CPUs"),
+    ("governor", "governor"), ("clock_source", "clock"), ("load_average", "load average"),
+    ("python", "Python"), ("numba", "numba"), ("numpy", "numpy"), ("pyzmq", "pyzmq"),
+    ("libzmq", "libzmq"), ("gfmhil", "gfmhil"),
+)  # fmt: skip
+
+_SECTIONS = {
+    "latency": (
+        "Round trips",
+        "A message there and its answer back, between two processes on two processors. Solid: the "
+        "links of the bench; dashed: the limit, the same exchange in C, in the same rounds. "
+        "lockstep: one after the other. realtime: one every 100 µs, counted from its deadline, so "
+        "that a late start is part of it. hogs: a busy process on each processor.",
+    ),
+    "misses": (
+        "Real time",
+        "The product at 10 kHz: ticks whose answer had not come by the next deadline, and why. The "
+        "mark is what a loop that does nothing but pace lost on the same processors right before: "
+        "what no link can win back.",
+    ),
+    "jitter": (
+        "Pacing",
+        "A loop that waits for the next deadline and does nothing else, on both processors at a "
+        "time. The line is the period: beyond it a whole tick is gone. The kernel stops SCHED_FIFO "
+        "that only spins for 5 % of each second; so the bench sleeps first, then spins.",
+    ),
+    "lockstep": (
+        "Lockstep",
+        "The closed loop in simulated time, as fast as it goes, beside what the plant's arithmetic "
+        "alone allows. inproc: both sides in one compiled loop, no link at all.",
+    ),
+    "kernel": (
+        "Kernel",
+        "One step of the controller for every law, each waiting for the one before, beside the "
+        "same algorithm in C on the same bytes, with the same bits as result.",
+    ),
+}
+
+
+def write_page(content: dict[str, Any], path: Path) -> None:
+    """Write the page of a result."""
+    made = figures(content)
+    by_section: dict[str, list[str]] = {name: [] for name in _SECTIONS}
+    for section, table in _tables(content):
+        by_section[section].append(_table(table))
+    parts = []
+    for name, (heading, text) in _SECTIONS.items():
+        if not by_section[name]:
+            continue
+        parts.append(f"<h2>{heading}</h2><p>{html.escape(text)}</p>")
+        if name in made:
+            uri = base64.b64encode(made[name]).decode()
+            parts.append(f'<img alt="{heading}" src="data:image/svg+xml;base64,{uri}">')
+        parts += by_section[name]
+    points = "".join(
+        f"<li>{html.escape(x)}</li>" for x in (*content["caveats"], *content["remarks"])
+    )
+    path.write_text(
+        f"""<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>gfmhil bench</title><style>{_STYLE}</style>
+<h1>gfmhil bench {html.escape(content["bench"])}</h1>
+<p class="dim">measured in {content["seconds"]:g} s, in interleaved rounds: p50, p90 and p99 are
+medians over them, what is beyond p99 is of all rounds together; a ratio is taken round by round</p>
+<div class="badge">{_badge(content["environment"])}</div>
+<div class="cards">{_cards(content)}</div>
+{"".join(parts)}
+<h2>What to keep in mind</h2><ul>{points}
+<li>Absolute times are this machine's at this moment; ratios within the run are what carries over.
+</li></ul></html>
+""",
+        encoding="utf-8",
+    )
+
+
+def _badge(environment: dict[str, Any]) -> str:
+    bad = {
+        "virtual_machine": lambda v: v != "no",
+        "sched_fifo": lambda v: not v,
+        "steal_pct": lambda v: (v or 0) > 0.1,
+        "load_average": lambda v: v[0] > environment["cpus"] / 2,
+    }
+    said = {True: "yes", False: "no"}
+    chips = []
+    for key, label in _BADGE:
+        value = environment.get(key)
+        if value is None:
+            continue
+        text = said.get(value, value) if isinstance(value, bool) else value
+        text = " ".join(map(str, text)) if isinstance(text, list) else str(text)
+        warn = ' class="warn"' if key in bad and bad[key](value) else ""
+        chips.append(f"<span{warn}><b>{label}</b>{html.escape(text)}</span>")
+    return "".join(chips)
+
+
+def _cards(content: dict[str, Any]) -> str:
+    """The figures that most people look for."""
+    found: list[tuple[str, str]] = []
+    for r in content["results"]:
+        if (r["peer"], r["code"], r["mode"], r["load"]) == ("ours", "compiled", "lockstep", "idle"):
+            ratio = r["ratio_to_baseline_p50"]
+            beside = f", {tables.times(ratio)} the limit in C" if ratio else ""
+            found.append((f"{tables.micro(r['p50_us'])} µs", f"{r['name']}, round trip{beside}"))
+    for r in content.get("loop", {}).get("realtime", ()):
+        if r["missed_pct"] is not None:
+            text = f"{r['link']}, {r['load']}: ticks missed; host alone {r['host_pct']:.3g} %"
+            found.append((f"{r['missed_pct']:.3g} %", text))
+    for r in content.get("loop", {}).get("lockstep", ()):
+        rate = r["times_real_time"]["median"]
+        found.append((f"{rate:.3g} ×", f"{r['link']}: real time, in lockstep"))
+    return "".join(
+        f'<div class="card"><div class="v">{html.escape(value)}</div>'
+        f'<div class="t">{html.escape(text)}</div></div>'
+        for value, text in found
+    )
+
+
+def _tables(content: dict[str, Any]) -> Iterator[tuple[str, tables.Table]]:
+    for table in tables.latency_tables(content["results"]):
+        yield "latency", table
+    loop = content.get("loop", {})
+    if "realtime" in loop:
+        yield "misses", tables.realtime_table(loop["realtime"])
+        yield "misses", tables.causes_table(loop["realtime"])
+    if "jitter" in content:
+        yield "jitter", tables.jitter_table(content["jitter"])
+    if "lockstep" in loop:
+        yield "lockstep", tables.lockstep_table(loop["lockstep"])
+        yield "lockstep", tables.laws_table(loop["laws"])
+    if "kernel" in content:
+        yield "kernel", tables.kernel_table(content["kernel"])
+
+
+def _table(table: tables.Table) -> str:
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in table.rows
+    )
+    caption = f"<caption>{html.escape(table.heading)}</caption>"
+    return f'<div class="scroll"><table>{caption}<tr>{head}</tr>{body}</table></div>'
