@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from numba import njit
 
+from gfm_hil.atomics import copy, load_acquire, pause, store_release
 from gfm_hil.links.port import PORT_CALL, port_function
-from gfm_hil.links.shm.atomics import copy, load_acquire, pause, store_release
 
 SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
 SLOT = 512  # bytes
