@@ -102,6 +102,15 @@ def test_a_message_that_is_too_long_is_gone_and_tells_its_length(ends):
     assert ByPort(ends["controller"]).receive() == b"next"
 
 
+def test_the_patient_way_to_receive_sleeps_but_not_for_ever(ends):
+    port, room = ends["controller"].port, np.zeros(84, np.uint8)
+    assert compiled(port.patient, port.handle, room) == 0
+    send_last(ends["plant"], b"late")
+    while (size := compiled(port.patient, port.handle, room)) == 0:
+        pass
+    assert room[:size].tobytes() == b"late"
+
+
 def test_a_port_with_nobody_there_drops_and_one_that_is_closed_does_nothing(endpoint):
     link = ZmqLink("plant", endpoint)
     by_port = ByPort(link)

@@ -30,12 +30,16 @@ class Port:
             One that is too long returns its length and is gone.
         spins: looks in vain before a waiting loop begins to yield its processor: many where
             the peer itself delivers, 0 where a thread of the link needs the processor for it.
+        patient: as ``receive``, but may sleep for up to a millisecond until there is something:
+            for loops without deadlines, which on a crowded machine need not yield in vain.
+            None: ``receive`` has to do.
     """
 
     handle: NDArray[np.int64]
     send: Any
     receive: Any
     spins: int
+    patient: Any = None
 
 
 def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> Any:

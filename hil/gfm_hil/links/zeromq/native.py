@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import zmq
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.extending import intrinsic
 
 from gfm_hil.links.port import Port, port_function
@@ -21,6 +21,7 @@ from gfm_hil.links.port import Port, port_function
 _SEND, _RECEIVE, _SOCKET = range(3)
 
 _DONTWAIT = int(zmq.DONTWAIT)
+_PATIENCE = 1  # ms
 
 
 def native_port(socket: zmq.Socket[bytes]) -> Port | None:
@@ -29,7 +30,8 @@ def native_port(socket: zmq.Socket[bytes]) -> Port | None:
     if found is None:
         return None
     handle = np.array([*found, socket.underlying], dtype=np.int64)
-    return Port(handle, _send, _receive, spins=0)  # libzmq's own thread needs the processor
+    socket.set(zmq.RCVTIMEO, _PATIENCE)
+    return Port(handle, _send, _receive, 0, _await)  # its own thread needs the processor
 
 
 def _functions() -> tuple[int, int] | None:
@@ -77,9 +79,19 @@ def _send(handle, message):
     return 1 if sent == message.size else 0
 
 
-@port_function
-def _receive(handle, message):
+@njit(nogil=True)
+def _take(handle, message, flags):
     if handle[_SOCKET] == 0:
         return 0
-    got = _transfer(handle[_RECEIVE], handle[_SOCKET], message.ctypes.data, message.size, _DONTWAIT)
+    got = _transfer(handle[_RECEIVE], handle[_SOCKET], message.ctypes.data, message.size, flags)
     return max(0, got)
+
+
+@port_function
+def _receive(handle, message):
+    return _take(handle, message, _DONTWAIT)
+
+
+@port_function
+def _await(handle, message):
+    return _take(handle, message, 0)
