@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.errors import UserError
-from gfm_hil.figures import draw_run
 from gfm_hil.recording import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
@@ -20,7 +19,6 @@ from gfm_hil.recording import (
     PLANT_TIMES,
     merge,
 )
-from gfm_hil.report import write_report
 from gfm_hil.scenario import Scenario
 from gfm_hil.summary import summarise
 from gfm_hil.timeline import Outcome, read_log, worst
@@ -98,6 +96,10 @@ def finish(
         summary["injected"] = injected
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
     if figures and len(signals["tick"]):
+        # a second of imports, which the sides' processes do without
+        from gfm_hil.figures import draw_run
+        from gfm_hil.report import write_report
+
         pictures = draw_run(folder, scenario, signals, timing, summary, laws)
         write_report(folder, scenario, summary, pictures)
     return Run(folder, summary, signals)
