@@ -26,6 +26,7 @@ MODULES = {
     "bench": "bench",
     "laws": "laws",
     "design": "design",
+    "dbc": "dbc",
     "scenarios": "scenarios",
     "keys": "keys",
     "controller": "sides",

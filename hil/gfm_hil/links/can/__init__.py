@@ -15,11 +15,17 @@ _PLACES = 4  # of a loopback bus, UDP ports in a row
 
 
 def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
-    if find_spec("cantools") is None:
-        raise UserError("link.type = 'can': needs cantools: pip install 'gfmhil[can]'")
     from gfm_hil.links.can.link import CanLink
 
     return CanLink(side, endpoint, options)
+
+
+def _check(options: CanOptions, T_s: float) -> None:
+    if find_spec("cantools") is None:
+        raise ValueError("link.type = 'can' needs cantools: pip install 'gfmhil[can]'")
+    from gfm_hil.links.can.bus_budget import check_budget
+
+    check_budget(options, T_s)
 
 
 def _fresh(folder: Path) -> str:
@@ -50,5 +56,6 @@ KIND = LinkKind(
     fresh=_fresh,
     open=_open,
     options=CanOptions,
+    check=_check,
     exact=False,
 )

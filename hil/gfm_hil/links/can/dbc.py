@@ -135,7 +135,7 @@ def write_dbc(fd: bool) -> str:
         version=f"gfmhil {table_hash()}",
         dbc_specifics=_bus_type("CAN FD") if fd else None,
     )
-    return str(database.as_dbc_string())
+    return str(database.as_dbc_string()).replace("\r\n", "\n")
 
 
 def _bus_type(value: str) -> DbcSpecifics:

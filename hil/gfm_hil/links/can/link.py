@@ -15,11 +15,13 @@ import numpy as np
 from gfm_hil.errors import PeerLost, UserError
 from gfm_hil.frames import FrameWriter
 from gfm_hil.links.base import SIDES, Side
-from gfm_hil.links.can.dbc import VECTORS, read_dbc, write_dbc
-from gfm_hil.links.can.layout import Plan, plan_of
+from gfm_hil.links.can.dbc import VECTORS
+from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
+from gfm_hil.links.can.plan import load_plan
 from gfm_hil.links.can.segments import SegmentReceiver, SegmentSender
+from gfm_hil.links.can.subrate import Subrate
 from gfm_hil.links.can.vectors import CanFrame, VectorReceiver, VectorSender
 from gfm_hil.links.port import Port
 from gfm_runtime.signals import Group, names
@@ -45,7 +47,10 @@ class CanLink:
     port: Port | None = None
 
     def __init__(self, side: Side, endpoint: str, options: CanOptions) -> None:
-        plan = load_plan(options)
+        try:
+            plan = load_plan(options)
+        except ValueError as problem:
+            raise UserError(f"link.options.{problem}") from None
         self._fd, self._where = options.fd, endpoint.partition("://")[2]
         mine: Group = "u" if side == "controller" else "y"
         theirs: Group = "y" if side == "controller" else "u"
@@ -55,6 +60,7 @@ class CanLink:
         self._inbox: deque[can.Message] = deque()
         self._foreign = self._error_frames = self._dropped = 0
         _compile(plan)
+        self._subrate = Subrate(side, options.every, self._whole) if options.every > 1 else None
         self._bus = _open_bus(side, endpoint, options)
 
     @property
@@ -71,6 +77,8 @@ class CanLink:
 
     def send(self, message: bytes) -> bool:
         """Hand a message over; False if the bus has no room for all of it."""
+        if self._subrate is not None and not self._subrate.goes(message):
+            return True
         if self._sender.fits(message):
             return all([self._put(frame) for frame in self._sender.frames(message)])
         until = time.monotonic() + _ROOM_S
@@ -101,6 +109,10 @@ class CanLink:
         Raises:
             PeerLost: the bus is down, or the other side uses another DBC.
         """
+        return self._whole() if self._subrate is None else self._subrate.receive()
+
+    def _whole(self) -> bytes | None:
+        """The next message that the bus itself brought."""
         for _ in range(_AT_ONCE):
             frame = self._inbox.popleft() if self._inbox else self._next(0.0)
             if frame is None:
@@ -160,27 +172,6 @@ def _compile(plan: Plan) -> None:
         message = FrameWriter(group).pack(0, 0, 0, np.zeros(len(names(group))))
         for frame in sender.frames(message):
             receiver.take(*frame)
-
-
-def load_plan(options: CanOptions) -> Plan:
-    """The frames of the DBC that the options name, or of our own.
-
-    Raises:
-        UserError: it cannot be read, or does not describe what the link needs.
-    """
-    if options.dbc is None:
-        return plan_of(read_dbc(write_dbc(options.fd)))
-    where = f"link.options.dbc = {options.dbc!r}"
-    try:
-        plan = plan_of(read_dbc(Path(options.dbc).read_text(encoding="utf-8")))
-    except OSError as problem:
-        raise UserError(f"{where}: {problem.strerror}") from None
-    except Exception as problem:  # cantools has no common base of what its parser raises
-        raise UserError(f"{where}: {problem}") from None
-    if plan.fd != options.fd:
-        kind = "CAN FD" if plan.fd else "classic CAN"
-        raise UserError(f"{where}: describes {kind}; link.options.fd must agree")
-    return plan
 
 
 def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:

@@ -22,5 +22,6 @@ class CanOptions(LinkOptions):
     data_bitrate: int = Field(
         8_000_000, ge=10_000, le=8_000_000, description="of a CAN FD frame's data, bit/s"
     )
+    every: int = Field(1, ge=1, le=50, description="ticks to an exchange; held in between")
     dbc: str | None = Field(None, description="DBC file in place of the one of `gfmhil dbc`")
     heartbeat: int = Field(10_000, ge=1, description="vectors after which a state is said again")

@@ -1,0 +1,79 @@
+"""gfmhil dbc: the DBC file of the CAN link, and what its frames cost on the bus."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gfm_hil.errors import UserError
+
+_RATES = {
+    False: [(500_000, 0), (1_000_000, 0)],
+    True: [(500_000, 2_000_000), (1_000_000, 2_000_000), (1_000_000, 5_000_000),
+           (1_000_000, 8_000_000)],
+}  # fmt: skip
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser("dbc", help="the CAN link's DBC file, or its bus budget")
+    command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
+    command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
+    command.add_argument("--budget", action="store_true", help="frame times at common bit rates")
+    command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Write the file, or show the budget."""
+    if find_spec("cantools") is None:
+        raise UserError("gfmhil dbc: needs cantools: pip install 'gfmhil[can]'")
+    if options.T_s <= 0:
+        raise UserError(f"--T_s {options.T_s:g}: must be more than 0 s")
+    if options.budget:
+        Console().print(_budgets(options.T_s), highlight=False)
+        return 0
+    from gfm_hil.links.can.dbc import write_dbc
+
+    text = write_dbc(not options.classic)
+    if options.out is None:
+        print(text, end="")
+        return 0
+    try:
+        Path(options.out).write_text(text, encoding="utf-8")
+    except OSError as problem:
+        raise UserError(f"--out {options.out}: {problem.strerror}") from None
+    return 0
+
+
+def _budgets(T_s: float) -> Table:
+    """Longest frames of y and u by bit rate, and the exchange that fits."""
+    from gfm_hil.links.can.bus_budget import budget
+    from gfm_hil.links.can.options import CanOptions
+    from gfm_hil.links.can.plan import load_plan
+
+    table = Table(box=None, pad_edge=False, caption_justify="left")
+    table.caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"
+    table.add_column("bus [Mbit/s]", no_wrap=True)
+    for title in ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for fd, rates in _RATES.items():
+        plan = load_plan(CanOptions(fd=fd))
+        for bitrate, data in rates:
+            need = budget(plan, bitrate, data)
+            every = need.every(T_s)
+            name = f"FD {bitrate / 1e6:g}/{data / 1e6:g}" if fd else f"classic {bitrate / 1e6:g}"
+            table.add_row(
+                name,
+                "+".join(map(str, need.lengths)),
+                *(f"{time * 1e6:.1f}" for time in (need.y, need.u, need.exchange)),
+                f"{1 / need.exchange:.0f}",
+                f"{every}",
+                f"{need.load(every * T_s):.0%}",
+            )
+    return table
