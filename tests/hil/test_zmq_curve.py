@@ -19,9 +19,9 @@ from gfm_hil.links.zeromq.curve import key_files, write_keys
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.links.zeromq.options import ZmqOptions
 from gfm_hil.links.zeromq.reach import beyond_loopback
-from gfm_hil.waiting import send_last
 
 from .test_links import PATIENT, assert_same, both_sides, in_threads
+from .test_zmq_port import deliver
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_frames_are_not_readable_on_the_wire(tcp, keys):
         ]
         secret = b"nobody else is to know"
         try:
-            send_last(ends[1], secret)
+            deliver(ends[1], secret)
             assert ends[0].wait(30)
             assert ends[0].receive() == secret
         finally:
