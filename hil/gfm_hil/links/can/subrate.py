@@ -86,7 +86,9 @@ class Subrate:
         self._made: deque[bytes] = deque()  # ready to be given out
         self._last = b""  # measurement received
         self._due = -1  # tick for which the plant wants a command
-        self._commands: dict[int, bytes] = {}  # by the tick they answer
+        # by the tick they answer: commands and their sequences but for those sent again
+        self._commands: dict[int, tuple[bytes, int]] = {}
+        self._again = 0
         self._given = -1  # sequence given out last
 
     def goes(self, message: bytes) -> bool:
@@ -123,15 +125,17 @@ class Subrate:
             if not self._theirs.read(message):
                 return message  # damaged: for the reader to count
             if self._theirs.tick in self._commands:  # sent again: likewise
+                self._again += 1
                 return self._theirs.under(self._theirs.tick, self._given)
             if self._theirs.leaves:
                 return self._theirs.under(self._theirs.tick, self._given + 1)
-            self._commands[self._theirs.tick] = message
+            self._commands[self._theirs.tick] = message, self._theirs.sequence - self._again
             if len(self._commands) > _KEPT:
                 del self._commands[min(self._commands)]
         in_force = max(0, (self._due // self._every - 1) * self._every)
-        if self._due < 0 or not self._theirs.read(self._commands.get(in_force, b"")):
+        message, sequence = self._commands.get(in_force, (b"", 0))
+        if self._due < 0 or not self._theirs.read(message):
             return None
         due, self._due = self._due, -1
-        self._given = self._theirs.sequence + due - in_force
+        self._given = sequence + due - in_force
         return self._theirs.under(due, self._given)
