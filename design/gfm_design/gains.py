@@ -52,7 +52,8 @@ def free_gains(
     """The gains that the file declares free, with other starts or fewer of them if wanted.
 
     Raises:
-        LawError: an unknown or fixed name, none at all, a start outside its bounds.
+        LawError: an unknown or fixed name, none at all, a start for one that is not wanted or
+            outside its bounds, bounds that are none.
     """
     declared = {n: p for n, p in file.parameters.items() if p.free is not None}
     for name in [*(start or {}), *(only or [])]:
@@ -60,6 +61,9 @@ def free_gains(
             known = sorted(declared)
             raise LawError(f"gain {name}", f"not free in {file.name}; free are {known}")
     wanted = [n for n in declared if only is None or n in only]
+    for name in start or {}:
+        if name not in wanted:
+            raise LawError(f"gain {name}", f"has a start but is not among those to move, {wanted}")
     if not wanted:
         raise LawError(f"law {file.name}", "declares no free gain (parameters.NAME.free)")
     gains = []
@@ -67,6 +71,10 @@ def free_gains(
         p = declared[name]
         assert p.free is not None
         low, high = p.free
+        if not (np.isfinite(p.free).all() and low < high):
+            raise LawError(
+                f"parameters.{name}.free", f"[{low:g}, {high:g}] must be finite and ascending"
+            )
         value = (start or {}).get(name, p.value)
         if not low <= value <= high:
             raise LawError(f"gain {name}", f"start {value:g} lies outside [{low:g}, {high:g}]")

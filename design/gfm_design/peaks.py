@@ -84,6 +84,8 @@ def peaks(loop: StateSpace, weights: tuple[Weight, ...]) -> Peaks | None:
         better = y[each, j] > height
         height, top = np.where(better, y[each, j], height), np.where(better, x[each, j], top)
         low, high = x[each, np.maximum(j - 1, 0)], x[each, np.minimum(j + 1, 8)]
+    if not len(height):  # no weight is reached at all
+        return None
     order = np.argsort(-height, kind="stable")
     order = order[height[order] > _TALL * height.max()]
     return Peaks(height[order], top[order], channel[order])

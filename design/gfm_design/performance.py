@@ -50,6 +50,8 @@ class Weight:
             raise ValueError(f"{name}: needs a numerator and a denominator")
         if not np.isfinite([*self.num, *self.den]).all() or self.den[0] == 0.0:
             raise ValueError(f"{name}: coefficients must be finite, den[0] not 0")
+        if not any(self.num):
+            raise ValueError(f"{name}: its numerator is zero; leave the weight out instead")
         if len(self.den) > 1 and np.roots(self.den).real.max() >= 0.0:
             raise ValueError(f"{name}: must be stable; {self.den} has a root outside")
 

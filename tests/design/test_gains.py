@@ -24,6 +24,7 @@ def test_ties_follow() -> None:
         ({"D_p": 1.0}, None, "D_p"),
         ({"k_22": 1e9}, None, "outside"),
         (None, ["nothing"], "nothing"),
+        ({"k_22": 5.0}, ["k_34"], "not among those to move"),
     ],
 )
 def test_gains_that_cannot_be(
@@ -84,6 +85,12 @@ X = { value = 0.0174, unit = "p.u.", source = "s", free = [0.01, 0.1] }
 T = { value = 0.005, unit = "s", source = "s", free = [0.001, 0.1] }
 k = { value = 1.0, unit = "p.u.", source = "s", free = [-5.0, 5.0] }
 """
+
+
+@pytest.mark.parametrize("bounds", ["[5.0, 1.0]", "[1.0, 1.0]", "[nan, 5.0]", "[0.1, inf]"])
+def test_bounds_that_are_none(bounds: str) -> None:
+    with pytest.raises(LawError, match="must be finite and ascending"):
+        free_gains(parse_law(OWN.replace("[-5.0, 5.0]", bounds)))
 
 
 def test_gains_in_the_error_map_cancelling_factors_and_gains_that_make_no_law() -> None:

@@ -69,6 +69,7 @@ def test_sampled_fast_leads_to_the_continuous_norm() -> None:
         ((1.0,), (1.0, 0.0), "stable"),
         ((np.nan,), (1.0,), "finite"),
         ((1.0,), (0.0, 1.0), "den"),
+        ((0.0, 0.0), (1.0, 1.0), "numerator is zero"),
     ],
 )
 def test_weights_that_cannot_be(num: tuple[float, ...], den: tuple[float, ...], words: str) -> None:

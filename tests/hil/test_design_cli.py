@@ -89,6 +89,9 @@ def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
         (["tune", "--law", "vsg-2", "--gains", "k_99=1"], "k_99"),
         (["tune", "--law", "vsg-2", "--gains", "k_34=1e9"], "outside"),
         (["tune", "--law", "vsg-2", "--only", "k_99"], "k_99"),
+        (["tune", "--law", "vsg-2", "--only", ""], "free are"),
+        (["tune", "--law", "vsg-2", "--only", "k_22", "--gains", "k_34=2"], "among those to move"),
+        (["tune", "--law", "vsg-2", "--out", "no-such-folder/x.toml"], "no-such-folder"),
         (["tune", "--law", "vsg-2", "--evaluations", "0"], "at least 1"),
         (["tune", "--law", "vsg-2", "--seed", "-1"], "negative"),
     ],
@@ -100,8 +103,43 @@ def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) 
     assert error.count("\n") == 1
 
 
-def test_refuses_an_improper_weight(capsys: Capture, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["gamma", "tune"])
+def test_refuses_an_improper_weight(kind: str, capsys: Capture, tmp_path: Path) -> None:
     path = tmp_path / "w.toml"
     path.write_text("[W_11]\nnum = [1.0, 1.0]\nden = [1.0]\n")
-    assert main(["design", "gamma", "--law", "vsg-2", "--weights", str(path)]) == 2
+    assert main(["design", kind, "--law", "vsg-2", "--weights", str(path)]) == 2
     assert "W_11: improper" in capsys.readouterr().err
+
+
+OWN = """
+name = "own"
+title = "t"
+source = "s"
+[phi]
+22 = { type = "P", k = "k" }
+23 = { type = "P", k = "a" }
+35 = { type = "I", k_i = 20.0 }
+[parameters]
+k = { value = 0.01, unit = "p.u.", source = "s", free = [0.001, 0.1] }
+a = { value = 0.5, unit = "p.u.", source = "s", free = [-2.0, 2.0] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "words"),
+    [
+        ("value = 0.5", "value = -1.0", "omega_u loop"),  # omega_u = ... + omega_u
+        ("", "", "no steady state"),  # nothing holds v_dc
+        ("[-2.0, 2.0]", "[2.0, -2.0]", "parameters.a.free: [2, -2] must be finite and ascending"),
+        ("[-2.0, 2.0]", "[1.0, 2.0]", "start 0.5 lies outside [1, 2]"),
+    ],
+)
+def test_refuses_a_problem_that_is_none(
+    was: str, becomes: str, words: str, capsys: Capture, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(OWN.replace(was, becomes))
+    assert main(["design", "tune", "--law", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1

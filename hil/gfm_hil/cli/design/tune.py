@@ -56,8 +56,10 @@ def call(options: argparse.Namespace) -> int:
             raise UserError(f"--{name} {getattr(options, name)}: must be at least 1")
     if options.seed < 0:
         raise UserError(f"--seed {options.seed}: must not be negative")
+    if options.out and not Path(options.out).parent.is_dir():
+        raise UserError(f"--out {options.out}: {Path(options.out).parent} is no folder")
     file = law_file(options.law)
-    only = options.only.split(",") if options.only else None
+    only = None if options.only is None else options.only.split(",")
     paper = PAPER_START.get(file.name, {})
     gains = free_gains(
         file,
