@@ -59,9 +59,11 @@ class Link(_Model):
         if self.endpoint is not None:
             kind.check_endpoint(self.endpoint)
         try:
-            kind.options.model_validate(self.options)
+            options = kind.options.model_validate(self.options)
         except ValidationError as problem:
             raise ValueError("; ".join(f"options.{line}" for line in lines(problem))) from None
+        if self.endpoint is not None:
+            kind.check_both(self.endpoint, options)
         return self
 
 

@@ -191,7 +191,7 @@ def test_unencrypted_beyond_this_machine_is_refused_unless_meant(side):
     with pytest.raises(UserError) as found:
         open_link("zmq", side, "tcp://0.0.0.0:5555")
     text = str(found.value)
-    assert text.startswith("link.endpoint = 'tcp://0.0.0.0:5555': goes beyond this machine")
+    assert text.startswith("link: endpoint = 'tcp://0.0.0.0:5555': goes beyond this machine")
     assert "link.options.curve" in text
     assert "link.options.plain = true" in text
     with socket.socket() as probe:
@@ -213,6 +213,7 @@ def test_the_command_refuses_it_and_takes_options(capsys, tmp_path):
         return str(capsys.readouterr().err)
 
     assert "tcp://0.0.0.0:5555': goes beyond this machine" in refusal()
+    assert not list(tmp_path.iterdir())  # before anything starts
     assert "controller.key_secret: " in refusal("--option", f"curve={tmp_path}")
     both = refusal("--option", "curve=x", "--option", "plain=true")
     assert "plain = true and curve = 'x': only one of both" in both

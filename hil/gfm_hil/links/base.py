@@ -50,6 +50,10 @@ def _fits(options: Any, T_s: float) -> None:
     """Any options at any sampling time."""
 
 
+def _may(endpoint: str, options: Any) -> None:
+    """Any endpoint with any options."""
+
+
 @dataclass(frozen=True)
 class LinkKind:
     """What the bench knows of a link before it opens one.
@@ -63,6 +67,7 @@ class LinkKind:
             in there. Raises ``UserError`` where the endpoint is not to be had.
         options: model of ``link.options``.
         check: sees that options fit the sampling time in s; raises ValueError in one line.
+        check_both: sees that an endpoint may be used with options; raises ValueError likewise.
         exact: float64 arrives as sent, so that results are those of a run in process.
     """
 
@@ -74,6 +79,7 @@ class LinkKind:
     open: Callable[[Side, str, Any], Link]
     options: type[LinkOptions] = LinkOptions
     check: Callable[[Any, float], None] = _fits
+    check_both: Callable[[str, Any], None] = _may
     exact: bool = True
 
     def check_endpoint(self, endpoint: str) -> None:

@@ -54,6 +54,7 @@ def open_link(name: str, side: Side, endpoint: str, options: dict[str, Any] | No
         kind = link_kind(name)
         kind.check_endpoint(endpoint)
         checked = kind.options.model_validate(options or {})
+        kind.check_both(endpoint, checked)
     except ValueError as problem:
         raise UserError(f"link: {problem}") from None
     return kind.open(side, endpoint, checked)

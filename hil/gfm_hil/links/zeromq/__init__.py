@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gfm_hil.links.base import Link, LinkKind, Side
 from gfm_hil.links.zeromq.options import ZmqOptions
+from gfm_hil.links.zeromq.reach import refuse_open
 
 
 def _open(side: Side, endpoint: str, options: ZmqOptions) -> Link:
@@ -28,4 +29,5 @@ KIND = LinkKind(
     fresh=_fresh,
     open=_open,
     options=ZmqOptions,
+    check_both=refuse_open,
 )

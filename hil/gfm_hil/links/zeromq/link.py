@@ -21,7 +21,6 @@ from gfm_hil.links.base import Side
 from gfm_hil.links.port import Port
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.links.zeromq.options import ZmqOptions
-from gfm_hil.links.zeromq.reach import refuse_open
 
 if TYPE_CHECKING:
     from gfm_hil.links.zeromq.curve import Curve
@@ -50,14 +49,12 @@ class ZmqLink:
             if it has no library that could be called (it says so).
 
     Raises:
-        UserError: it cannot be bound, as when it is in use; it goes beyond this machine and
-            neither is it encrypted nor meant to be plain; keys are missing.
+        UserError: it cannot be bound, as when it is in use; keys are missing.
     """
 
     port: Port | None = None
 
     def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
-        refuse_open(endpoint, options)
         if side == "controller" and endpoint.startswith("ipc://"):
             _refuse_if_served(endpoint)
         self._context = zmq.Context()

@@ -6,7 +6,6 @@ import ipaddress
 import socket
 from pathlib import Path
 
-from gfm_hil.errors import UserError
 from gfm_hil.links.zeromq.options import ZmqOptions
 
 _IFF_LOOPBACK = 0x8  # of linux/if.h
@@ -16,11 +15,11 @@ def refuse_open(endpoint: str, options: ZmqOptions) -> None:
     """See that frames leave this machine encrypted, or because somebody said so.
 
     Raises:
-        UserError: neither.
+        ValueError: neither.
     """
     if options.curve is None and not options.plain and beyond_loopback(endpoint):
-        raise UserError(
-            f"link.endpoint = {endpoint!r}: goes beyond this machine, unencrypted: set "
+        raise ValueError(
+            f"endpoint = {endpoint!r}: goes beyond this machine, unencrypted: set "
             "link.options.curve to a folder of keys (gfmhil keys makes one), or "
             "link.options.plain = true if that is meant"
         )
