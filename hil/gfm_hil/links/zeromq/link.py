@@ -29,7 +29,7 @@ _LAST_WORDS = 500  # ms
 
 # What a stalled peer leaves unread is bounded, and more is dropped: at each end so many messages,
 _ROOM = 64
-# and in the kernel about 600 more: a Unix socket takes no more by itself, tcp is told (bytes; by
+# and in the kernel 500 to 800 more: a Unix socket takes no more by itself, tcp is told (bytes; by
 # itself it takes 40,000). A frame's tick says how old it is; PAIR ignores CONFLATE.
 _KERNEL_ROOM = 16384
 
