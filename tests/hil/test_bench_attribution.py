@@ -102,6 +102,21 @@ def test_ticks_that_follow_have_the_cause_of_the_first() -> None:
     assert found(timing) == ["stalled host"] * 3
 
 
+def test_frames_lost_while_the_controller_stood_still_are_not_the_links() -> None:
+    """It was away for six ticks; of what was sent meanwhile the ring had room for two frames."""
+    timing = good()
+    back = timing["plant_scheduled"][12] + 95_000
+    for k, late in ((7, 0), (8, 900)):
+        timing["controller_received"][k] = back + late
+        timing["controller_sent"][k] = back + late + 800
+    timing["controller_stall"][7] = back - timing["plant_scheduled"][6] - 20_000
+    for name in ("controller_received", "controller_computed", "controller_sent"):
+        timing[name][9:13] = -1
+    timing["controller_stall"][9:13] = -1
+    timing["plant_received"][7:13] = -1
+    assert found(timing) == ["stalled host"] * 6
+
+
 def test_plant_that_is_behind_does_not_blame_its_timer() -> None:
     timing = good()
     timing["plant_stall"][7] = 2 * T

@@ -76,14 +76,27 @@ def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
     worked = np.where((heard >= 0) & (answered >= 0), answered - heard, 0)
     end = np.where(received >= 0, received, np.maximum(due + T_ns, sent))
     zero = np.zeros(len(due), np.int64)
-    gaps = [timing.get(f"{side}_stall", zero) for side in ("plant", "controller")]
+    gap = np.maximum(timing.get("plant_stall", zero), _away(timing, sent, end))
     parts = {
-        _OWN: sent - woke + worked,
-        _LINK: end - sent - worked,
-        _WAKE: woke - due,
-        _STALL: np.maximum(*gaps),
-    }
+        _OWN: sent - woke + worked, _LINK: end - sent - worked, _WAKE: woke - due, _STALL: gap
+    }  # fmt: skip
     return {cause: part.clip(min=0).astype(float) for cause, part in parts.items()}
+
+
+def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How long the controller did not look between two times of each tick, ns.
+
+    Its gap is recorded with the frame that it took next, whichever that was.
+    """
+    heard = timing["controller_received"]
+    gap = timing.get("controller_stall", np.zeros(len(heard), np.int64))
+    taken = np.flatnonzero(heard >= 0)
+    if not len(taken):
+        return np.zeros(len(heard), np.int64)
+    back = heard[taken]  # ascending: frames arrive in order
+    after = np.minimum(np.searchsorted(back, begin, side="right"), len(back) - 1)
+    away = back[after] - gap[taken][after]
+    return (np.minimum(back[after], end) - np.maximum(away, begin)).clip(min=0)
 
 
 def counts(causes: NDArray[np.int64]) -> dict[str, int]:

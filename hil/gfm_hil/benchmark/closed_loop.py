@@ -29,15 +29,21 @@ from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.spread import summary
 from gfm_hil.benchmark.turns import Spread, quickest
+from gfm_hil.errors import UserError
+from gfm_hil.links import link_kind, open_link
 from gfm_hil.runner import Progress, run_scenario
 from gfm_hil.scenario import Scenario, check_scenario
 
 LAW = "mimo-gfm"
 T_S = 1e-4  # s
 _SETTLE = 1_000  # ticks after the hogs were let go that are left out
+_PATIENCE_S = 5.0  # a machine that is busy with other things shall not end a run
 _SHORT = 2_000  # ticks of one of the short runs in process
 
+COMPLETED = "completed"
+
 Tell = Callable[[str, float], None]
+Found = tuple[list[dict[str, Any]], list[str]]  # rows and remarks
 Timing = dict[str, NDArray[np.int64]]
 
 
@@ -60,6 +66,7 @@ class _Run:
     timing: Timing
     begin: int  # tick from which on it counts
     scheduling: list[str]
+    ended: str
     late: NDArray[np.int64]
 
 
@@ -72,12 +79,25 @@ class _Cell:
     runs: list[_Run] = field(default_factory=list)
 
 
-def measure_lockstep(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
-    """Ticks a second over every link and in process; simulated, so as fast as it goes.
+def usable(links: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The links that are to be had here at ``T_S``, and a remark on each other one."""
+    found, remarks = [], []
+    for link in links:
+        try:
+            scenario = _scenario(link, "lockstep", T_S)
+            with ExitStack() as stack:
+                endpoint = link_kind(link).fresh(memory_folder(stack))
+                open_link(link, "controller", endpoint, scenario.link.options).close()
+        except UserError as problem:
+            remarks.append(f"{link}, closed loop: not measured: {problem}")
+        else:
+            found.append(link)
+    return found, remarks
 
-    Raises:
-        UserError: a link is not to be had.
-    """
+
+def measure_lockstep(plan: Plan, tell: Tell) -> Found:
+    """Ticks a second over every link and in process; simulated, so as fast as it goes."""
+    remarks: list[str] = []
     rates: dict[str, list[float]] = {"inproc": [], **{link: [] for link in plan.links}}
     shares: dict[str, list[float]] = {name: [] for name in rates}
     with ExitStack() as stack:
@@ -91,11 +111,15 @@ def measure_lockstep(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
                     tick_ns = quickest(alone.whole)
                 else:
                     scenario = _scenario(name, "lockstep", plan.lockstep_s)
-                    sent = _run(scenario, place)[0]["plant_sent"]
+                    timing, _, ended = _run(scenario, place)
+                    if ended != COMPLETED:
+                        remarks.append(f"{name}, lockstep: a run ended early: {ended}")
+                        continue
+                    sent = timing["plant_sent"]
                     tick_ns = float(sent[-1] - sent[0]) / (len(sent) - 1)
                 rates[name].append(1e9 / tick_ns)
                 shares[name].append(plant_ns / tick_ns)
-    return [
+    rows = [
         {
             "link": name,
             "mode": "lockstep",
@@ -104,15 +128,13 @@ def measure_lockstep(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
             "share_of_plant_alone": Spread.of(shares[name]).plain(),
         }
         for name in rates
+        if rates[name]
     ]
+    return rows, remarks
 
 
-def measure_realtime(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
-    """Misses of 10 kHz in real time over every link under every load.
-
-    Raises:
-        UserError: a link is not to be had.
-    """
+def measure_realtime(plan: Plan, tell: Tell) -> Found:
+    """Misses of 10 kHz in real time over every link under every load."""
     cells = [_Cell(link, load) for link in plan.links for load in plan.loads]
     with ExitStack() as stack:
         place = memory_folder(stack)
@@ -128,7 +150,15 @@ def measure_realtime(plan: Plan, tell: Tell) -> list[dict[str, Any]]:
                 scenario = _scenario(cell.link, "realtime", plan.realtime_s)
                 beside = partial(load_is, cell.load) if cell.load != "idle" else None
                 cell.runs.append(_observe(scenario, place, late, beside))
-    return [_row(cell) for cell in cells]
+    remarks = [
+        f"{cell.link}, real time, {cell.load}: a run ended early: {run.ended}"
+        for cell in cells
+        for run in cell.runs
+        if run.ended != COMPLETED
+    ]
+    for cell in cells:
+        cell.runs = [run for run in cell.runs if "plant_received" in run.timing]
+    return [_row(cell) for cell in cells if cell.runs], remarks
 
 
 def _observe(
@@ -147,8 +177,8 @@ def _observe(
                 during.enter_context(beside())
                 begin = ticks + _SETTLE
 
-        timing, scheduling = _run(scenario, place, progress)
-    return _Run(timing, begin, scheduling, late)
+        timing, scheduling, ended = _run(scenario, place, progress)
+    return _Run(timing, begin, scheduling, ended, late)
 
 
 def _row(cell: _Cell) -> dict[str, Any]:
@@ -195,7 +225,7 @@ def _scenario(link: str, mode: str, duration: float) -> Scenario:
         "T_s": T_S,
         "mode": mode,
         "law": LAW,
-        "link": {"type": link},
+        "link": {"type": link, "peer_timeout_s": _PATIENCE_S},
         "late_policy": {"hold": 10**9},  # misses are counted, none ends the run
     }
     return check_scenario(content, "bench")
@@ -203,12 +233,13 @@ def _scenario(link: str, mode: str, duration: float) -> Scenario:
 
 def _run(
     scenario: Scenario, place: Path, progress: Progress = lambda ticks, misses: None
-) -> tuple[Timing, list[str]]:
-    """Run a scenario; its timing and how its sides were scheduled."""
+) -> tuple[Timing, list[str], str]:
+    """Run a scenario; its timing, how its sides were scheduled, and how it ended."""
     folder = place / f"run-{time.monotonic_ns()}"
-    run_scenario(scenario, folder, progress, figures=False)
+    summary = run_scenario(scenario, folder, progress, figures=False).summary
     with np.load(folder / "timing.npz") as file:
         timing = dict(file)
     log = [json.loads(line) for line in (folder / "events.jsonl").read_text("utf-8").splitlines()]
     shutil.rmtree(folder)
-    return timing, [f"{e['side']}: {e['policy']}" for e in log if e["event"] == "scheduling"]
+    policies = [f"{e['side']}: {e['policy']}" for e in log if e["event"] == "scheduling"]
+    return timing, policies, " ".join(filter(None, (summary["status"], summary["reason"])))

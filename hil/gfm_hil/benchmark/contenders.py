@@ -5,6 +5,7 @@ A contender is data, so that it can be sent to the two processes, which open the
 
 from __future__ import annotations
 
+import secrets
 import socket
 import tempfile
 from contextlib import ExitStack, closing
@@ -15,7 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.pingpong import LinkEnd, Messages, frames, plain
+from gfm_hil.benchmark.peers import Iceoryx2Link, has_iceoryx2
+from gfm_hil.benchmark.pingpong import LONGEST, LinkEnd, Messages, frames, plain
 from gfm_hil.errors import UserError
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import Side
@@ -77,6 +79,8 @@ class Contender:
             assert self.library is not None
             how = {"shm": c_ends.open_shm, "udp": c_ends.open_udp, "zmq": c_ends.open_zmq}
             return how[self.link](self.library, side, self.endpoint, messages.shape[1])
+        if self.peer == "iceoryx2":
+            return LinkEnd(Iceoryx2Link(side, self.endpoint, LONGEST), messages)
         return LinkEnd(open_link(self.link, side, self.endpoint, self.options), messages)
 
     @staticmethod
@@ -117,28 +121,29 @@ def of_links(links: list[str], place: Path, library: Path | None) -> list[Conten
         found.setdefault(name, Contender(name, link, "C", endpoint, {}, name, library))
         return name
 
+    def ours(name: str, link: str, endpoint: str, baseline: str, **options: Any) -> None:
+        found[name] = Contender(name, link, "ours", endpoint, options, baseline)
+
     for link in links:
         kind = link_kind(link)
         folder = place / link
         folder.mkdir()
         if link == "zmq":
-            c_ipc = limit("C zmq ipc", "zmq", f"ipc://{folder}/c")
-            c_tcp = limit("C zmq tcp", "zmq", f"tcp://127.0.0.1:{free_port()}")
-            portable = {"portable": True}
             ipc, tcp = kind.fresh(folder), f"tcp://127.0.0.1:{free_port()}"
-            for name, endpoint, options, baseline in (
-                ("zmq ipc", ipc, {}, c_ipc),
-                ("zmq ipc, portable", f"{ipc}-portable", portable, c_ipc),
-                ("zmq tcp", tcp, {}, c_tcp),
-            ):
-                found[name] = Contender(name, link, "ours", endpoint, options, baseline)
+            limit_ipc = limit("C zmq ipc", "zmq", f"ipc://{folder}/c")
+            ours("zmq ipc", link, ipc, limit_ipc)
+            ours("zmq ipc, portable", link, f"{ipc}-portable", limit_ipc, portable=True)
+            limit_tcp = limit("C zmq tcp", "zmq", f"tcp://127.0.0.1:{free_port()}")
+            ours("zmq tcp", link, tcp, limit_tcp)
+        elif link == "shm":
+            in_c = limit("C shm", "shm", str(place / "slots"))
+            ours(link, link, kind.fresh(folder), in_c)
+            if has_iceoryx2():
+                name = f"gfmhil-{secrets.token_hex(8)}"
+                found["iceoryx2"] = Contender("iceoryx2", "iceoryx2", "iceoryx2", name, {}, in_c)
         else:
-            baseline = (
-                limit("C shm", "shm", str(place / "slots"))
-                if link == "shm"
-                else limit("C udp", "udp", f"{free_port()},{free_port()}")
-            )
-            found[link] = Contender(link, link, "ours", kind.fresh(folder), {}, baseline)
+            in_c = limit("C udp", "udp", f"{free_port()},{free_port()}")
+            ours(link, link, kind.fresh(folder), in_c)
     return list(found.values())
 
 

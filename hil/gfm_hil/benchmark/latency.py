@@ -16,6 +16,7 @@ from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
 from gfm_hil.benchmark.hogs import Load, hogs
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.errors import UserError
 
 Mode = Literal["lockstep", "realtime"]
 MODES: tuple[Mode, ...] = ("lockstep", "realtime")
@@ -64,10 +65,9 @@ class _Cell:
 def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
     """Measure; returns (results, remarks), one result a contender, mode and load.
 
-    Raises:
-        UserError: an unknown link, or one that is not to be had.
+    A link that is not to be had here is left out, with a remark.
     """
-    remarks = []
+    remarks: list[str] = []
     with ExitStack() as stack:
         place = memory_folder(stack)
         try:
@@ -81,7 +81,11 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
         cells = []
         for contender in contenders:
             tell(f"opening {contender.name}", 0.0)
-            compiled = two.open(contender, plan.payload)
+            try:
+                compiled = two.open(contender, plan.payload)
+            except UserError as problem:
+                remarks.append(f"{contender.name}: not measured: {problem}")
+                continue
             cells += [_Cell(contender, m, w, compiled) for w in plan.loads for m in plan.modes]
         for number in range(-1, plan.rounds):  # the first to compile and to warm up
             for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):

@@ -20,7 +20,7 @@ p{max-width:52rem;margin:.4rem 0} .dim{color:#666;font-size:.9rem}
 .badge span{border:1px solid #d8d8d8;border-radius:.4rem;padding:.1rem .55rem;font-size:.82rem}
 .badge b{font-weight:500;color:#666;margin-right:.35rem}
 .badge .warn{border-color:#d09000;background:#fff6e0}
-.cards{display:flex;flex-wrap:wrap;gap:.8rem;margin:1.2rem 0}
+.cards{display:flex;flex-wrap:wrap;gap:.8rem;margin:.8rem 0}
 .card{border:1px solid #e0e0e0;border-radius:.6rem;padding:.6rem 1rem;min-width:11rem}
 .card .v{font-size:1.45rem;font-variant-numeric:tabular-nums} .card .t{font-size:.82rem;color:#666}
 table{border-collapse:collapse;margin:.5rem 0 1.2rem;font-size:.88rem}
@@ -100,7 +100,7 @@ def write_page(content: dict[str, Any], path: Path) -> None:
 <p class="dim">measured in {content["seconds"]:g} s, in interleaved rounds: p50, p90 and p99 are
 medians over them, what is beyond p99 is of all rounds together; a ratio is taken round by round</p>
 <div class="badge">{_badge(content["environment"])}</div>
-<div class="cards">{_cards(content)}</div>
+{_cards(content)}
 {"".join(parts)}
 <h2>What to keep in mind</h2><ul>{points}
 <li>Absolute times are this machine's at this moment; ratios within the run are what carries over.
@@ -131,25 +131,38 @@ def _badge(environment: dict[str, Any]) -> str:
 
 
 def _cards(content: dict[str, Any]) -> str:
-    """The figures that most people look for."""
-    found: list[tuple[str, str]] = []
-    for r in content["results"]:
-        if (r["peer"], r["code"], r["mode"], r["load"]) == ("ours", "compiled", "lockstep", "idle"):
-            ratio = r["ratio_to_baseline_p50"]
-            beside = f", {tables.times(ratio)} the limit in C" if ratio else ""
-            found.append((f"{tables.micro(r['p50_us'])} µs", f"{r['name']}, round trip{beside}"))
-    for r in content.get("loop", {}).get("realtime", ()):
-        if r["missed_pct"] is not None:
-            text = f"{r['link']}, {r['load']}: ticks missed; host alone {r['host_pct']:.3g} %"
-            found.append((f"{r['missed_pct']:.3g} %", text))
-    for r in content.get("loop", {}).get("lockstep", ()):
-        rate = r["times_real_time"]["median"]
-        found.append((f"{rate:.3g} ×", f"{r['link']}: real time, in lockstep"))
-    return "".join(
-        f'<div class="card"><div class="v">{html.escape(value)}</div>'
-        f'<div class="t">{html.escape(text)}</div></div>'
-        for value, text in found
-    )
+    """The figures that most people look for, a line a kind."""
+    loop = content.get("loop", {})
+    trips = [
+        (f"{tables.micro(r['p50_us'])} µs", _beside(r))
+        for r in content["results"]
+        if (r["peer"], r["code"], r["mode"], r["load"]) == ("ours", "compiled", "lockstep", "idle")
+    ]
+    misses = [
+        (
+            tables.percent(r["missed_pct"]),
+            f"{r['link']}, {r['load']}: ticks missed, host alone {tables.percent(r['host_pct'])}",
+        )
+        for r in loop.get("realtime", ())
+    ]
+    rates = [
+        (f"{r['times_real_time']['median']:.3g} ×", f"{r['link']}: times real time, in lockstep")
+        for r in loop.get("lockstep", ())
+    ]
+    lines = []
+    for cards in filter(None, (trips, misses, rates)):
+        drawn = "".join(
+            f'<div class="card"><div class="v">{html.escape(value)}</div>'
+            f'<div class="t">{html.escape(text)}</div></div>'
+            for value, text in cards
+        )
+        lines.append(f'<div class="cards">{drawn}</div>')
+    return "".join(lines)
+
+
+def _beside(row: dict[str, Any]) -> str:
+    ratio = row["ratio_to_baseline_p50"]
+    return f"{row['name']}: round trip" + (f", {tables.times(ratio)} the limit" if ratio else "")
 
 
 def _tables(content: dict[str, Any]) -> Iterator[tuple[str, tables.Table]]:

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import os
 import time
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.frames import FrameWriter
-from gfm_hil.links import Link, Port
+from gfm_hil.links import Port
 from gfm_hil.loops.clock import give_way, now_ns, wait_until
 from gfm_runtime.signals import Group, names
 
@@ -95,10 +95,27 @@ def pong_port(handle, send, receive, spins, messages, stop):
     return n
 
 
+class Carrier(Protocol):
+    """What a ping-pong needs of ``gfm_hil.links.Link``."""
+
+    @property
+    def port(self) -> Port | None:
+        """For compiled loops, or None."""
+
+    def send(self, message: bytes) -> bool:
+        """Hand a message over."""
+
+    def receive(self) -> bytes | None:
+        """The next message, or None."""
+
+    def close(self) -> None:
+        """Let go of everything."""
+
+
 class LinkEnd:
     """One end of an open link, by its port where it has one."""
 
-    def __init__(self, link: Link, messages: Messages) -> None:
+    def __init__(self, link: Carrier, messages: Messages) -> None:
         self._link, self._messages = link, messages
         self._bytes = [row.tobytes() for row in messages]
 

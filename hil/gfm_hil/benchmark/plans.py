@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,8 +107,9 @@ def _loop(options: Namespace) -> Step:
     names = laws(options.laws) or list(inproc_loop.LAWS)
     modes = split("--mode", options.mode, latency.MODES)
     seconds = within("--seconds", options.seconds, 0.1, 3600)
-    plan = closed_loop.Plan(
-        links=check_links(split("--links", options.links)),
+    links = check_links(split("--links", options.links))
+    asked = closed_loop.Plan(
+        links=links,
         loads=split("--load", options.load, LOADS),
         policy=policies("auto")[0],
         lockstep_s=seconds,
@@ -117,13 +119,19 @@ def _loop(options: Namespace) -> Step:
 
     def step(content: dict[str, Any], tell: Tell) -> None:
         found: dict[str, Any] = {}
+        tell("trying the links", 0.0)
+        usable, remarks = closed_loop.usable(links)
+        content["remarks"] += remarks
+        plan = replace(asked, links=usable)
         if "lockstep" in modes:
             with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
                 turns = plan.rounds
                 found["laws"] = inproc_loop.measure(names, _TICKS, turns, Path(place), tell)
-            found["lockstep"] = closed_loop.measure_lockstep(plan, tell)
+            found["lockstep"], remarks = closed_loop.measure_lockstep(plan, tell)
+            content["remarks"] += remarks
         if "realtime" in modes:
-            found["realtime"] = closed_loop.measure_realtime(plan, tell)
+            found["realtime"], remarks = closed_loop.measure_realtime(plan, tell)
+            content["remarks"] += remarks
         content["loop"] = found
 
     return step

@@ -22,7 +22,6 @@ _BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS
 _CAUSE_COLOURS = dict(zip(CAUSES, (_BLUE, _ORANGE, _SKY, "#b8b8b8"), strict=True))
 _LINK_COLOURS = {"shm": _BLUE, "zmq": _RED, "can": _GREEN, "udp": _GREEN}
 _OTHERS = (_PINK, _ORANGE, _SKY)
-_NINES = 6  # the axis ends at 99.9999 %
 
 
 def figures(content: dict[str, Any]) -> dict[str, bytes]:
@@ -68,15 +67,15 @@ def _curve(row: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64
     return 1 / beyond, us
 
 
-def _percentile_axis(axes: Axes) -> None:
-    marks = [2.0] + [10.0**k for k in range(1, _NINES + 1)]
+def _percentile_axis(axes: Axes, nines: int) -> None:
+    marks = [2.0] + [10.0**k for k in range(1, nines + 1)]
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlim(1.0, 10.0**_NINES)
+    axes.set_xlim(1.0, 2 * 10.0**nines)
     shares = [f"{100 * (1 - 1 / m):.{max(0, k - 2)}f} %" for k, m in enumerate(marks)]
     axes.set_xticks(marks, shares)
     axes.minorticks_off()
-    axes.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    axes.yaxis.set_major_formatter(lambda x, _: f"{x:,g}" if x < 1e4 else f"{x:,.0f}")
     axes.set_xlabel("share of all that take no longer", fontsize=9)
 
 
@@ -91,13 +90,14 @@ def _panels(
     size = (4.9 * max(len(across), 1) + 2.0, 3.1 * len(down) + 0.4)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(down), len(across), squeeze=False, sharex=True, sharey=True)
+    nines = int(np.log10(max(r["n"] for r in rows)))
     for i, first in enumerate(down):
         for j, second in enumerate(across):
             some = [r for r in rows if (r[keys[0]], r[keys[1]]) == (first, second)]
             for k, row in enumerate(some):
                 draw(grid[i][j], row, k)
             _plain(grid[i][j], heading(first, second))
-            _percentile_axis(grid[i][j])
+            _percentile_axis(grid[i][j], nines)
             if i + 1 < len(down):
                 grid[i][j].set_xlabel("")
     handles, labels = grid[0][0].get_legend_handles_labels()

@@ -1,0 +1,69 @@
+"""What others offer for the same purpose, from PyPI; measured where it is installed."""
+
+from __future__ import annotations
+
+import ctypes
+from importlib.util import find_spec
+from typing import Any
+
+from gfm_hil.links.base import Side
+from gfm_hil.links.port import Port
+
+_ROOM = 64  # messages, as in the links
+
+
+def has_iceoryx2() -> bool:
+    """Whether its Python binding can be imported; it does not install flatbuffers by itself."""
+    return find_spec("iceoryx2") is not None and find_spec("flatbuffers") is not None
+
+
+class Iceoryx2Link:
+    """One end of a link over iceoryx2's publish-subscribe: shared memory, driven from Python.
+
+    Args:
+        side: of the bench.
+        name: of the two services, unique on this machine.
+        longest: bytes of a message.
+    """
+
+    port: Port | None = None
+
+    def __init__(self, side: Side, name: str, longest: int) -> None:
+        import iceoryx2 as iox2
+
+        iox2.set_log_level(iox2.LogLevel.Fatal)
+        node = iox2.NodeBuilder.new().create(iox2.ServiceType.Ipc)
+
+        def service(way: str) -> Any:
+            return (
+                node.service_builder(iox2.ServiceName.new(f"{name}/{way}"))
+                .publish_subscribe(iox2.Slice[ctypes.c_uint8])
+                .subscriber_max_buffer_size(_ROOM)
+                .open_or_create()
+            )
+
+        ways = ("u", "y") if side == "controller" else ("y", "u")
+        out, into = (service(way) for way in ways)
+        self._publisher = out.publisher_builder().initial_max_slice_len(longest).create()
+        self._subscriber = into.subscriber_builder().create()
+        self._keep: list[Any] = [node, out, into]
+
+    def send(self, message: bytes) -> bool:
+        """Publish a message."""
+        sample = self._publisher.loan_slice_uninit(len(message))
+        ctypes.memmove(sample.payload().as_ptr(), message, len(message))
+        return bool(sample.assume_init().send())
+
+    def receive(self) -> bytes | None:
+        """The next message, or None."""
+        sample = self._subscriber.receive()
+        if sample is None:
+            return None
+        payload = sample.payload()
+        return ctypes.string_at(payload.as_ptr(), payload.len())
+
+    def close(self) -> None:
+        """Let go of the shared memory."""
+        self._publisher.delete()
+        self._subscriber.delete()
+        self._keep.clear()
