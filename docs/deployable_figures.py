@@ -1,9 +1,12 @@
-"""Figures of docs/deployable.md: sigma over delay and line of printed and deployable gains, and
-what the ceiling on gamma buys. Usage: python docs/deployable_figures.py    (about a minute)
+"""Figures of docs/deployable.md: sigma over delay, line and resistance, overshoot, the frontier.
+
+Usage: python docs/deployable_figures.py    (about a minute; the frontier is drawn from
+docs/deployable_frontier.csv, which docs/deployable_frontier.py writes)
 """
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,9 @@ from gfm_runtime import law_file
 FIGURES = Path(__file__).resolve().parent / "_static" / "figures"
 LAWS = ("mimo-gfm", "mimo-gfm-deployable")
 NAMES = ("printed gains", "deployable gains")
+RIG_LAW, RIG_R = "mimo-gfm-deployable-rig", (0.33, 1.0, 3.0)
+FRONTIER = Path(__file__).resolve().parent / "deployable_frontier.csv"
+MET = (0.1, 0.005)  # 1/s, a part of the step: the searches ask for so much more than is needed
 RESISTANCE = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
 
 
@@ -78,27 +84,69 @@ def resistance() -> None:
 
 def overshoot() -> None:
     """The nonlinear bench: overshoot of every step from 0.5 to 1 p.u. over L_g, both sources."""
+    both, rig = Box(delay=(1.0, 5.0), P_ref=(0.5,)), {"R_f": RIG_R, "R_g": RIG_R}
+    shown = (
+        (LAWS[1], replace(both, dc=("controlled",)), "controlled"),
+        (LAWS[1], replace(both, dc=("regulated",)), "regulated"),
+        (RIG_LAW, replace(both, dc=("regulated",), **rig), "regulated, its law, R ≥ × 0.33"),
+    )
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
-    for dc, colour in zip(Box().dc, ("C0", "C1"), strict=True):
-        points = Box(delay=(1.0, 5.0), P_ref=(0.5,), dc=(dc,)).corners()
-        runs = [step_run(p, LAWS[1]) for p in points]
-        shift = 0.97 if dc == "controlled" else 1.03
+    for k, (law, box, name) in enumerate(shown):
+        runs = [step_run(p, law) for p in box.corners()]
+        shift = 0.96 + 0.04 * k
         axis.plot(
             [shift * r.point.L_g for r in runs],
             [100 * r.overshoot for r in runs],
             ".",
-            color=colour,
-            label=f"DC source {dc}",
+            label=f"DC source {name}",
         )
     axis.plot([0.7, 3.6, 3.6, 23], [5, 5, 20, 20], "k--", lw=1, label="asked for")
     axis.set(xscale="log", xlabel="L_g / nominal", ylabel="overshoot [% of the step]")
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside upper center", ncols=2, fontsize=8)
     figure.savefig(FIGURES / "deployable_overshoot.png", dpi=150)
+
+
+def frontier() -> None:
+    """The least gamma found over what is asked; hollow where the search did not meet it all.
+
+    The line is the least gamma of all points that are asked as much or more: these gains hold too.
+    """
+    with FRONTIER.open(encoding="utf-8", newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    panels = (
+        ("controlled", "delay", 100.0, "largest loop delay [µs], $L_g$ to × 20"),
+        ("regulated", "R", 1.0, "least $R_f$, $R_g$ / nominal"),
+        ("regulated", "overshoot", 100.0, "overshoot allowed [%], R ≥ × 0.33"),
+    )
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axis, (dc, moved, factor, label) in zip(figure.subplots(1, 3), panels, strict=True):
+        some = [r for r in rows if (r["dc"], r["moved"]) == (dc, moved)]
+        some.sort(key=lambda r: float(r["value"]))
+        if moved != "delay":  # the smaller, the more is asked
+            some.reverse()
+        colour = "C0" if dc == "controlled" else "C1"
+        for met, fill in ((True, "full"), (False, "none")):
+            found = [r for r in some if is_met(r) == met]
+            value = [factor * float(r["value"]) for r in found]
+            gamma = np.array([float(r["gamma"]) for r in found])
+            axis.plot(value, gamma, "o", color=colour, fillstyle=fill)
+            if met:
+                axis.plot(value, np.minimum.accumulate(gamma[::-1])[::-1], "-", color=colour)
+        axis.set(xlabel=label, title=f"DC source {dc}", ylabel="γ beside this source")
+        axis.set_ylim(1.0, 1.1 * max(float(r["gamma"]) for r in some))
+    figure.savefig(FIGURES / "deployable_frontier.png", dpi=150)
+
+
+def is_met(row: dict[str, str]) -> bool:
+    """Whether a line of the table keeps what is needed."""
+    return float(row["slow"]) <= MET[0] and float(row["beyond"]) <= MET[1]
 
 
 if __name__ == "__main__":
     region()
     resistance()
     overshoot()
+    frontier()
