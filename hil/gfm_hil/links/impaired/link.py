@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from gfm_hil.links.impaired.stage import (
     admit,
     make_stage,
     release,
+    waiting,
 )
 from gfm_hil.links.port import Port, port_function
 
@@ -40,21 +42,23 @@ class ImpairedLink:
 
     @property
     def injected(self) -> dict[str, int]:
-        """How many messages were seen, and how many of them met which fate."""
-        return {name: int(self._stage[index]) for name, index in COUNTED.items()}
+        """How many messages were seen, how many of them met which fate, how many still wait."""
+        counts = {name: int(self._stage[index]) for name, index in COUNTED.items()}
+        return {**counts, "waiting": int(waiting(self._stage))}
 
     def send(self, message: bytes) -> bool:
         """As the link underneath."""
         return self._link.send(message)
 
     def receive(self) -> bytes | None:
-        """The next message that the stage lets through."""
-        while (message := self._link.receive()) is not None:
+        """The next message that the stage lets through; what comes after it stays on the link."""
+        while not (size := release(self._stage, self._message)):
+            if (message := self._link.receive()) is None:
+                return None
             if len(message) <= LONGEST:
                 self._message[: len(message)] = np.frombuffer(message, np.uint8)
                 admit(self._stage, self._message, len(message))
-        size = release(self._stage, self._message)
-        return self._message[:size].tobytes() if size else None
+        return self._message[:size].tobytes()
 
     def wait(self, seconds: float) -> bool:
         """Sleep until a message arrives underneath, shortly at most: one may be due by itself."""
@@ -79,12 +83,17 @@ _as_pointer: Any = _pointer
 
 
 def _port(inner: Port, stage: np.ndarray) -> Port:
-    """The port of an impaired link: closures over the functions of the one underneath.
+    """The port of an impaired link: the stage as its handle, with the one underneath in it."""
+    stage[INNER], stage[INNER_WORDS] = inner.handle.ctypes.data, len(inner.handle)
+    return Port(stage, *_functions(inner.send, inner.receive), inner.spins)
+
+
+@cache
+def _functions(inner_send: Any, inner_receive: Any) -> tuple[Any, Any]:
+    """Send and receive of an impaired port: closures over those of the one underneath.
 
     Compiled anew in every process, since they hold addresses; it takes a second.
     """
-    stage[INNER], stage[INNER_WORDS] = inner.handle.ctypes.data, len(inner.handle)
-    inner_send, inner_receive = inner.send, inner.receive
 
     def send(handle, message):
         under = carray(_as_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
@@ -92,12 +101,14 @@ def _port(inner: Port, stage: np.ndarray) -> Port:
 
     def receive(handle, message):
         under = carray(_as_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
-        size = inner_receive(under, message)
-        while size > 0:
-            if size <= len(message):
-                admit(handle, message, size)
-            size = inner_receive(under, message)
-        return release(handle, message)
+        size = release(handle, message)
+        while size == 0:
+            came = inner_receive(under, message)
+            if came <= 0:
+                return 0
+            if came <= len(message):
+                admit(handle, message, came)
+            size = release(handle, message)
+        return size
 
-    return Port(stage, port_function(send, cached=False), port_function(receive, cached=False),
-                inner.spins)  # fmt: skip
+    return port_function(send, cached=False), port_function(receive, cached=False)

@@ -17,10 +17,10 @@ from gfm_hil.loops.clock import end_this_process, now_ns
 INNER, INNER_WORDS = 0, 1  # address and length of the handle of the link underneath
 _RANDOM, _LOSS, _LOSS_MORE, _CORRUPT, _BITS, _DUPLICATE, _REORDER = range(2, 9)
 _DELAY, _JITTER, _PAUSE_AT, _PAUSE, _KILL_AT, _BURST, _SILENT_UNTIL, _LAST_DUE = range(9, 17)
-SEEN, LOST, CORRUPTED, DUPLICATED, REORDERED, PAUSED, _HELD = range(17, 24)
+SEEN, LOST, CORRUPTED, DUPLICATED, REORDERED, PAUSED, DROPPED, _HELD = range(17, 25)
 COUNTED = {"seen": SEEN, "lost": LOST, "corrupted": CORRUPTED, "duplicated": DUPLICATED,
-           "reordered": REORDERED, "paused": PAUSED}  # fmt: skip
-_QUEUE = 24
+           "reordered": REORDERED, "paused": PAUSED, "dropped": DROPPED}  # fmt: skip
+_QUEUE = 25
 
 PLACES, _WORDS = 64, 64  # messages in the queue; words of 8 bytes in each
 _DUE, _KEY, _SIZE, _DATA = range(4)  # of one place: ns, order, bytes (0: free), the message
@@ -34,10 +34,12 @@ _LONG = 1_000_000_000  # ns that a frame waits at most for the next one to overt
 def make_stage(settings: Impairment, side_number: int) -> NDArray[np.int64]:
     """A stage in which nothing waits; each side draws from a sequence of its own."""
     h = np.zeros(_QUEUE + PLACES * _PLACE, np.int64)
-    h[_RANDOM] = settings.seed * 2 + side_number + 1
+    seed = (settings.seed * 2 + side_number + 1) * 0x9E3779B97F4A7C15  # few bits to many
+    h[_RANDOM] = np.uint64(seed % 2**64).astype(np.int64)
+    loss, more = settings.loss, max(1 - 1 / settings.burst, settings.loss)
     for index, value in (
-        (_LOSS, settings.loss / settings.burst),  # of a burst's beginning
-        (_LOSS_MORE, 1 - 1 / settings.burst),
+        (_LOSS, loss * (1 - more) / (1 - loss) if loss < 1 else 1.0),  # after a frame that came
+        (_LOSS_MORE, more),  # after one that was lost
         (_CORRUPT, settings.corrupt),
         (_DUPLICATE, settings.duplicate),
         (_REORDER, settings.reorder),
@@ -64,7 +66,7 @@ def _draw(h):
 
 @njit(cache=True, nogil=True)
 def _keep(h, message, size, due, key):
-    """Put a copy into a free place of the queue; -1 if there is none, and it is gone."""
+    """Put a copy into a free place of the queue; -1 if there is none: it is gone and counted."""
     for n in range(PLACES):
         at = _QUEUE + n * _PLACE
         if h[at + _SIZE] == 0:
@@ -75,7 +77,27 @@ def _keep(h, message, size, due, key):
                     value |= np.uint64(message[k]) << np.uint64(8 * (k % 8))
                 h[at + _DATA + word] = np.int64(value)
             return at
+    h[DROPPED] += 1
     return -1
+
+
+@njit(cache=True, nogil=True)
+def _flip(h, message, size):
+    """Flip as many different bits as the settings say, each choice of them as likely."""
+    left = min(h[_BITS], 8 * size)
+    for bit in range(8 * size):
+        if _draw(h) * (8 * size - bit) < left * _ONE:
+            message[bit // 8] ^= np.uint8(1 << (bit % 8))
+            left -= 1
+
+
+@njit(cache=True, nogil=True)
+def waiting(h):
+    """How many messages are in the queue."""
+    count = 0
+    for n in range(PLACES):
+        count += h[_QUEUE + n * _PLACE + _SIZE] > 0
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -104,22 +126,21 @@ def admit(h, message, size):
     due = max(due, h[_LAST_DUE])  # a link keeps order, unless it is told not to
     h[_LAST_DUE] = due
     chance = _draw(h)
-    lost = chance < (h[_LOSS_MORE] if h[_BURST] else h[_LOSS])
+    limit = h[_LOSS_MORE] if h[_BURST] else h[_LOSS]
+    lost = chance < limit
     h[_BURST] = lost
     if lost:
         h[LOST] += 1
         return
-    chance -= h[_LOSS]
+    chance -= limit
     if 0 <= chance < h[_CORRUPT]:
         h[CORRUPTED] += 1
-        for _ in range(h[_BITS]):
-            bit = (_draw(h) * (8 * size)) >> 32
-            message[bit // 8] ^= np.uint8(1 << (bit % 8))
+        _flip(h, message, size)
     chance -= h[_CORRUPT]
     twice = 0 <= chance < h[_DUPLICATE]
     chance -= h[_DUPLICATE]
-    behind = 0 <= chance < h[_REORDER]
     held = h[_HELD]
+    behind = held == 0 and 0 <= chance < h[_REORDER]  # one that waits is to be overtaken
     h[_HELD] = 0
     if behind:
         h[REORDERED] += 1
