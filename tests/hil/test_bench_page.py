@@ -123,6 +123,8 @@ def test_page_needs_nothing_else(content: dict[str, Any], tmp_path: Path) -> Non
     for link in page.links:
         assert link.startswith("data:image/svg+xml;base64,")
         ET.fromstring(base64.b64decode(link.split(",")[1]))  # is an image
+    files = {path.stem: path.read_bytes() for path in tmp_path.glob("*.svg")}
+    assert files == figures(content)
     written = (tmp_path / "bench.html").read_text("utf-8")
     assert not re.search(r"<script|@import|url\(|https?://", written)
 

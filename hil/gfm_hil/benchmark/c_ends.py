@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.c_code import NoCompiler, load_c
+from gfm_hil.benchmark.c_code import load_c
+from gfm_hil.errors import UserError
 from gfm_hil.links.base import Side
 
 _SLOTS = 2 * 1024  # bytes, two slot_t
 _WORD = ctypes.c_int64
 _ORDER: dict[Side, int] = {"controller": 1, "plant": -1}
-_ROOM = 64  # messages, as in the link
+_ROOM, _KERNEL_ROOM = 64, 16384  # messages and bytes, as in the link
 
 
 class CEnd:
@@ -83,8 +84,13 @@ def open_udp(library: Path, side: Side, ports: str, size: int) -> CEnd:
 
 
 def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
-    """libzmq, the very one that the link uses, on a socket with the options of the link's."""
+    """libzmq, the very one that the link uses, on a socket with the options of the link's.
+
+    Raises:
+        UserError: its functions cannot be found.
+    """
     import zmq
+    from zmq.backend.cython import _zmq
 
     keep = ExitStack()
     context = keep.enter_context(zmq.Context())
@@ -92,24 +98,16 @@ def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
     end.set(zmq.LINGER, 0)
     end.set(zmq.SNDHWM, _ROOM)
     end.set(zmq.RCVHWM, _ROOM)
+    end.set(zmq.SNDBUF, _KERNEL_ROOM)
+    end.set(zmq.RCVBUF, _KERNEL_ROOM)
     if side == "controller":
         end.bind(endpoint)
     else:
         end.connect(endpoint)
-    functions = loaded_libzmq()
-    call = [ctypes.cast(functions[name], ctypes.c_void_p) for name in ("zmq_send", "zmq_recv")]
+    libzmq = ctypes.CDLL(_zmq.__file__)  # finds what it was linked to
+    try:
+        call = [ctypes.cast(libzmq[name], ctypes.c_void_p) for name in ("zmq_send", "zmq_recv")]
+    except AttributeError:
+        keep.close()
+        raise UserError("pyzmq hides its libzmq: nothing for C to call") from None
     return CEnd(library, "zmq", [ctypes.c_void_p(end.underlying), *call], size, keep)
-
-
-def loaded_libzmq() -> ctypes.CDLL:
-    """The shared library that pyzmq has loaded.
-
-    Raises:
-        NoCompiler: it is not a library of its own.
-    """
-    with Path("/proc/self/maps").open(encoding="utf-8") as maps:
-        paths = {line.split(maxsplit=5)[-1].strip() for line in maps if "libzmq" in line}
-    for path in sorted(paths):
-        if ".so" in path:
-            return ctypes.CDLL(path)
-    raise NoCompiler("pyzmq was built with libzmq inside: nothing for C to call")

@@ -75,8 +75,10 @@ _SECTIONS = {
 
 
 def write_page(content: dict[str, Any], path: Path) -> None:
-    """Write the page of a result."""
+    """Write the page of a result, and its figures beside it as files."""
     made = figures(content)
+    for name, svg in made.items():
+        path.with_name(f"{name}.svg").write_bytes(svg)
     by_section: dict[str, list[str]] = {name: [] for name in _SECTIONS}
     for section, table in _tables(content):
         by_section[section].append(_table(table))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.frames import FrameWriter
 from gfm_hil.links import Port
-from gfm_hil.loops.clock import give_way, now_ns, wait_until
+from gfm_hil.loops.clock import between_looks, now_ns, wait_until
 from gfm_runtime.signals import Group, names
 
 SILENCE_NS = 1_000_000_000
@@ -64,8 +64,7 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
         looks = 0
         while receive(handle, answer) == 0:
             looks += 1
-            if looks > spins:
-                give_way()
+            between_looks(looks, spins, False)
             if looks % _LOOKS == 0 and now_ns() - begin > SILENCE_NS:
                 return -1
         now = now_ns()
@@ -84,8 +83,7 @@ def pong_port(handle, send, receive, spins, messages, stop):
     while stop[0] == 0:
         if receive(handle, heard) == 0:
             looks += 1
-            if looks > spins:
-                give_way()
+            between_looks(looks, spins, False)
             continue
         for i in range(len(message)):
             message[i] = messages[n % len(messages), i]

@@ -52,7 +52,7 @@ def _everything(options: Namespace) -> list[Step]:
         _latency(with_(seconds=0.1, rounds=5)),
         _jitter(with_(seconds=0.1, rounds=5)),
         _kernel(with_(rounds=3)),
-        _loop(with_(seconds=2.0, rounds=2, laws=",".join(_FEW_LAWS))),
+        _loop(with_(seconds=1.5, rounds=2, laws=",".join(_FEW_LAWS))),
     ]
 
 

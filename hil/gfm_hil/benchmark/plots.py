@@ -180,8 +180,9 @@ def _bars(axes: Axes, labels: Sequence[str], values: Sequence[float], texts: Seq
     axes.set_yticks(y, labels)
     for at, value, text in zip(y, values, texts, strict=True):
         axes.annotate(
-            text, (value, at), (4, 0), textcoords="offset points", va="center", fontsize=8
-        )
+            text, (value, at), (4, 0), textcoords="offset points", va="center", fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+        )  # fmt: skip
 
 
 def _lockstep(rows: list[dict[str, Any]]) -> Figure:
