@@ -24,14 +24,14 @@ from gfm_plant import NoEquilibrium
 Vector = NDArray[np.float64]
 
 EVALUATIONS = 240  # of each start, before its polish
-_STARTS = 2, 2  # so many, and so many more for every gain
+_STARTS = 6  # and one more for every gain
 _SAME = 1e-6  # relative: of a height that no gain moves, and of two that are one
 _SETTLES = 3  # polishes at the operating point of the gains that the last one came to
 
 
 def starts_for(gains: int) -> int:
     """How many starts a law of so many free gains is given."""
-    return _STARTS[0] + _STARTS[1] * gains
+    return _STARTS + gains
 
 
 def tune_paper(

@@ -82,6 +82,6 @@ def _best_step(nearby: Model, low: Vector, high: Vector) -> Vector:
             "jac": lambda z: np.hstack([nearby.slopes(z[:n]), -np.ones((len(nearby.base), 1))]),
         },
         method="SLSQP",
-        options={"maxiter": 60, "ftol": 1e-9},
+        options={"maxiter": 40, "ftol": 1e-9},
     )
     return np.clip(found.x[:n], low, high)

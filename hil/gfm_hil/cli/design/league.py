@@ -32,7 +32,7 @@ def add(kinds: Any) -> None:
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
     command.add_argument("--evaluations", type=int, default=EVALUATIONS, help="of each start")
-    command.add_argument("--starts", type=int, default=24, help="the given start and random ones")
+    command.add_argument("--starts", type=int, default=17, help="the given start and random ones")
     command.add_argument("--out", help="folder to write, or to go on with; runs/league-<time>")
     command.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     command.add_argument("--json", action="store_true", help="print league.json, nothing else")

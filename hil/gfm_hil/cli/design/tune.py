@@ -39,7 +39,9 @@ def add(kinds: Any) -> None:
         "--evaluations", type=int, default=EVALUATIONS, help="of each start, before its polish"
     )
     command.add_argument(
-        "--starts", type=int, help="the given start and random ones; 2, and 2 more a gain, if left"
+        "--starts",
+        type=int,
+        help="the given start and random ones; 6, and one more a gain, if left out",
     )
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
     command.add_argument("--full-order", action="store_true", help="a bound from below besides")
