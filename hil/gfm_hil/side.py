@@ -7,6 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gfm_hil.bench import Bench, make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import PeerLost, UserError
@@ -15,7 +18,9 @@ from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import Side
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.loops.drive import compile_loops
+from gfm_hil.loops.records import RING, TOLD
 from gfm_hil.loops.thread import run_compiled
+from gfm_hil.operator.desk import Desk
 from gfm_hil.plant_side import run_plant
 from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording import Part, keep_in_memory, record_controller, record_plant
@@ -58,38 +63,67 @@ def _run(
         keep_in_memory(folder, scenario.ticks)
     part = Part.create(folder, side, scenario.ticks)
     compile_side(side, bench, part)
-    rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
-    link: Link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
-    if rights is not None:
-        if link.port is None:  # a loop in Python never sleeps
-            rights["policy"] = ordinary_priority()
-        timeline.write(0, "scheduling", side=side, **rights)
+    told = np.zeros(TOLD, np.int64)
+
+    def ring() -> None:
+        told[RING] += 1
+
+    # the desk comes first: its threads must not inherit the rights that the loop asks for
+    with Desk(side, bench, timeline, folder, ring, interrupt.ask):
+        try:
+            seen = _meet_and_run(side, bench, endpoint, part, timeline, told, interrupt, notice)
+            (folder / f"link_{side}.json").write_text(json.dumps({"side": side, **seen}))
+        except PeerLost as problem:
+            timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
+        finally:
+            timeline.close()
+    assert timeline.outcome is not None
+    return timeline.outcome
+
+
+def _meet_and_run(
+    side: Side,
+    bench: Bench,
+    endpoint: str,
+    part: Part,
+    timeline: Timeline,
+    told: NDArray[np.int64],
+    interrupt: Interrupt,
+    notice: Callable[[str], None],
+) -> dict[str, Any]:
+    """Open the link, meet the other side, run; returns what the link saw.
+
+    Raises:
+        PeerLost: there was nobody to run with.
+        UserError: the endpoint is not to be had.
+    """
+    scenario = bench.scenario
+    rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
+    good: Link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
+    link = good
 
     def stopped() -> bool:
         return interrupt.came
 
     try:
-        no_collector_pauses()
-        start = shake_hands(side, link, scenario, stopped, notice)
         if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
-            link = ImpairedLink(link, scenario.link.impairment, side)
+            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: not after START
+        if rights is not None:
+            if link.port is None:  # a loop in Python never sleeps
+                rights["policy"] = ordinary_priority()
+            timeline.write(0, "scheduling", side=side, **rights)
+        no_collector_pauses()
+        start = shake_hands(side, good, scenario, stopped, notice)
         if link.port is not None:
-            reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped)
+            reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped, told)
         else:
             run = run_controller if side == "controller" else run_plant
             reader = run(bench, link, part, timeline, start.t0_ns, stopped)
-        seen: dict[str, Any] = {"side": side, "faults": reader.faults, "one_clock": start.one_clock}
-        if isinstance(link, ImpairedLink):
-            seen["injected"] = link.injected
-        (folder / f"link_{side}.json").write_text(json.dumps(seen))
-    except PeerLost as problem:
-        timeline.end("interrupted" if stopped() else "safe", str(problem), 0)
     finally:
         link.close()
-        timeline.close()
-    assert timeline.outcome is not None
-    return timeline.outcome
+    injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
+    return {"faults": reader.faults, "one_clock": start.one_clock, **injected}
 
 
 def compile_side(side: Side, bench: Bench, part: Part) -> None:

@@ -36,6 +36,10 @@ class Interrupt:
             raise KeyboardInterrupt
         self.came = True
 
+    def ask(self) -> None:
+        """Stop in an orderly way, as one signal would; from any thread."""
+        self.came = True
+
     def __exit__(self, *_: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)

@@ -6,8 +6,9 @@ The log is one JSON object a line, written at once, so that it is there however 
 from __future__ import annotations
 
 import json
+import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,6 +32,15 @@ class Outcome:
     tick: int
 
 
+@dataclass
+class Ticket:
+    """What became of an event that an operator put in: its tick once ``done``, or an error."""
+
+    done: threading.Event = field(default_factory=threading.Event)
+    tick: int = -1
+    error: str = ""
+
+
 class Timeline:
     """The events of one side, or of both in process, and the log of the run.
 
@@ -49,6 +59,7 @@ class Timeline:
             for e in scenario.sorted_events()
             if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in sides
         ]
+        self._inbox: deque[tuple[Any, Ticket]] = deque()
         self._changes = 0
         self._lines: deque[dict[str, Any]] = deque()
         self.put_off = False  # a disk may keep the writer waiting for longer than a tick
@@ -63,19 +74,35 @@ class Timeline:
         """Tick of the next event; far away if there is none."""
         return self._todo[0][0] if self._todo else 2**62
 
+    def insert(self, event: Any) -> Ticket:
+        """Have an event of ours carried out at the next tick; may be called from any thread."""
+        ticket = Ticket()
+        self._inbox.append((event, ticket))
+        return ticket
+
     def carry_out(self, tick: int) -> None:
-        """Carry out every event due at this tick."""
+        """Carry out every event due at this tick, and what was put in."""
         while self._todo and self._todo[0][0] <= tick:
-            event = self._todo.pop(0)[1]
-            self.write(tick, event.type, label=event.label())
-            match event:
-                case Reference():
-                    for name, value in event.values().items():
-                        self._bench.controller.set(name, value, event.ramp_s)
-                case LawChange():
-                    self._bench.controller.select(event.law)
-                case _:
-                    apply_grid_event(event, self._bench.par, self._bench.st)
+            self._carry_out(self._todo.pop(0)[1], tick)
+        while self._inbox:
+            event, ticket = self._inbox.popleft()
+            try:
+                self._carry_out(event, tick, by="operator")
+                ticket.tick = tick
+            except ValueError as problem:  # of a plant that has changed since it was checked
+                ticket.error = str(problem)
+            ticket.done.set()
+
+    def _carry_out(self, event: Any, tick: int, **more: Any) -> None:
+        match event:
+            case Reference():
+                for name, value in event.values().items():
+                    self._bench.controller.set(name, value, event.ramp_s)
+            case LawChange():
+                self._bench.controller.select(event.law)
+            case _:
+                apply_grid_event(event, self._bench.par, self._bench.st)
+        self.write(tick, event.type, label=event.label(), **more)
 
     def look(self, tick: int) -> None:
         """Write down what the tick just done brought: a change of law, a safe state, a trip."""

@@ -21,6 +21,7 @@ from gfm_runtime import LawError
 #: starts without the design tools
 MODULES = {
     "run": "run",
+    "tell": "tell",
     "compare": "compare",
     "campaign": "campaign",
     "bench": "bench",

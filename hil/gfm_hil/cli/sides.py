@@ -43,7 +43,7 @@ def call(options: argparse.Namespace) -> int:
     folder = new_folder(options.out, side)
     if options.part:  # of `gfmhil run`, which puts the parts together
         end_with_parent()
-        run_side(side, scenario, folder)
+        run_side(side, scenario, folder, notice=lambda text: None)
         return 0
     check_free(folder, scenario.ticks)
 

@@ -11,7 +11,17 @@ from numba import njit
 
 from gfm_hil.codec import OUT_OF_SEQUENCE, pack, unpack
 from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until
-from gfm_hil.loops.records import EVENT, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, STOPPED_HERE
+from gfm_hil.loops.records import (
+    BELL,
+    EVENT,
+    LOOK,
+    PEER_SAFE,
+    PEER_STOPPED,
+    RING,
+    SILENT,
+    STOP,
+    STOPPED_HERE,
+)
 from gfm_hil.recording import record_controller
 from gfm_runtime.controller import RUNNING, SAFE, STOPPED, control, missed
 
@@ -23,7 +33,7 @@ _CLIP = 0.25  # of a tick: a stall must not throw the lock
 
 @njit(cache=True, nogil=True)
 def controller_ticks(
-    send, receive, handle, spins, out, into, reader, loop, stop, ctl, laws, states, est, y, u,
+    send, receive, handle, spins, out, into, reader, loop, told, ctl, laws, states, est, y, u,
     rows, times, progress, event,
 ):  # fmt: skip
     """Answer frames; returns why it came back, one of ``gfm_hil.loops.records``.
@@ -32,7 +42,7 @@ def controller_ticks(
     before; if frames were lost on the way there, with that tick's y in hand (``pending``).
 
     Args:
-        send, receive, handle, spins, out, into, reader, loop, stop: as for ``plant_ticks``.
+        send, receive, handle, spins, out, into, reader, loop, told: as for ``plant_ticks``.
         ctl, laws, states, est: the controller's records.
         y, u: vectors of ``gfm_hil.bench.Bench``.
         rows, times, progress: of the recording's part.
@@ -43,7 +53,7 @@ def controller_ticks(
         if not r.pending:
             before = r.tick
             why = _next_frame(
-                receive, handle, spins, into, reader, r, stop, ctl, y, times, len(rows)
+                receive, handle, spins, into, reader, r, told, ctl, y, times, len(rows)
             )
             if why >= 0:
                 return why
@@ -74,11 +84,14 @@ def controller_ticks(
 
 @njit(cache=True, nogil=True)
 def _next_frame(
-    receive, handle, spins, into, reader, r, stop, ctl, y, times, ticks
+    receive, handle, spins, into, reader, r, told, ctl, y, times, ticks
 ):  # fmt: skip
     """Wait for a good frame of the plant: -1, its tick in ``r``; or why to come back."""
     got, got_bytes = into
-    if r.realtime and r.done > 0 and stop[0] == 0:
+    if told[RING] != r.bell:
+        r.bell = told[RING]
+        return BELL
+    if r.realtime and r.done > 0 and told[STOP] == 0:
         wake = r.t0 + int(r.expected) - AHEAD_NS
         if wake - now_ns() > 0:
             sleep_until(min(wake, now_ns() + r.T))
@@ -107,8 +120,11 @@ def _next_frame(
                     missed(ctl)
                 if ctl[0].state == SAFE:
                     return LOOK
-        if stop[0] != 0:
+        if told[STOP] != 0:
             return STOPPED_HERE
+        if told[RING] != r.bell:
+            r.bell = told[RING]
+            return BELL
         between_looks(looks, spins, not r.realtime)
     if reader[0].state == SAFE:
         return PEER_SAFE

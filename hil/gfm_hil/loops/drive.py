@@ -19,6 +19,7 @@ from gfm_hil.links.base import Side
 from gfm_hil.loops.controller import controller_ticks
 from gfm_hil.loops.plant import plant_ticks
 from gfm_hil.loops.records import (
+    BELL,
     DONE,
     EVENT,
     LATE,
@@ -27,6 +28,7 @@ from gfm_hil.loops.records import (
     PEER_STOPPED,
     SILENT,
     STOPPED_HERE,
+    TOLD,
     make_loop,
 )
 from gfm_hil.recording import Part
@@ -42,12 +44,12 @@ class _Loop:
     """One side's compiled loop with everything that its calls have in common."""
 
     def __init__(
-        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, stop: NDArray[np.int64]
+        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, told: NDArray[np.int64]
     ) -> None:
         assert link.port is not None
         scenario, port, self.part = bench.scenario, link.port, part
         plant = side == "plant"
-        self.bench, self.link, self.stop = bench, link, stop
+        self.bench, self.link = bench, link
         own: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
         self.writer, self.reader = FrameWriter(own[0]), FrameReader(own[1])
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
@@ -58,7 +60,7 @@ class _Loop:
             receive, spins = port.patient, _FAR  # it sleeps by itself
         self._arguments: tuple[Any, ...] = (
             port.send, receive, port.handle, spins, (w.sequence, w.frame, w.message),
-            (r.frame, r.message), r.record, self.loop, stop, *records, bench.y, bench.u,
+            (r.frame, r.message), r.record, self.loop, told, *records, bench.y, bench.u,
             part.signals, part.times, part.progress,
         )  # fmt: skip
         self._call = plant_ticks if plant else controller_ticks
@@ -78,10 +80,10 @@ class _Loop:
 
 
 def drive_plant(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, stop: NDArray[np.int64]
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, told: NDArray[np.int64]
 ) -> FrameReader:
     """Run the plant's side of a scenario after the handshake; returns its frame counters."""
-    loop, ticks = _Loop("plant", bench, link, part, t0_ns, stop), bench.scenario.ticks
+    loop, ticks = _Loop("plant", bench, link, part, t0_ns, told), bench.scenario.ticks
     loop.loop["u_last"] = loop.loop["u_before"] = bench.u
     while timeline.running:
         timeline.carry_out(loop.tick)
@@ -108,17 +110,18 @@ def drive_plant(
 
 
 def drive_controller(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, stop: NDArray[np.int64]
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, told: NDArray[np.int64]
 ) -> FrameReader:
     """Run the controller's side of a scenario after the handshake; returns its frame counters."""
-    loop, ctl = _Loop("controller", bench, link, part, t0_ns, stop), bench.controller.ctl
+    loop, ctl = _Loop("controller", bench, link, part, t0_ns, told), bench.controller.ctl
+    why = EVENT
     loop.loop["heard"] = time.monotonic_ns()
     while timeline.running:
         event = timeline.next_tick()
         if loop.loop["pending"][0]:  # frames were lost on the way to the event
             timeline.carry_out(loop.tick)
             event = timeline.next_tick()
-        elif event <= loop.tick + 1:
+        elif event <= loop.tick + 1 or why == BELL:
             timeline.carry_out(loop.tick + 1)
             event = timeline.next_tick()
         why = loop.go(event)
@@ -147,7 +150,7 @@ def drive_controller(
 
 def compile_loops(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
-    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(1, np.int64))
+    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(TOLD, np.int64))
     loop.go(_FAR if side == "controller" else 0)
 
 

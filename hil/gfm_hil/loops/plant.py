@@ -9,7 +9,18 @@ from numba import njit
 
 from gfm_hil.codec import pack, unpack
 from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until, wait_until
-from gfm_hil.loops.records import DONE, LATE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, STOPPED_HERE
+from gfm_hil.loops.records import (
+    BELL,
+    DONE,
+    LATE,
+    LOOK,
+    PEER_SAFE,
+    PEER_STOPPED,
+    RING,
+    SILENT,
+    STOP,
+    STOPPED_HERE,
+)
 from gfm_hil.recording import record_plant
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.controller import SAFE, STOPPED
@@ -23,7 +34,7 @@ _CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
 
 @njit(cache=True, nogil=True)
 def plant_ticks(
-    send, receive, handle, spins, out, into, reader, loop, stop, par, st, y, u, rows, times,
+    send, receive, handle, spins, out, into, reader, loop, told, par, st, y, u, rows, times,
     progress, last,
 ):  # fmt: skip
     """Run ticks until ``last``; returns why it came back, one of ``gfm_hil.loops.records``.
@@ -34,7 +45,7 @@ def plant_ticks(
             receive into; see ``gfm_hil.codec``.
         reader: counters of what was received.
         loop: one-element array of ``loop_dtype``.
-        stop: shape (1,), int64; not 0 asks the loop to come back.
+        told: shape (2,), int64, what other threads tell it, see ``gfm_hil.loops.records``.
         par, st, y, u: the plant's records and the vectors of ``gfm_hil.bench.Bench``.
         rows, times, progress: of the recording's part.
     """
@@ -42,8 +53,11 @@ def plant_ticks(
     sequence, frame, message = out
     got, got_bytes = into
     while r.tick < last:
-        if stop[0] != 0:
+        if told[STOP] != 0:
             return STOPPED_HERE
+        if told[RING] != r.bell:
+            r.bell = told[RING]
+            return BELL
         k = r.tick
         due = r.t0 + k * r.T
         gap = 0
@@ -63,7 +77,7 @@ def plant_ticks(
         again = sent + (r.patience if r.realtime else r.repeat)
         while True:
             came, gap = _answer(
-                receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k,
+                receive, handle, spins, got, got_bytes, reader, r, told, u, times, k,
                 min(until, again), gap,
             )  # fmt: skip
             if came != OVERDUE or again >= until:
@@ -104,7 +118,7 @@ def plant_ticks(
 
 @njit(cache=True, nogil=True)
 def _answer(
-    receive, handle, spins, got, got_bytes, reader, r, stop, u, times, k, until, gap
+    receive, handle, spins, got, got_bytes, reader, r, told, u, times, k, until, gap
 ):  # fmt: skip
     """Wait for u[k]: whether it is FRESH, OVERDUE or not awaited any more (LEAVING), and the
     longest gap between two looks at the clock."""
@@ -128,6 +142,6 @@ def _answer(
             if now >= until:
                 return OVERDUE, gap
         if size <= 0:
-            if not r.realtime and stop[0] != 0:
+            if not r.realtime and told[STOP] != 0:
                 return LEAVING, gap
             between_looks(looks, spins, not r.realtime)

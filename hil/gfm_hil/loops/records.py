@@ -8,7 +8,10 @@ from gfm_hil.scenario_model import Scenario
 from gfm_runtime.signals import NU
 
 #: why a loop returned
-DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT = range(8)
+DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT, BELL = range(9)
+
+#: what other threads tell a loop, int64: to come back for good, and, by counting up, for a moment
+STOP, RING, TOLD = range(3)
 
 loop_dtype = np.dtype(
     [
@@ -26,6 +29,7 @@ loop_dtype = np.dtype(
         ("heard", "i8"),  # when the last message came, ns
         ("pending", "i8"),  # a frame was taken but not yet computed
         ("done", "i8"),  # ticks computed
+        ("bell", "i8"),  # as last heard
         ("u_last", "f8", (NU,)),  # the two newest u that came in time
         ("u_before", "f8", (NU,)),
         ("expected", "f8"),  # arrival of the next frame by the phase lock, ns after t0

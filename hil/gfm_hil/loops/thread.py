@@ -6,12 +6,14 @@ import threading
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameReader
 from gfm_hil.links import Link
 from gfm_hil.links.base import Side
 from gfm_hil.loops.drive import drive_controller, drive_plant
+from gfm_hil.loops.records import STOP
 from gfm_hil.realtime import stand_back
 from gfm_hil.recording import Part
 from gfm_hil.timeline import Timeline
@@ -27,20 +29,21 @@ def run_compiled(
     timeline: Timeline,
     t0_ns: int,
     stopped: Callable[[], bool],
+    told: NDArray[np.int64],
 ) -> FrameReader:
     """Run one side after the handshake, over a link with a port; returns its frame counters.
 
     The thread inherits processor and priority from the caller, who then steps back to ordinary
     priority and only looks, a few times a second, whether to stop and what to write down.
+    ``told`` is what other threads tell the loop, see ``gfm_hil.loops.records``.
     """
-    stop = np.zeros(1, np.int64)
     found: list[FrameReader] = []
     failed: list[BaseException] = []
 
     def work() -> None:
         try:
             drive = drive_plant if side == "plant" else drive_controller
-            found.append(drive(bench, link, part, timeline, t0_ns, stop))
+            found.append(drive(bench, link, part, timeline, t0_ns, told))
         except BaseException as problem:  # to be raised where somebody sees it
             failed.append(problem)
 
@@ -51,10 +54,10 @@ def run_compiled(
     try:
         while thread.is_alive():
             thread.join(_LOOK_S)
-            stop[0] = stopped()
+            told[STOP] = stopped()
             timeline.flush()
     finally:  # a second Ctrl-C: the thread must not outlive what it writes to
-        stop[0] = 1
+        told[STOP] = 1
         thread.join()
         timeline.put_off = False
     if failed:

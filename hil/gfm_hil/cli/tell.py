@@ -1,0 +1,81 @@
+"""gfmhil tell: set-points, laws and grid events for a run that is going on."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.errors import UserError
+from gfm_hil.operator import Operator
+from gfm_runtime.signals import REF_NAMES
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "tell",
+        help="have a run that is going on do something, or show where it is",
+        description="Without anything to tell: the newest tick as JSON.",
+    )
+    command.add_argument("folder", type=Path, help="the run folder")
+    command.add_argument(
+        "references", nargs="*", metavar="NAME=VALUE", help=f"one of {', '.join(REF_NAMES)}, p.u."
+    )
+    command.add_argument("--ramp", type=float, metavar="S", help="spread them over a time, s")
+    command.add_argument("--law", help="change to this law, one that the scenario names")
+    command.add_argument("--event", metavar="JSON", help="an event as in a scenario, without t")
+    command.add_argument("--stop", action="store_true", help="end the run")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry it out; returns the exit code."""
+    events = _events(options)
+    operator = Operator(options.folder)
+    try:
+        for event in events:
+            done = operator.tell(event)
+            print(f"{done['label']} at tick {done['tick']}")
+        if options.stop:
+            operator.stop()
+        if not events and not options.stop:
+            print(json.dumps(operator.snapshot(), indent=2))
+    finally:
+        operator.close()
+    return 0
+
+
+def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """What is asked for, in the order: references, law, event.
+
+    Raises:
+        UserError: not NAME=VALUE, or not JSON.
+    """
+    events: list[dict[str, Any]] = []
+    values: dict[str, float] = {}
+    for text in options.references:
+        name, _, value = text.partition("=")
+        try:
+            if name not in REF_NAMES:
+                raise ValueError
+            values[name] = float(value)
+        except ValueError:
+            raise UserError(f"{text!r}: must be NAME=VALUE, NAME one of {REF_NAMES}") from None
+    if values:
+        ramp = {} if options.ramp is None else {"ramp_s": options.ramp}
+        events.append({"type": "reference", **values, **ramp})
+    elif options.ramp is not None:
+        raise UserError(f"--ramp {options.ramp:g}: there is no reference to spread")
+    if options.law is not None:
+        events.append({"type": "law", "law": options.law})
+    if options.event is not None:
+        try:
+            event = json.loads(options.event)
+        except ValueError as problem:
+            raise UserError(f"--event: not JSON: {problem}") from None
+        if not isinstance(event, dict):
+            raise UserError(f"--event {options.event}: must be an object")
+        events.append(event)
+    return events

@@ -1,0 +1,6 @@
+"""The operator's hand on a run: commands to a side that is running, and a look at what it does."""
+
+from gfm_hil.operator.client import Operator
+from gfm_hil.operator.desk import Desk
+
+__all__ = ["Desk", "Operator"]

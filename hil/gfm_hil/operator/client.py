@@ -1,0 +1,97 @@
+"""An operator: sends commands to a run by its folder, and reads what it records as it goes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_runtime.controller import STATES
+
+_ANSWER_MS = 6000
+
+
+class Operator:
+    """Commands and a look, for one run that is going on.
+
+    Args:
+        folder: the run folder.
+
+    Raises:
+        UserError: nothing is going on there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._context = zmq.Context()
+        if not any(self._desk(side) for side in SIDES):
+            raise UserError(f"{folder}: no run is going on there")
+
+    def close(self) -> None:
+        """Let go of the sockets."""
+        self._context.destroy(linger=0)
+
+    def tell(self, event: dict[str, Any]) -> dict[str, Any]:
+        """Have an event of a scenario, without its time, carried out at once.
+
+        Returns:
+            ``tick`` at which it was, and its ``label``.
+
+        Raises:
+            UserError: it was refused, with the reason; or the side is gone.
+        """
+        side: Side = "controller" if event.get("type") in ("reference", "law") else "plant"
+        return self._ask(side, event)
+
+    def stop(self) -> None:
+        """End the run as Ctrl-C would."""
+        for side in SIDES:
+            if self._desk(side):
+                self._ask(side, {"type": "stop"})
+                return
+
+    def snapshot(self) -> dict[str, Any]:
+        """The newest recorded tick: every column of the recording by name, ``tick`` and, of the
+        controller, ``state`` in words. A side that has not recorded anything is left out.
+
+        Rows are only ever appended, so that reading them takes nothing from the loop.
+        """
+        found: dict[str, Any] = {}
+        for side, columns in (("plant", PLANT_COLUMNS), ("controller", CONTROLLER_COLUMNS)):
+            part = Part.open(self._folder, side)
+            done = 0 if part is None else int(part.progress[0])
+            if part is None or not done:
+                continue
+            found.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
+            if side == "plant":
+                found["tick"], found["misses"] = done - 1, int(part.progress[1])
+            else:
+                found["state"] = STATES[int(found["state"])]
+        return found
+
+    def _desk(self, side: Side) -> str:
+        try:
+            text = (self._folder / f"desk_{side}.json").read_text(encoding="utf-8")
+            return str(json.loads(text)["endpoint"])
+        except (OSError, ValueError):
+            return ""
+
+    def _ask(self, side: Side, content: dict[str, Any]) -> dict[str, Any]:
+        endpoint = self._desk(side)
+        if not endpoint:
+            raise UserError(f"{self._folder}: the {side} is not running")
+        with self._context.socket(zmq.REQ) as socket:
+            socket.set(zmq.LINGER, 0)
+            socket.connect(endpoint)
+            socket.send_json(content)
+            if not socket.poll(_ANSWER_MS):
+                raise UserError(f"{self._folder}: the {side} does not answer")
+            answer: Any = socket.recv_json()
+        if not answer["ok"]:
+            raise UserError(str(answer["error"]))
+        return {key: value for key, value in answer.items() if key != "ok"}

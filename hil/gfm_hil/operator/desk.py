@@ -1,0 +1,130 @@
+"""Where an operator's commands reach a side that is running: a socket of its own, off the loop.
+
+A command is an event of a scenario without its time. It is checked here, in a thread that the
+loop never waits for; a good one is put into the timeline and the loop's bell is rung, so that it
+is carried out between two ticks. The answer names that tick. The socket is a ZeroMQ REP on a Unix
+path in a folder that only this user can read; ``desk_<side>.json`` in the run folder names it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+from pydantic import TypeAdapter, ValidationError
+
+from gfm_hil.bench import Bench
+from gfm_hil.errors import lines
+from gfm_hil.events import CONTROLLER_EVENTS, Event, LawChange, apply_grid_event
+from gfm_hil.links.base import Side
+from gfm_hil.timeline import Timeline
+
+_LOOK_MS = 100
+_TAKEN_OVER_S = 5.0  # in lockstep a tick may take as long as the other side likes
+_LARGEST = 65536  # bytes of a command
+
+_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+
+
+class Desk:
+    """One side's desk; use as a context manager around the run.
+
+    Args:
+        side, bench, timeline: of the run.
+        folder: the run folder, to announce the socket in.
+        ring: tells the loop that the timeline has something new.
+        stop: ends the run as Ctrl-C would.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        bench: Bench,
+        timeline: Timeline,
+        folder: Path,
+        ring: Callable[[], None],
+        stop: Callable[[], None],
+    ) -> None:
+        self._side, self._bench, self._timeline = side, bench, timeline
+        self._announcement = folder / f"desk_{side}.json"
+        self._ring, self._stop = ring, stop
+        self._over = threading.Event()
+
+    def __enter__(self) -> Desk:
+        self._place = Path(tempfile.mkdtemp(prefix="gfmhil-desk-"))
+        endpoint = f"ipc://{self._place}/{self._side}"
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.REP)
+        self._socket.set(zmq.MAXMSGSIZE, _LARGEST)
+        self._socket.bind(endpoint)
+        self._thread = threading.Thread(target=self._serve, name=f"{self._side}-desk", daemon=True)
+        self._thread.start()
+        self._announcement.write_text(json.dumps({"endpoint": endpoint}), encoding="utf-8")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._announcement.unlink(missing_ok=True)
+        self._over.set()
+        self._thread.join()
+        self._socket.close(linger=0)
+        self._context.term()
+        shutil.rmtree(self._place, ignore_errors=True)
+
+    def _serve(self) -> None:
+        while not self._over.is_set():
+            if self._socket.poll(_LOOK_MS):
+                with contextlib.suppress(zmq.ZMQError):  # a client that is gone again
+                    self._socket.send_json(self._answer(self._socket.recv()))
+
+    def _answer(self, message: bytes) -> dict[str, Any]:
+        try:
+            content = json.loads(message)
+            if content == {"type": "stop"}:
+                self._stop()
+                return {"ok": True}
+            if isinstance(content, dict):
+                for key in ("t", "tick"):
+                    if key in content:
+                        raise ValueError(
+                            f"{key} = {content[key]}: a command is carried out at once"
+                        )
+                content["tick"] = 0
+            return self._carry_out(self._checked(content))
+        except ValidationError as problem:
+            return {"ok": False, "error": "; ".join(lines(problem))}
+        except (ValueError, UnicodeDecodeError) as problem:
+            return {"ok": False, "error": str(problem)}
+
+    def _checked(self, content: Any) -> Any:
+        """The event, with everything tried out that might fail in the loop.
+
+        Raises:
+            ValueError: it is none, not for this side, or cannot be carried out.
+        """
+        event = _EVENT.validate_python(content)
+        ours = "controller" if isinstance(event, CONTROLLER_EVENTS) else "plant"
+        if ours != self._side:
+            raise ValueError(f"type = {event.type!r}: for the {ours}, not the {self._side}")
+        if isinstance(event, LawChange) and event.law not in self._bench.controller.sets:
+            ready = sorted(self._bench.controller.sets)
+            raise ValueError(f"law = {event.law!r}: not made ready for this run; ready are {ready}")
+        if ours == "plant":
+            par, st = self._bench.par.copy(), self._bench.st.copy()
+            apply_grid_event(event, par, st)
+        return event
+
+    def _carry_out(self, event: Any) -> dict[str, Any]:
+        ticket = self._timeline.insert(event)
+        self._ring()
+        if not ticket.done.wait(_TAKEN_OVER_S):
+            return {"ok": False, "error": f"not taken over within {_TAKEN_OVER_S:g} s"}
+        if ticket.error:
+            return {"ok": False, "error": ticket.error}
+        return {"ok": True, "tick": ticket.tick, "label": event.label()}

@@ -1,0 +1,132 @@
+"""Commands to runs that are going on: two processes, really started."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gfm_hil.errors import UserError
+from gfm_hil.operator import Operator
+from gfm_hil.timeline import read_log
+
+SCENARIO = """
+title = "told"
+duration = 600.0
+[link]
+type = "{link}"
+options = {options}
+peer_timeout_s = 30.0
+[[events]]
+type = "law"
+t = 599.0
+law = "vsg-2"
+"""
+PATIENCE_S = 100.0
+
+
+@pytest.fixture(
+    params=[("shm", "{}"), ("zmq", "{}"), ("zmq", "{portable = true}")],
+    ids=["shm", "zmq", "zmq portable"],
+)
+def going(request, tmp_path):
+    """A run that would take a long while, its folder."""
+    file, folder = tmp_path / "told.toml", tmp_path / "run"
+    link, options = request.param
+    file.write_text(SCENARIO.format(link=link, options=options), encoding="utf-8")
+    command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder)]
+    process = subprocess.Popen([*command, "--quiet", "--no-figures"], stdout=subprocess.DEVNULL)
+    try:
+        wait_for(lambda: all((folder / f"desk_{s}.json").exists() for s in ("plant", "controller")))
+        yield process, folder
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait_for(condition) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def rows(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "signals.npz") as file:
+        return {name: file[name] for name in file.files if name != "laws"}
+
+
+def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
+    process, folder = going
+    operator = Operator(folder)
+    wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
+    reference = operator.tell({"type": "reference", "P_ref": 0.8})
+    law = operator.tell({"type": "law", "law": "vsg-2"})
+    grid = operator.tell({"type": "grid-frequency", "f_hz": 49.99})
+    assert reference["label"] == "P_ref = 0.8"
+    wait_for(lambda: operator.snapshot()["tick"] > grid["tick"] + 100)
+    seen = operator.snapshot()
+    assert (seen["ref_P_ref"], seen["law"], seen["state"]) == (0.8, 1.0, "RUNNING")
+    operator.stop()
+    assert process.wait(PATIENCE_S) == 130  # as after Ctrl-C
+    operator.close()
+    signals = rows(folder)
+    assert np.flatnonzero(signals["ref_P_ref"] == 0.8)[0] == reference["tick"]
+    assert np.flatnonzero(signals["law"] == 1)[0] == law["tick"]
+    assert np.flatnonzero(signals["true_omega_g"] < 0.9999)[0] == grid["tick"]
+    told = [e for e in read_log(folder / "events.jsonl") if e.get("by") == "operator"]
+    assert [e["tick"] for e in told] == [reference["tick"], law["tick"], grid["tick"]]
+    assert not list(folder.glob("desk_*"))
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ({"type": "reference", "P_ref": 9.0}, r"P_ref = 9\.0: must lie in \[-2, 2\]"),
+        ({"type": "law", "law": "droop-1"}, "not made ready"),
+        ({"type": "reference", "P_ref": 0.6, "t": 1.0}, "t: a command is carried out at once"),
+        ({"type": "grid-impedance", "L_g": 1e-9, "R_g": 1.0}, "too fast"),
+        ({"type": "grid-breaker", "closed": False}, "load"),
+        ({"type": "nonsense"}, "must be one of"),
+        ({}, "missing"),
+    ],
+)
+@pytest.mark.parametrize("going", [("shm", "{}")], indirect=True)
+def test_what_is_refused_changes_nothing(going, event, words):
+    _, folder = going
+    operator = Operator(folder)
+    wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
+    with pytest.raises(UserError, match=words):
+        operator.tell(event)
+    seen = operator.snapshot()
+    assert (seen["ref_P_ref"], seen["law"], seen["true_trip"]) == (0.5, 0.0, 0.0)
+    operator.close()
+
+
+@pytest.mark.parametrize("going", [("shm", "{}")], indirect=True)
+def test_the_command(going):
+    process, folder = going
+
+    def tell(*words: str) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-m", "gfm_hil", "tell", str(folder), *words]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    wait_for(lambda: json.loads(tell().stdout or "{}").get("tick", 0) > 0)
+    assert tell("P_ref=0.7", "--ramp", "0.1").stdout.startswith("P_ref = 0.7 at tick ")
+    for words, problem in (
+        (["P=1"], "gfmhil: 'P=1': must be NAME=VALUE"),
+        (["--ramp", "1"], "gfmhil: --ramp 1: there is no reference"),
+        (["--event", "{"], "gfmhil: --event: not JSON"),
+    ):
+        refused = tell(*words)
+        assert (refused.returncode, refused.stdout) == (2, "")
+        assert refused.stderr.startswith(problem)
+    assert tell("--stop").returncode == 0
+    assert process.wait(PATIENCE_S) == 130
+    over = tell("P_ref=0.7")
+    assert over.returncode == 2 and "no run is going on there" in over.stderr
