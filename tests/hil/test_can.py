@@ -20,15 +20,15 @@ from gfm_hil.frames import FrameWriter
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.base import SIDES, Side
-from gfm_hil.links.can.dbc import read_dbc, write_dbc
+from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import PLANT_COLUMNS, Part, merge, record_plant
+from gfm_hil.recording import Part, merge
 from gfm_hil.scenario import Scenario
 from gfm_hil.timeline import Timeline
-from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.signals import Group, names
 
+from .can_reference import quantised_run
 from .test_links import in_threads
 
 KIND = link_kind("can")
@@ -86,45 +86,6 @@ def both_sides(
         if isinstance(outcome, Exception):
             raise outcome
     return merge(folder, scenario.T_s, benches["controller"].controller.labels), found
-
-
-def through_cantools(name: Group, values: np.ndarray) -> None:
-    """What is left of a vector that went over CAN FD, by cantools alone."""
-    title = {"y": "Measurements", "u": "Commands"}[name]
-    message = DBC.get_message_by_name(title)
-    physical = dict(zip(names(name), values.tolist(), strict=True))
-    payload = message.encode({**physical, "Crc": 0, "Counter": 0}, strict=False)
-    decoded = message.decode(payload, decode_choices=False)
-    values[:] = [decoded[n] for n in names(name)]
-
-
-DBC = read_dbc(write_dbc(True))
-
-
-def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str, np.ndarray]:
-    """The same run in one process, y and u through cantools on their way.
-
-    Every n ticks only: y is held, and so is u, which takes n ticks to arrive.
-    """
-    b = make_bench(scenario)
-    timeline = Timeline(b, folder / "events.jsonl", SIDES)
-    rows = np.full((scenario.ticks, len(PLANT_COLUMNS)), np.nan)
-    command, sent = b.u.copy(), []
-    for tick in range(scenario.ticks):
-        timeline.carry_out(tick)
-        plant_sample(b.par, b.st, b.y)
-        if tick % every == 0:
-            read = b.y.copy()
-            through_cantools("y", read)
-        b.controller.step(read, command)
-        if tick % every == 0:
-            sent.append(command.copy())
-            through_cantools("u", sent[-1])
-        applied = sent[max(0, tick // every - (every > 1))]
-        record_plant(rows[tick], b.y, applied, b.par, b.st)
-        plant_advance(b.par, b.st, applied)
-    timeline.close()
-    return {name: rows[:, j] for j, name in enumerate(PLANT_COLUMNS)}
 
 
 @pytest.mark.parametrize(
@@ -365,3 +326,11 @@ def test_a_place_found_empty_is_asked_again(endpoint):
             while other.recv(0.02) is None:
                 assert time.monotonic() < until
                 one.send(ping)
+
+
+def test_an_emulated_bus_changes_when_and_not_what(make, tmp_path, endpoint):
+    scenario = make(duration=0.005, law="vsg-2", link={**PATIENT, "repeat_s": 5.0})
+    began = time.monotonic()
+    apart, _ = both_sides(scenario, tmp_path, endpoint, emulate=True)
+    assert time.monotonic() - began > scenario.ticks * 90e-6  # of 97.1 µs an exchange
+    assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 _CRC_15 = 0x4599  # x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
-_SIZES = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # payloads; the index is the DLC
+PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes; the index is the DLC
 _TAIL = 12  # ACK, its delimiter, end of frame, interframe space
 _NEVER = -9999
 _RUN = 5
@@ -25,7 +25,7 @@ _Bits = list[int | None]
 
 
 def _dlc(length: int) -> _Bits:
-    return [_SIZES.index(length) >> k & 1 for k in (3, 2, 1, 0)]
+    return [PAYLOADS.index(length) >> k & 1 for k in (3, 2, 1, 0)]
 
 
 def _identifier(number: int | None) -> _Bits:

@@ -16,6 +16,7 @@ from gfm_hil.errors import PeerLost, UserError
 from gfm_hil.frames import FrameWriter
 from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.can.dbc import VECTORS
+from gfm_hil.links.can.emulation import EmulatedBus
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
@@ -61,7 +62,9 @@ class CanLink:
         self._foreign = self._error_frames = self._dropped = 0
         _compile(plan)
         self._subrate = Subrate(side, options.every, self._whole) if options.every > 1 else None
-        self._bus = _open_bus(side, endpoint, options)
+        bus = _open_bus(side, endpoint, options)
+        rates = options.fd, options.bitrate, options.data_bitrate
+        self._bus = EmulatedBus(bus, *rates) if options.emulate else bus
 
     @property
     def counters(self) -> dict[str, int]:
