@@ -6,17 +6,17 @@ import contextlib
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from gfm_hil import scratch
 from gfm_hil.bench import make_bench
 from gfm_hil.errors import UserError
 from gfm_hil.links import link_kind
 from gfm_hil.links.base import SIDES, Side
-from gfm_hil.recording import Part
+from gfm_hil.recording import Part, keep_in_memory
 from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
 from gfm_hil.stopping import Interrupt
@@ -62,8 +62,10 @@ class Processes:
         with contextlib.ExitStack() as stack:
             endpoint = self.scenario.link.endpoint
             if endpoint is None:  # a Unix socket's path may hold 107 bytes, so not the run folder
-                place = stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-"))
-                endpoint = link_kind(self.scenario.link.type).fresh(Path(place))
+                place = stack.enter_context(scratch.temporary("gfmhil-run-"))
+                endpoint = link_kind(self.scenario.link.type).fresh(place)
+            if self.scenario.mode == "realtime":
+                keep_in_memory(self.folder, self.scenario.ticks)
             self.notice("starting controller and plant …")
             self._sides = {side: self._start(side, endpoint) for side in SIDES}
             try:
@@ -83,9 +85,9 @@ class Processes:
         """Fill numba's cache here, so that two processes do not compile the same at a time."""
         self.notice("compiling the kernels (once a machine) …")
         bench = make_bench(self.scenario)
-        with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
+        with scratch.temporary("gfmhil-run-") as place:
             for side in SIDES:
-                compile_side(side, bench, Part.create(Path(place), side, 1))
+                compile_side(side, bench, Part.create(place, side, 1))
 
     def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
         # -P: a file of the operator's folder must not stand in for a module

@@ -7,8 +7,9 @@ written survives the process, however it ends. ``merge`` turns the parts into ``
 
 from __future__ import annotations
 
+import contextlib
+import secrets
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gfm_hil import scratch
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
 
@@ -37,6 +39,9 @@ CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
 _TRUE = NY + NU
 _MEMORY = Path("/dev/shm")
+_PREFIX = "gfmhil-parts-"
+_HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
+_holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
 
 
 @njit(cache=True)
@@ -107,18 +112,42 @@ def keep_in_memory(folder: Path, ticks: int) -> None:
     """Have the parts of a run lie in memory until they are merged, if there is room.
 
     A page of a file on a disk is write-protected while it is written back: a loop that touches it
-    waits for the disk. ``folder``/parts becomes a link, so that what was recorded by a run that
-    nobody could end is still found.
+    waits for the disk. ``folder``/parts becomes a link. To be called by every process of the run,
+    which then holds the place until it removes the parts or ends. What a run whose processes were
+    all killed has left is first moved to its own folder: nothing recorded is lost.
     """
+    if not _MEMORY.is_dir():
+        return
+    _rescue()
     columns = (PLANT_COLUMNS, CONTROLLER_COLUMNS, PLANT_TIMES, CONTROLLER_TIMES)
     needed = 8 * ticks * sum(map(len, columns))
-    if not _MEMORY.is_dir() or shutil.disk_usage(_MEMORY).free < 2 * needed:
-        return
-    place = Path(tempfile.mkdtemp(prefix="gfmhil-parts-", dir=_MEMORY))
-    try:
-        (folder / "parts").symlink_to(place)
-    except FileExistsError:  # the other side was first
-        place.rmdir()
+    parts = folder / "parts"
+    if not parts.is_symlink():
+        if shutil.disk_usage(_MEMORY).free < 2 * needed:
+            return
+        place, _holds[parts] = scratch.make(_PREFIX, _MEMORY)
+        (place / _HOME).symlink_to(parts.absolute())
+        try:
+            parts.symlink_to(place)
+            return
+        except FileExistsError:  # another process of this run was first
+            shutil.rmtree(place)
+            scratch.let_go(_holds.pop(parts))
+    _holds[parts] = scratch.hold(parts.resolve())
+
+
+def _rescue() -> None:
+    """Move parts that nobody uses any more to where their run is, if that is still there."""
+    for place, hold in scratch.left_behind(_PREFIX, _MEMORY):
+        with contextlib.suppress(OSError):  # no room, no rights: they stay
+            home = (place / _HOME).readlink()
+            if home.is_symlink() and home.resolve() == place:
+                copy = home.with_name(f"parts-{secrets.token_hex(4)}")
+                shutil.copytree(place, copy, ignore=shutil.ignore_patterns(_HOME))
+                home.unlink()
+                copy.rename(home)
+            shutil.rmtree(place)
+        scratch.let_go(hold)
 
 
 def remove_parts(folder: Path) -> None:
@@ -126,12 +155,12 @@ def remove_parts(folder: Path) -> None:
     parts = folder / "parts"
     if not parts.is_dir():
         return
-    for path in parts.glob("*.npy"):
-        path.unlink()
     place = parts.resolve()
     if parts.is_symlink():
         parts.unlink()
-    place.rmdir()
+    shutil.rmtree(place)
+    if parts in _holds:
+        scratch.let_go(_holds.pop(parts))
 
 
 def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:

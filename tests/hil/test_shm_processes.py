@@ -79,6 +79,14 @@ def test_a_killed_controller_is_not_joined_and_its_name_is_free(peer, endpoint):
     controller.close()
 
 
+def test_what_a_killed_controller_left_is_removed_by_its_plant(peer, endpoint):
+    controller = peer("controller")
+    plant = ShmLink("plant", endpoint)
+    kill(controller)
+    plant.close()
+    assert not segment_of(endpoint).exists()
+
+
 def test_a_killed_plant_leaves_its_place_to_the_next(peer, endpoint):
     controller = ShmLink("controller", endpoint)
     kill(peer("plant"))

@@ -104,8 +104,12 @@ def join(name: str) -> SharedMemory | None:
 
 
 def leave(memory: SharedMemory) -> None:
-    """Undo ``join``; another plant may come."""
+    """Undo ``join``; another plant may come, unless the controller was killed: then it goes."""
+    path = FOLDER / memory.name
     _PLANT.pack_into(_buffer(memory), _PLANT_AT, *NOBODY)
+    with _locked(), contextlib.suppress(Refused, FileNotFoundError):
+        if _owner(path) is None:
+            path.unlink()
     memory.close()
 
 

@@ -1,0 +1,147 @@
+"""Folders that last as long as their processes, and recordings in memory that outlive theirs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gfm_hil import recording, scratch
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from gfm_hil.recording import Part, keep_in_memory
+folder = Path(sys.argv[1])
+keep_in_memory(folder, 100)
+part = Part.create(folder, sys.argv[2], 100)
+part.signals[:60] = 1.5
+print("ready", flush=True)
+time.sleep(600)
+"""
+
+Record = Callable[[Path, str], "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def memory(tmp_path, monkeypatch) -> Path:
+    """A folder in place of /dev/shm, for this process."""
+    place = tmp_path / "memory"
+    place.mkdir()
+    monkeypatch.setattr(recording, "_MEMORY", place)
+    return place
+
+
+@pytest.fixture
+def record(memory) -> Iterator[Record]:
+    """A process that has recorded 60 of 100 ticks and then sleeps."""
+    started = []
+
+    def call(folder: Path, side: str) -> subprocess.Popen[str]:
+        folder.mkdir(exist_ok=True)
+        where = f"import gfm_hil.recording as r, pathlib; r._MEMORY = pathlib.Path({str(memory)!r})"
+        process = subprocess.Popen(
+            [sys.executable, "-c", where + HOLD, str(folder), side],
+            text=True,
+            stdout=subprocess.PIPE,
+        )
+        started.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    yield call
+    for process in started:
+        kill(process)
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+
+
+def another_run(tmp_path: Path) -> None:
+    """What any run in real time does at its start and its end."""
+    folder = tmp_path / "another"
+    folder.mkdir()
+    recording.keep_in_memory(folder, 10)
+    recording.remove_parts(folder)
+    folder.rmdir()
+
+
+def test_a_folder_is_left_behind_once_nobody_holds_it(tmp_path):
+    place, first = scratch.make("x-", tmp_path)
+    second = scratch.hold(place)
+    assert list(scratch.left_behind("x-", tmp_path)) == []
+    scratch.let_go(first)
+    assert list(scratch.left_behind("x-", tmp_path)) == []
+    scratch.let_go(second)
+    ((found, handle),) = scratch.left_behind("x-", tmp_path)
+    assert found == place
+    assert list(scratch.left_behind("x-", tmp_path)) == []  # whoever clears up is alone
+    scratch.let_go(handle)
+
+
+def test_a_temporary_folder_goes_with_its_context_and_left_ones_go_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    left, handle = scratch.make("x-", tmp_path)
+    (left / "link").touch()
+    scratch.let_go(handle)
+    (tmp_path / "x-a-file").touch()
+    with scratch.temporary("x-") as place:
+        (place / "link").touch()
+        with scratch.temporary("x-") as other:
+            assert place.is_dir() and other.is_dir()
+        assert not left.exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["x-a-file"]
+
+
+def test_what_a_killed_run_recorded_in_memory_is_moved_to_its_folder(record, memory, tmp_path):
+    folder = tmp_path / "run"
+    kill(record(folder, "plant"))
+    assert (folder / "parts").is_symlink()
+    another_run(tmp_path)
+    assert not (folder / "parts").is_symlink()
+    assert list(memory.iterdir()) == []
+    part = recording.Part.open(folder, "plant")
+    assert part is not None
+    assert (part.signals[:60] == 1.5).all() and np.isnan(part.signals[60:]).all()
+    assert {path.name for path in folder.iterdir()} == {"parts"}
+
+
+def test_it_stays_while_one_side_lives(record, memory, tmp_path):
+    folder = tmp_path / "run"
+    plant, controller = record(folder, "plant"), record(folder, "controller")
+    kill(plant)
+    another_run(tmp_path)
+    assert (folder / "parts").is_symlink()
+    kill(controller)
+    another_run(tmp_path)
+    assert not (folder / "parts").is_symlink()
+    assert all(recording.Part.open(folder, side) for side in ("plant", "controller"))
+    assert list(memory.iterdir()) == []
+
+
+def test_it_goes_where_the_run_folder_is_gone(record, memory, tmp_path):
+    folder = tmp_path / "run"
+    kill(record(folder, "plant"))
+    (folder / "parts").unlink()
+    folder.rmdir()
+    another_run(tmp_path)
+    assert list(memory.iterdir()) == []
+
+
+def test_it_stays_where_its_folder_has_no_room(record, memory, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    kill(record(folder, "plant"))
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("shutil.copytree", full)
+    another_run(tmp_path)
+    assert recording.Part.open(folder, "plant") is not None
