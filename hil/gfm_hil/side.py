@@ -123,7 +123,9 @@ def _meet_and_run(
     finally:
         link.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
-    return {"faults": reader.faults, "one_clock": start.one_clock, **injected}
+    counted = getattr(good, "counters", {})  # of a link that sees more than whole messages
+    faults = {**reader.faults, **counted}
+    return {"faults": faults, "one_clock": start.one_clock, **injected}
 
 
 def compile_side(side: Side, bench: Bench, part: Part) -> None:
