@@ -26,7 +26,6 @@ from gfm_hil.recording import record_controller
 from gfm_runtime.controller import RUNNING, SAFE, STOPPED, control, missed
 
 _Y_ID = 1
-_CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
 _PHASE, _RATE = 1 / 16, 1 / 512  # of the phase lock, critically damped: 16 ticks
 _CLIP = 0.25  # of a tick: a stall must not throw the lock
 
@@ -101,7 +100,7 @@ def _next_frame(
     while True:
         size = receive(handle, got_bytes)
         looks += 1
-        if size > 0 or r.realtime or looks % _CLOCK_EVERY == 0:
+        if size > 0 or looks % r.clock_every == 0:
             now = now_ns()
             gap = max(gap, now - before)
             before = now

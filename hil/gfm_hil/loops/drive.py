@@ -57,7 +57,8 @@ class _Loop:
         records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
         receive, spins = port.receive, port.spins
         if scenario.mode == "lockstep" and port.patient is not None:
-            receive, spins = port.patient, _FAR  # it sleeps by itself
+            receive, spins = port.patient, _FAR  # it sleeps by itself, so that a look takes long
+            self.loop["clock_every"] = 1
         self._arguments: tuple[Any, ...] = (
             port.send, receive, port.handle, spins, (w.sequence, w.frame, w.message),
             (r.frame, r.message), r.record, self.loop, told, *records, bench.y, bench.u,

@@ -29,7 +29,6 @@ from gfm_runtime.signals import NU
 _U_ID = 2
 FRESH, OVERDUE, LEAVING = range(3)
 _REST_NS = 8_000
-_CLOCK_EVERY = 64  # looks in lockstep between two looks at the clock
 
 
 @njit(cache=True, nogil=True)
@@ -135,7 +134,7 @@ def _answer(
                     times[k, 3] = now
                 return FRESH if tick == k else LEAVING, max(gap, now - before)
         looks += 1
-        if r.realtime or looks % _CLOCK_EVERY == 0:
+        if looks % r.clock_every == 0:
             now = now_ns()
             gap = max(gap, now - before)
             before = now
