@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gfm_design.league import Found, as_it_is, search, stands
+from gfm_design.league import Found, as_it_is, late_case, search, stands
+from gfm_design.league_late import ALPHA
 from gfm_design.league_modes import Culprit
 from gfm_design.linear import Mode
 from gfm_design.performance import Channel
@@ -19,10 +21,6 @@ from gfm_hil.league_bench import EXPERIMENTS, experiment
 from gfm_hil.tuned_law import channels_as_json, write_law
 from gfm_runtime import law_file
 
-#: laws that run with their own gains, and why these are not searched
-AS_SHIPPED = {
-    "mimo-gfm-deployable": "tuned for a box of sampled loops; freed it would be mimo-gfm",
-}
 #: laws without a row, and why
 LEFT_OUT = {
     "mimo-gfm-scheduled": "on the paper's grid its first stage is in force, which is mimo-gfm",
@@ -30,7 +28,13 @@ LEFT_OUT = {
 }
 
 Row = dict[str, Any]
+_MIMO = "mimo-gfm"
 Tell = Callable[[str, int, float], None]  # law, evaluations done, least gamma so far
+
+
+def as_shipped(name: str) -> bool:
+    """MIMO-GFM with gains for another purpose: not searched, as freed it would be MIMO-GFM."""
+    return name != _MIMO and law_file(name).phi == law_file(_MIMO).phi
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Job:
     law: str
     seed: int
     evaluations: int
-    starts: int
+    starts: int | None
 
     def digest(self) -> str:
         """Hash over the law's contents, the search and the version."""
@@ -52,7 +56,7 @@ def make_row(job: Job, folder: Path, tell: Tell) -> Row:
     """A law's row as plain data; its tuned gains go to ``folder``/laws/NAME-tuned.toml."""
     file = law_file(job.law)
     row: Row = {"law": job.law, "title": file.title, "digest": job.digest(), "seed": job.seed}
-    if job.law in AS_SHIPPED:
+    if as_shipped(job.law):
         found = as_it_is(file)
     else:
         found = search(
@@ -63,38 +67,38 @@ def make_row(job: Job, folder: Path, tell: Tell) -> Row:
             lambda done, best: tell(job.law, done, best),
         )
     row |= _found(found)
-    loop = stands(file, found.gains or {})
+    row["order"] = late_case(file, found.gains or {}).law.order
+    if found.gains is None:
+        return row
+    loop = stands(file, found.gains)
     row |= {
-        "order": loop.order,
         "sigma": loop.sigma,
         "worst": _mode(loop.worst),
-        "delay_us": 1e6 * loop.delay.seconds if loop.delay else None,
-        "delay_hz": loop.delay.frequency_hz if loop.delay else None,
+        "delay_us": _number(1e6 * loop.delay.seconds),  # null: more than was looked at
+        "delay_hz": _number(loop.delay.frequency_hz),
         "L_g": _range(loop.L_g),
         "R": _range(loop.R),
     }
-    if found.gains is None:
-        return row
     name = job.law
-    if job.law not in AS_SHIPPED:
+    if not as_shipped(job.law):
         path = folder / "laws" / f"{job.law}-tuned.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_law(path, file, found.gains, row, _notes(job, row))
+        write_law(path, file, found.gains, row, _notes(job, row), "gfmhil design league")
         name = str(path)
     row["bench"] = {kind: experiment(kind, name) for kind in EXPERIMENTS}
     return row
 
 
 def _found(found: Found) -> Row:
-    tuned = _channels(found.after)
     return {
         "free": list(found.free),
         "before": _channels(found.before),
+        "ideal": _channels(found.ideal),
         "gains": found.gains,
-        "droop_fixed": found.droop_fixed,
+        "fixed": [list(pair) for pair in found.fixed],
         "evaluations": found.evaluations,
         "seconds": found.seconds,
-        **tuned,
+        **_channels(found.after),
     }
 
 
@@ -108,6 +112,10 @@ def _channels(found: Sequence[Channel] | Culprit) -> Row:
 
 def _mode(mode: Mode) -> Row:
     return {"sigma": mode.sigma, "frequency_hz": mode.frequency_hz, "ratio": mode.ratio}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _range(found: Range | None) -> list[Row] | None:
@@ -130,19 +138,21 @@ def _notes(job: Job, row: Row) -> list[str]:
         "the problem: w = (P_ref, omega_g), z = (P_ref - p, p, omega_u, q + V/D_q), the paper's",
         "  six weights; its converter ideal (no delay, no sensors), the loop continuous, the DC",
         "  source a current that row 1 commands",
-        f"started from {job.law}, {job.starts} starts of at most {job.evaluations} evaluations",
+        f"started from {job.law}",
     ]
-    if row["droop_fixed"]:
-        lines.append("W_41 T_41(0) does not depend on the gains: chosen for the other channels")
-    late = "holds" if row["sigma"] < 0.0 else "is lost"
-    lines.append(
-        f"one sample (100 us) late the loop {late}: sigma {row['sigma']:+.3g} 1/s; least damping "
-        f"ratio {mode['ratio']:.4f} at {mode['frequency_hz']:.4g} Hz"
-    )
+    if row["fixed"]:
+        names = ", ".join(f"W_{i}{j}" for i, j in row["fixed"])
+        lines.append(f"no gains that hold lower {names} at rest or infinity: chosen for the others")
+    lines += [
+        "and so that it holds sampled at 100 us, one sample late, every mode decaying by "
+        f"{ALPHA:g} 1/s; without that gamma could be {row['ideal']['gamma']:.4f}",
+        f"one sample late: sigma {row['sigma']:+.3g} 1/s; least damping ratio {mode['ratio']:.4f} "
+        f"at {mode['frequency_hz']:.4g} Hz",
+    ]
     if row["delay_us"] is not None:
-        lines.append(f"u may act {row['delay_us']:.0f} us after the sample of y")
-    for name in ("L_g", "R"):
-        if row[name]:
-            low, high = (e["factor"] for e in row[name])
+        lines.append(f"it stands {row['delay_us']:.0f} us from the sample of y to its action")
+    for key, name in (("L_g", "L_g"), ("R", "R_f and R_g")):
+        if row[key]:
+            low, high = (e["factor"] for e in row[key])
             lines.append(f"one sample late it holds for {name} x {low:.3g} ... {high:.3g}")
     return lines

@@ -9,9 +9,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gfm_design.delays import longest
+from gfm_design.league import T_S
+
 Row = dict[str, Any]
 Column = tuple[str, Callable[[Row], str]]
 
+_NO_BUMP = 0.001  # p.u.
 _LIMIT = "…"  # an end where nothing is lost
 
 
@@ -49,9 +53,13 @@ def _worst_text(row: Row) -> str:
     return f"W_{c['i']}{c['j']} at {number(at)} rad/s" if at is not None else f"W_{c['i']}{c['j']}"
 
 
-def others(row: Row) -> float | None:
-    """The largest norm of all channels but W_41."""
-    return max((c["norm"] for c in row["channels"] if (c["i"], c["j"]) != (4, 1)), default=None)
+def others(row: Row) -> float:
+    """The largest norm of the channels that are not pinned."""
+    return max(c["norm"] for c in row["channels"] if [c["i"], c["j"]] not in row["fixed"])
+
+
+def _fixed(row: Row) -> str:
+    return ", ".join(f"W_{i}{j}" for i, j in row["fixed"]) or "–"
 
 
 def _channel(i: int, j: int) -> Column:
@@ -65,14 +73,14 @@ def _channel(i: int, j: int) -> Column:
 
 def _delay(row: Row) -> str:
     if row["delay_us"] is None:
-        return "lost at once"
-    return f"{number(row['delay_us'])} ({number(row['delay_hz'])} Hz)"
+        return f"> {1e6 * longest(T_S):.0f}"
+    at = f" ({number(row['delay_hz'])} Hz)" if row["delay_hz"] is not None else ""
+    return f"{number(row['delay_us'])}{at}"
 
 
 def _damping(row: Row) -> str:
     mode = row["worst"]
-    text = f"{number(mode['ratio'])} at {number(mode['frequency_hz'])} Hz"
-    return text if row["sigma"] < 0.0 else f"**lost**: {text}"
+    return f"{number(mode['ratio'])} at {number(mode['frequency_hz'])} Hz"
 
 
 def _factors(name: str) -> Callable[[Row], str]:
@@ -87,22 +95,23 @@ def _factors(name: str) -> Callable[[Row], str]:
     return text
 
 
-def _bench(kind: str, key: str, digits: int = 3, scale: float = 1.0) -> Callable[[Row], str]:
+def _bench(kind: str, key: str, digits: int = 3, first: bool = True) -> Callable[[Row], str]:
+    """A metric of an experiment; the first column of one that ended early says why it did."""
+
     def text(row: Row) -> str:
         run: Mapping[str, Any] = row["bench"][kind]
         if run["status"] != "completed":
-            return f"{run['reason'].split(':')[0]} after {number(run['end_s'], 2)} s"
-        value = run.get(key)
-        return number(None if value is None else scale * value, digits)
+            why = f"{run['reason'].split(':')[0]} after {number(run['end_s'], 2)} s"
+            return why if first else "–"
+        return number(run.get(key), digits)
 
     return text
 
 
-def _late(row: Row) -> str:
-    run = row["bench"]["late"]
-    if run["status"] == "completed":
-        return "holds"
-    return f"{run['reason'].split(':')[0]} after {number(run['end_s'], 2)} s"
+def _bump(row: Row) -> str:
+    run = row["bench"]["switchover"]
+    small = run["status"] == "completed" and run["dp"] < _NO_BUMP
+    return f"< {_NO_BUMP:g}" if small else _bench("switchover", "dp", 2)(row)
 
 
 _LAW: Column = ("law", lambda r: str(r["law"]))
@@ -112,9 +121,11 @@ _WITH_GAMMA: dict[str, list[Column]] = {
         ("states", lambda r: str(r["order"])),
         ("free", lambda r: str(len(r["free"]))),
         ("γ, own gains", own),
-        ("γ, tuned", lambda r: f"**{number(r['gamma'], 4)}**"),
+        ("γ, ideal", lambda r: number(r["ideal"]["gamma"], 4)),
+        ("γ, late", lambda r: f"**{number(r['gamma'], 4)}**"),
         ("worst channel", _worst_text),
-        ("γ but for W_41", lambda r: number(others(r))),
+        ("pinned", _fixed),
+        ("γ of the others", lambda r: number(others(r), 4)),
         *(_channel(i, j) for i, j in ((1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 1))),
     ],
     "league_loop": [
@@ -128,13 +139,14 @@ _WITH_GAMMA: dict[str, list[Column]] = {
     "league_bench": [
         _LAW,
         ("P_ref step: overshoot [%]", _bench("p_ref", "overshoot_pct")),
-        ("settling [s]", _bench("p_ref", "settling_s", 2)),
+        ("settling [s]", _bench("p_ref", "settling_s", 2, False)),
+        ("one sample late: overshoot [%]", _bench("late", "overshoot_pct")),
         ("ω_g step: nadir of ω_u [Hz]", _bench("frequency", "f_nadir_hz", 5)),
-        ("RoCoF [Hz/s]", _bench("frequency", "rocof_hz_s", 3)),
-        ("overshoot of p [%]", _bench("frequency", "overshoot_pct", 3)),
+        ("RoCoF [Hz/s]", _bench("frequency", "rocof_hz_s", 3, False)),
+        ("peak of p [p.u.]", _bench("frequency", "p_peak", 3, False)),
+        ("final p [p.u.]", _bench("frequency", "p_final", 3, False)),
         ("3° jump: peak current [p.u.]", _bench("phase", "i_peak")),
-        ("switchover: Δp [p.u.]", _bench("switchover", "dp", 2)),
-        ("one sample late", _late),
+        ("switchover: Δp [p.u.]", _bump),
     ],
 }  # fmt: skip
 _WITHOUT: list[Column] = [
@@ -161,17 +173,17 @@ def markdown(name: str, rows: Sequence[Row]) -> str:
 def print_league(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
     """The ranking, then who has no place in it."""
     console = Console(highlight=False)
-    heads = ("law", "γ own", "γ tuned", "worst channel", "delay µs", "overshoot %", "late")
+    heads = ("law", "γ own", "γ ideal", "γ late", "worst channel", "delay µs", "overshoot %")
     table = Table(*heads, box=None, pad_edge=False)
     for row in (r for r in rows if r["gamma"] is not None):
         table.add_row(
             row["law"],
             own(row),
+            number(row["ideal"]["gamma"], 4),
             number(row["gamma"], 4),
             _worst_text(row),
-            number(row["delay_us"]),
+            _delay(row),
             _bench("p_ref", "overshoot_pct")(row),
-            _late(row),
         )
     console.print(table)
     for row in (r for r in rows if r["gamma"] is None):

@@ -34,6 +34,7 @@ def write_law(
     gains: Mapping[str, float],
     result: Mapping[str, Any],
     notes: Sequence[str] = (),
+    by: str = "gfmhil design tune",
 ) -> None:
     """Write a law file with its tuned gains and, as comments, what they were tuned for.
 
@@ -46,6 +47,7 @@ def write_law(
         gains: the parameters that change.
         result: gamma, channels, evaluations, seconds and seed, as ``gfmhil design tune --json``.
         notes: more lines of comment.
+        by: the command that found the gains.
 
     Raises:
         UserError: the file cannot be written.
@@ -53,11 +55,11 @@ def write_law(
     content = file.model_dump(mode="json", exclude_none=True)
     content["name"] = path.stem
     content["title"] = f"{file.title}, tuned"
-    content["source"] = f"{file.source.strip()}; tuned by gfmhil design tune, see the comments"
+    content["source"] = f"{file.source.strip()}; tuned by {by}, see the comments"
     content.pop("home_grid")
     for name, value in gains.items():
         content["parameters"][name]["value"] = value
-        content["parameters"][name]["source"] = f"gfmhil design tune, seed {result['seed']}"
+        content["parameters"][name]["source"] = f"{by}, seed {result['seed']}"
     lines = [
         f"gamma = {result['gamma']:.6g} of the paper's problem (Section III-B), P_ref = 0.5",
         *(f"W_{c['i']}{c['j']}: {c['norm']:.6g}" for c in result["channels"]),

@@ -4,7 +4,7 @@ This package is what would be flashed. It imports numpy and numba (pydantic only
 files) and nothing else of gfmhil.
 """
 
-from gfm_runtime.catalogue import LawSet, get_law, law_file, law_names, load_law
+from gfm_runtime.catalogue import LawSet, get_law, law_file, law_names, load_law, tuned_names
 from gfm_runtime.discretise import DiscreteLaw, discretise
 from gfm_runtime.elements import Element
 from gfm_runtime.errors import LawError
@@ -41,4 +41,5 @@ __all__ = [
     "realise",
     "state_dtype",
     "step",
+    "tuned_names",
 ]

@@ -1,4 +1,8 @@
-"""The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``."""
+"""The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``.
+
+``laws/tuned`` holds the same laws with the gains that the league found for the paper's converter.
+They load by name like the others, but are listed apart.
+"""
 
 from __future__ import annotations
 
@@ -33,16 +37,26 @@ def _natural(name: str) -> list[int | str]:
 
 @cache
 def law_names() -> tuple[str, ...]:
-    """Names of all laws that ship, in natural order (vsg-2 before vsg-10)."""
-    folder = files("gfm_runtime") / "laws"
-    found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
-    return tuple(sorted(found, key=_natural))
+    """Names of all laws that ship but for the tuned ones, in natural order."""
+    return _names("")
 
 
 @cache
-def _shipped(name: str) -> LawFile:
-    text = (files("gfm_runtime") / "laws" / f"{name}.toml").read_text(encoding="utf-8")
-    return parse_law(text, f"law {name}")
+def tuned_names() -> tuple[str, ...]:
+    """Names of the laws with tuned gains, e.g. ``vsg-5-tuned``, in natural order."""
+    return _names("tuned")
+
+
+def _names(group: str) -> tuple[str, ...]:
+    folder = files("gfm_runtime").joinpath("laws", group)
+    found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
+    return tuple(sorted(found, key=_natural))  # vsg-2 before vsg-10
+
+
+@cache
+def _shipped(name: str, group: str) -> LawFile:
+    path = files("gfm_runtime").joinpath("laws", group, f"{name}.toml")
+    return parse_law(path.read_text(encoding="utf-8"), f"law {name}")
 
 
 def law_file(name: str) -> LawFile:
@@ -53,9 +67,12 @@ def law_file(name: str) -> LawFile:
     """
     if name.endswith(".toml"):
         return read_law_file(name)
-    if name not in law_names():
-        raise LawError(f"law {name!r}", f"unknown; use a .toml file or one of {list(law_names())}")
-    return _shipped(name)
+    if name in law_names():
+        return _shipped(name, "")
+    if name in tuned_names():
+        return _shipped(name, "tuned")
+    known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
+    raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}")
 
 
 def load_law(name: str, **changed: float) -> LawSet:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from gfm_hil.cli.main import main
+from gfm_hil.league import as_shipped
 from gfm_hil.league_bench import AT, TRACE_EVERY, experiment
 from gfm_hil.league_tables import number
 from gfm_runtime import law_file
@@ -47,7 +48,9 @@ def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Cap
 
 
 def test_tables(folder: Path) -> None:
-    assert "| vsg-2 | 3 | 2 | 15.97 | **15.97** |" in (folder / "league_gamma.md").read_text()
+    assert (
+        "| vsg-2 | 3 | 2 | 15.97 | 15.97 | **15.97** |" in (folder / "league_gamma.md").read_text()
+    )
     assert "droop-1" not in (folder / "league_gamma.md").read_text()
     assert "50.7" in (folder / "league_unstable.md").read_text()
 
@@ -79,6 +82,12 @@ def test_an_experiment_that_ends_early() -> None:
     assert run["status"] == "tripped"
     assert 0.0 < run["end_s"] < 4.5
     assert "overshoot_pct" not in run
+
+
+def test_mimo_gfm_with_other_gains_is_not_searched() -> None:
+    assert as_shipped("mimo-gfm-deployable")
+    assert not as_shipped("mimo-gfm")
+    assert not as_shipped("vsg-2")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
 
-from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law
+from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
 from gfm_runtime.lawfile import ElementSpec, LawFile
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -21,6 +21,7 @@ def add(commands: Any) -> None:
     """Add the command and its sub-command to the parser."""
     command = commands.add_parser("laws", help="list the laws, or show one")
     command.add_argument("--json", action="store_true", help="as JSON")
+    command.add_argument("--tuned", action="store_true", help="those with the league's gains")
     command.set_defaults(call=call_list)
     show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
     show.add_argument("name", help="catalogue name or law file")
@@ -44,9 +45,9 @@ def cell_text(file: LawFile, key: str) -> str:
 
 
 def call_list(options: argparse.Namespace) -> int:
-    """List the catalogue."""
+    """List the catalogue, or its tuned laws."""
     rows = []
-    for name in law_names():
+    for name in tuned_names() if options.tuned else law_names():
         laws, file = load_law(name), law_file(name)
         first = laws.laws[0]
         rows.append(

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from gfm_design.paper_tune import EVALUATIONS
+from gfm_design.synthesis import UNSTABLE
 from gfm_hil.campaign.execute import WorkerLost
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
 from gfm_hil.errors import UserError
@@ -32,7 +33,7 @@ def add(kinds: Any) -> None:
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
     command.add_argument("--evaluations", type=int, default=EVALUATIONS, help="of each start")
-    command.add_argument("--starts", type=int, default=17, help="the given start and random ones")
+    command.add_argument("--starts", type=int, help="of each law; more for more gains, if left")
     command.add_argument("--out", help="folder to write, or to go on with; runs/league-<time>")
     command.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     command.add_argument("--json", action="store_true", help="print league.json, nothing else")
@@ -83,8 +84,9 @@ def call(options: argparse.Namespace) -> int:
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
     for name, least in (("evaluations", 1), ("starts", 1), ("jobs", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            raise UserError(f"--{name} {getattr(options, name)}: must be at least {least}")
+        given = getattr(options, name)
+        if given is not None and given < least:
+            raise UserError(f"--{name} {given}: must be at least {least}")
     rated = [name for name in law_names() if name not in LEFT_OUT]
     names = split_laws(options.laws) if options.laws else rated
     for name in names:
@@ -122,9 +124,8 @@ def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, An
 
         def tell(law: str, done: int, best: float) -> None:
             if law not in searches:
-                total = options.evaluations * options.starts
-                searches[law] = bar.add_task(law, total=total, best="")
-            shown = f"γ {best:.4g}" if best < 1e6 else "looking for a stable loop"
+                searches[law] = bar.add_task(law, total=None, best="")
+            shown = f"γ {best:.4g}" if best < UNSTABLE else "looking for a loop that holds"
             bar.update(searches[law], completed=done, best=shown if math.isfinite(best) else "")
 
         def done(row: Row) -> None:
