@@ -17,6 +17,7 @@ from gfm_hil.links.impaired.stage import (
     INNER,
     INNER_WORDS,
     LONGEST,
+    REFUSED,
     admit,
     make_stage,
     release,
@@ -47,8 +48,10 @@ class ImpairedLink:
         return {**counts, "waiting": int(waiting(self._stage))}
 
     def send(self, message: bytes) -> bool:
-        """As the link underneath."""
-        return self._link.send(message)
+        """As the link underneath, which may have no room: counted too."""
+        sent = self._link.send(message)
+        self._stage[REFUSED] += not sent
+        return sent
 
     def receive(self) -> bytes | None:
         """The next message that the stage lets through; what comes after it stays on the link."""
@@ -97,7 +100,9 @@ def _functions(inner_send: Any, inner_receive: Any) -> tuple[Any, Any]:
 
     def send(handle, message):
         under = carray(_as_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
-        return inner_send(under, message)
+        sent = inner_send(under, message)
+        handle[REFUSED] += sent == 0
+        return sent
 
     def receive(handle, message):
         under = carray(_as_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)

@@ -17,10 +17,11 @@ from gfm_hil.loops.clock import end_this_process, now_ns
 INNER, INNER_WORDS = 0, 1  # address and length of the handle of the link underneath
 _RANDOM, _LOSS, _LOSS_MORE, _CORRUPT, _BITS, _DUPLICATE, _REORDER = range(2, 9)
 _DELAY, _JITTER, _PAUSE_AT, _PAUSE, _KILL_AT, _BURST, _SILENT_UNTIL, _LAST_DUE = range(9, 17)
-SEEN, LOST, CORRUPTED, DUPLICATED, REORDERED, PAUSED, DROPPED, _HELD = range(17, 25)
+SEEN, LOST, CORRUPTED, DUPLICATED, REORDERED, PAUSED, DROPPED, REFUSED, _HELD = range(17, 26)
 COUNTED = {"seen": SEEN, "lost": LOST, "corrupted": CORRUPTED, "duplicated": DUPLICATED,
-           "reordered": REORDERED, "paused": PAUSED, "dropped": DROPPED}  # fmt: skip
-_QUEUE = 25
+           "reordered": REORDERED, "paused": PAUSED, "dropped": DROPPED,
+           "refused": REFUSED}  # fmt: skip
+_QUEUE = 26
 
 PLACES, _WORDS = 64, 64  # messages in the queue; words of 8 bytes in each
 _DUE, _KEY, _SIZE, _DATA = range(4)  # of one place: ns, order, bytes (0: free), the message

@@ -1,0 +1,103 @@
+"""Both sides of a run in two threads of this process, over any link, in either kind of loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_hil.bench import make_bench
+from gfm_hil.controller_side import run_controller
+from gfm_hil.handshake import shake_hands
+from gfm_hil.links import Link, link_kind, open_link
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.impaired import ImpairedLink
+from gfm_hil.loops.records import TOLD
+from gfm_hil.loops.thread import run_compiled
+from gfm_hil.plant_side import run_plant
+from gfm_hil.recording import Part, merge
+from gfm_hil.scenario import Scenario
+from gfm_hil.side import compile_side
+from gfm_hil.timeline import Timeline, read_log
+
+from .test_links import in_threads
+
+PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
+Touch = Callable[[Side, Link], Link]
+
+
+@dataclass
+class Pair:
+    """What a run in two threads left.
+
+    Attributes:
+        signals, timing: as in signals.npz and timing.npz.
+        faults: each side's counters of frames.
+        injected: counters of each side's impairment stage.
+        log: lines of both event logs.
+    """
+
+    signals: dict[str, np.ndarray] = field(default_factory=dict)
+    timing: dict[str, np.ndarray] = field(default_factory=dict)
+    faults: dict[Side, dict[str, int]] = field(default_factory=dict)
+    injected: dict[Side, dict[str, int]] = field(default_factory=dict)
+    log: list[dict[str, Any]] = field(default_factory=list)
+
+    def ends(self) -> dict[str, tuple[str, str, int]]:
+        """How each side ended: status, reason, tick."""
+        return {
+            e["side"]: (e["status"], e["reason"], e["tick"])
+            for e in self.log
+            if e["event"] == "end"
+        }
+
+
+def run_pair(
+    scenario: Scenario,
+    folder: Path,
+    link: str,
+    options: dict[str, Any] | None = None,
+    touch: Touch = lambda side, link: link,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Pair:
+    """Run a scenario over a link of its own; ``touch`` may wrap an end after the handshake."""
+    folder.mkdir(parents=True, exist_ok=True)
+    endpoint = link_kind(link).fresh(folder)
+    benches = {side: make_bench(scenario) for side in SIDES}
+    parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
+    for side in SIDES:
+        compile_side(side, benches[side], parts[side])
+    pair = Pair()
+
+    def call(side: Side) -> None:
+        bench, part, impairment = benches[side], parts[side], scenario.link.impairment
+        end = open_link(link, side, endpoint, options)
+        timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
+        used, told = touch(side, end), np.zeros(TOLD, np.int64)
+        if impairment is not None and impairment.hits(side):
+            used = ImpairedLink(used, impairment, side)
+        try:
+            t0 = shake_hands(side, end, scenario, lambda: False, lambda text: None).t0_ns
+            if used.port is not None:
+                reader = run_compiled(side, bench, used, part, timeline, t0, stopped, told)
+            else:
+                run = run_controller if side == "controller" else run_plant
+                reader = run(bench, used, part, timeline, t0, stopped)
+            pair.faults[side] = dict(reader.faults)
+            if isinstance(used, ImpairedLink):
+                pair.injected[side] = used.injected
+        finally:
+            end.close()
+            timeline.close()
+
+    for problem in in_threads(call).values():
+        if problem is not None:
+            raise problem
+    pair.log = read_log(*sorted(folder.glob("events_*.jsonl")))
+    pair.signals = merge(folder, scenario.T_s, benches["controller"].controller.labels)
+    with np.load(folder / "timing.npz") as file:
+        pair.timing = dict(file)
+    return pair

@@ -1,0 +1,102 @@
+"""Faults on purpose on every link, in lockstep: each is counted, none changes a result."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.links.base import SIDES
+from gfm_hil.scenario import check_scenario
+
+from .pairs import PATIENT, Pair, run_pair
+
+TICKS, MANY = 2_000, 100_000
+LINKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "shm": ("shm", {}),
+    "zmq": ("zmq", {}),
+    "zmq-portable": ("zmq", {"portable": True}),
+    "can": ("can", {}),
+}
+IMPAIRMENTS: dict[str, dict[str, Any]] = {
+    "loss": {"loss": 0.01},
+    "burst": {"loss": 0.01, "burst": 4.0},
+    "corrupt": {"corrupt": 0.01},
+    "corrupt-bits": {"corrupt": 0.01, "bits": 16},
+    "duplicate": {"duplicate": 0.01},
+    "reorder": {"reorder": 0.01},
+    "delay": {"delay": 50e-6},
+    "jitter": {"delay": 20e-6, "jitter": 100e-6},
+    "pause": {"pause_at": 700, "pause": 0.05},
+    "all": {"loss": 0.005, "burst": 2.0, "corrupt": 0.005, "duplicate": 0.005, "reorder": 0.005},
+}
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder of short path, for an ipc endpoint."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
+        yield Path(folder)
+
+
+def lockstep(place: Path, link: str, ticks: int, impairment: dict[str, Any] | None) -> Pair:
+    """A run with a step of the power reference over one of ``LINKS``."""
+    name, options = LINKS[link]
+    content = {
+        "title": "faults",
+        "duration": ticks * 1e-4,
+        "seed": 5,
+        "law": "mimo-gfm",
+        "link": {**PATIENT, "repeat_s": 0.01, "impairment": impairment},
+        "plant": {"sensors": {"noise_std": {"p": 1e-4, "V": 1e-4}}},
+        "events": [{"tick": ticks // 3, "type": "reference", "P_ref": 0.6}],
+    }
+    return run_pair(check_scenario(content, "test"), place, name, options)
+
+
+@cache
+def unharmed(link: str, ticks: int) -> dict[str, np.ndarray]:
+    """The signals of the run without faults."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
+        return lockstep(Path(folder), link, ticks, None).signals
+
+
+def check(pair: Pair, link: str, ticks: int) -> None:
+    """Nothing changed, and every fault is in its class, none besides."""
+    assert {side: end[0] for side, end in pair.ends().items()} == dict.fromkeys(SIDES, "completed")
+    plain = unharmed(link, ticks)
+    for name in plain:
+        assert pair.signals[name].tobytes() == plain[name].tobytes(), name
+    for side, other in zip(SIDES, reversed(SIDES), strict=True):
+        i, faults = pair.injected[side], pair.faults[side]
+        assert i["seen"] >= ticks
+        assert faults["crc"] == i["corrupted"]
+        gone = i["lost"] + i["corrupted"] + i["reordered"] + i["dropped"]
+        refused = pair.injected[other]["refused"]  # by a link without room, on a crowded machine
+        assert gone <= faults["lost"] <= gone + refused
+        late = faults["repeated"] + faults["out_of_sequence"]
+        assert late <= i["duplicated"] + i["reordered"] <= late + i["waiting"]
+        assert not any(faults[f] for f in ("size", "magic", "version", "source"))
+
+
+@pytest.mark.parametrize("kind", IMPAIRMENTS)
+@pytest.mark.parametrize("link", LINKS)
+def test_every_fault_is_counted_and_no_result_changes(link, kind, place):
+    pair = lockstep(place, link, TICKS, IMPAIRMENTS[kind])
+    check(pair, link, TICKS)
+    if "delay" not in IMPAIRMENTS[kind]:
+        hit = ("lost", "corrupted", "duplicated", "reordered", "paused")
+        assert all(sum(pair.injected[side][h] for h in hit) > 0 for side in SIDES)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("kind", IMPAIRMENTS)
+@pytest.mark.parametrize("link", LINKS)
+def test_every_fault_is_counted_in_a_hundred_thousand_ticks(link, kind, place):
+    check(lockstep(place, link, MANY, IMPAIRMENTS[kind]), link, MANY)
