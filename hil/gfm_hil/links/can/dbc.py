@@ -76,7 +76,7 @@ def _number(
 def _protection() -> list[Signal]:
     return [
         _number(CRC, 0, 1, "CRC-8 SAE J1850 over data id and all bytes after this one"),
-        _number(COUNTER, 1, 1, "bits 0-5: sequence, bits 6-7: sequence - tick"),
+        _number(COUNTER, 1, 1, "bits 0-5: sequence, 6: lag of the tick, 7: said in the status"),
     ]
 
 

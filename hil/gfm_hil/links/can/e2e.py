@@ -4,7 +4,7 @@ Byte 0: CRC-8 SAE J1850 (polynomial 0x1D, start 0xFF, inverted at the end) over 
 byte, high byte) and then all bytes of the frame but this one, as in AUTOSAR E2E Profile 1A. The
 data id does not travel: it is taken from the frame's definition, so that a frame of another
 definition under the same identifier fails the check.
-Byte 1: counter, six bits of the sequence and two of the lag of the tick (see ``vectors``). Profile
+Byte 1: counter, six bits of the sequence and two about the tick (see ``vectors``). Profile
 1 has four bits, which a stall of a general-purpose kernel (2 to 5 ms, 50 ticks at 10 kHz) would
 overrun; a state, which could have had the other four, travels in a frame of its own.
 """

@@ -1,13 +1,14 @@
 """Between the bench's frames and the bus: a vector becomes CAN frames, and a frame again.
 
 A frame of the bench has a sequence (one more for every frame sent) and a tick (the same in one
-that was sent again). On the bus a vector carries the low six bits of its sequence and the low two
-of how far the tick is behind it, both in the byte ``Counter``; the receiver counts on from what it
-had. A state travels in a frame of its own ahead of the values, with 32 bits of the tick: twice when
-the state or that lag has changed, and every ``heartbeat`` vectors. Whoever lost more than 58
-vectors in a row takes new values for older ones until then, and misses multiples of 64 in the
-count of the lost. New values for a tick sent again could pass for newer ones only after four of
-them in a row and then their states got lost; the other side then does not accept the answer.
+that was sent again); how far the tick is behind is its lag. On the bus a vector carries the low six
+bits of its sequence and the lowest of its lag in the byte ``Counter``; the receiver counts on from
+what it had. State and lag travel in a frame of their own ahead of the values, with 32 bits of the
+tick: when one of them has changed, at that tick and the next, and every ``heartbeat`` vectors.
+Values sent with a change are marked, and worth nothing without it: in lockstep, where a tick goes
+on only once it was heard, none can pass for another tick. In real time, whoever lost both changes,
+or more than 58 vectors in a row, takes new values for older ones or refuses them until the next
+heartbeat; of the latter the count of the lost misses multiples of 64.
 
 What fails its check here is made a frame that fails its own, so that its reader counts it.
 """
@@ -26,7 +27,8 @@ from gfm_runtime.signals import Group, names
 #: a CAN frame: identifier and payload
 CanFrame = tuple[int, bytes]
 
-_SEQUENCES, _LAGS = 64, 4  # that a counter tells apart
+_SEQUENCES = 64  # that a counter tells apart
+_LAG, _MARK = 0x40, 0x80  # its other bits
 _BEHIND = 4  # how many of the sequences mean an older vector
 _CRC_BYTES = 4  # at the end of a frame of the bench
 
@@ -46,6 +48,7 @@ class VectorSender:
         self._status = plan.status[SENDERS[group]]
         self._heartbeat, self._since = heartbeat, 0
         self._told: tuple[int, int, int] | None = None
+        self._tick, self._ticks = -1, 0  # sent last; for how many more it is said with the values
         self.saturated = 0  # values that lay outside 16 bits
 
     def fits(self, message: bytes) -> bool:
@@ -59,13 +62,17 @@ class VectorSender:
         f = self._frame[0]
         sequence, tick = int(f["sequence"]), int(f["tick"])
         told = (int(f["state"]), int(f["reason"]), (sequence - tick) & 0xFFFF_FFFF)
-        counter = sequence % _SEQUENCES | (sequence - tick) % _LAGS * _SEQUENCES
         good = int(f["crc"]) == crc32(self._message, len(message) - _CRC_BYTES)
+        if good:
+            self._ticks -= tick != self._tick and self._ticks > 0
+            self._tick = tick
+            if told != self._told:
+                self._told, self._ticks = told, 2
+        counter = sequence % _SEQUENCES | (told[2] & 1) * _LAG | (self._ticks > 0) * _MARK
         out: list[CanFrame] = []
-        if good and told != self._told:
-            self._told, self._since = told, 0
-        if good and (self._since < 2 or self._since % self._heartbeat == 0):
+        if good and (self._ticks > 0 or self._since >= self._heartbeat):
             out.append((self._status.number, self._state(counter, tick, *told[:2])))
+            self._since = 0
         self._since += 1
         for part, payload in self._parts:
             self.saturated += pack_vector(
@@ -96,9 +103,10 @@ class VectorReceiver:
         self._frame, self._message = buffer(len(names(group)), DATA_IDS[group])
         self._parts = {part.number: (k, part) for k, part in enumerate(plan.vectors[group])}
         self._status = plan.status[SENDERS[group]]
-        self._sequence, self._lag = -1, 0  # of the newest frame; lag = sequence - tick
+        self._sequence, self._lag = -1, 0  # of the newest frame
+        self._said = -1  # sequence of the newest state
         self._counter, self._have = -1, 0  # of the vector being put together, and its parts
-        self.incomplete = 0  # vectors of which a part never came
+        self.incomplete = 0  # vectors of which a part or the state never came
 
     def knows(self, number: int) -> bool:
         """Whether an identifier is one of this vector or its sender's state."""
@@ -121,7 +129,7 @@ class VectorReceiver:
             return
         tick = self._sequence - self._lag
         tick += (int(status["Tick"]) - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
-        self._lag = sequence - tick
+        self._lag, self._said = sequence - tick, sequence
         self._frame["state"], self._frame["reason"] = status["State"], status["Reason"]
 
     def _count_on(self, counter: int) -> int:
@@ -141,11 +149,12 @@ class VectorReceiver:
         if self._have != (1 << len(self._parts)) - 1:
             return None
         self._have = 0
-        sequence = self._count_on(counter)
-        # of a state that got lost: a tick sent again is known as such, a skip passes for older
-        lag = self._lag + (counter // _SEQUENCES - self._lag) % _LAGS
-        if sequence > self._sequence:
-            self._sequence, self._lag = sequence, lag
+        sequence, lag = self._count_on(counter), self._lag
+        marked = counter & _MARK and sequence != self._said
+        if marked or bool(counter & _LAG) != bool(lag & 1):  # its tick is not known
+            self.incomplete += 1
+            return None
+        self._sequence = max(self._sequence, sequence)
         f = self._frame[0]
         f["sequence"], f["tick"] = sequence & 0xFFFF_FFFF, max(sequence - lag, 0)
         return self._made(damaged=False)
