@@ -25,6 +25,7 @@ from gfm_hil.plant_side import run_plant
 from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording import Part, keep_in_memory, record_controller, record_plant
 from gfm_hil.scenario import Scenario
+from gfm_hil.sd_notify import Watched, notify
 from gfm_hil.stopping import Interrupt
 from gfm_hil.timeline import Outcome, Timeline
 from gfm_plant import plant_advance, plant_sample
@@ -114,12 +115,14 @@ def _meet_and_run(
                 rights["policy"] = ordinary_priority()
             timeline.write(0, "scheduling", side=side, **rights)
         no_collector_pauses()
+        notify(f"STATUS=waiting for the other side at {endpoint}")
         start = shake_hands(side, good, scenario, stopped, notice)
-        if link.port is not None:
-            reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped, told)
-        else:
-            run = run_controller if side == "controller" else run_plant
-            reader = run(bench, link, part, timeline, start.t0_ns, stopped)
+        with Watched(scenario, part.progress):
+            if link.port is not None:
+                reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped, told)
+            else:
+                run = run_controller if side == "controller" else run_plant
+                reader = run(bench, link, part, timeline, start.t0_ns, stopped)
     finally:
         link.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
