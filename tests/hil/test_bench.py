@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +134,41 @@ def test_without_a_compiler_the_links_are_measured_alone(
     assert "C" not in {r["peer"] for r in found["results"]}
     assert all(r["ratio_to_baseline_p50"] is None and r["n"] for r in found["results"])
     assert any("no C compiler" in remark for remark in found["remarks"])
+
+
+def processes_with(mark: str) -> int:
+    """How many processes have a mark in their environment."""
+    found = 0
+    for place in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # gone meanwhile
+            found += mark.encode() in place.read_bytes()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "everyone"),  # with the parent: two processes, hogs; the product's two sides
+    [("latency", 3 + len(os.sched_getaffinity(0))), ("loop", 5 + len(os.sched_getaffinity(0)))],
+)
+def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) -> None:
+    mark = f"GFMHIL_TEST={uuid.uuid4()}"
+    line = ["bench", kind, "--links", "shm", "--seconds", "30", "--mode", "realtime"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gfm_hil", *line, "--out", str(tmp_path / "bench")],
+        env={**os.environ, **dict([mark.split("=")])}, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        until = time.monotonic() + 90
+        while processes_with(mark) < everyone and time.monotonic() < until:
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, said
+    assert said == ("", "")
+    assert processes_with(mark) == 0
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from gfm_hil.benchmark.inproc_loop import Loop
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.spread import summary
-from gfm_hil.benchmark.turns import Spread, quickest
+from gfm_hil.benchmark.turns import Spread, quickest, rounds
 from gfm_hil.errors import UserError
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.runner import Progress, run_scenario
@@ -49,7 +49,8 @@ Timing = dict[str, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for: links, loads of real time, its policy, s and rounds of both modes."""
+    """What is asked for: links, loads of real time, its policy, s and rounds of both modes (fewer
+    if those of a mode would take longer than the budget)."""
 
     links: Sequence[str]
     loads: Sequence[Load]
@@ -57,6 +58,7 @@ class Plan:
     lockstep_s: float
     realtime_s: float
     rounds: int
+    budget_s: float
 
 
 @dataclass
@@ -103,7 +105,7 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
-        for number in range(plan.rounds):
+        for number in rounds(plan.rounds, plan.budget_s):
             plant_ns = quickest(alone.plant_part)
             for k, name in enumerate(list(rates)[:: -1 if number % 2 else 1]):
                 tell(f"lockstep, {name}", (number + k / len(rates)) / plan.rounds)
@@ -141,7 +143,7 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
         load_is = stack.enter_context(hogs())
         two = stack.enter_context(pair(plan.policy, place))
         two.both(pace_here, 0, 1, HYBRID, 1)
-        for number in range(plan.rounds):
+        for number in rounds(plan.rounds, plan.budget_s):
             for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
                 share = (number + k / len(cells)) / plan.rounds
                 tell(f"real time, {cell.link}, {cell.load}", share)
@@ -237,6 +239,8 @@ def _run(
     """Run a scenario; its timing, how its sides were scheduled, and how it ended."""
     folder = place / f"run-{time.monotonic_ns()}"
     summary = run_scenario(scenario, folder, progress, figures=False).summary
+    if summary["status"] == "interrupted":  # Ctrl-C, which the run has caught
+        raise KeyboardInterrupt
     with np.load(folder / "timing.npz") as file:
         timing = dict(file)
     log = [json.loads(line) for line in (folder / "events.jsonl").read_text("utf-8").splitlines()]

@@ -29,7 +29,9 @@ _SETTLE_S = 0.02
 def hogs() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
     """Start them, halted; yields a context that lets them go for ``hogs`` and not for ``idle``."""
     started = [
-        subprocess.Popen([sys.executable, "-c", _HOG, str(cpu)])
+        subprocess.Popen(  # own session: Ctrl-C is the parent's to handle
+            [sys.executable, "-c", _HOG, str(cpu)], start_new_session=True
+        )
         for cpu in sorted(os.sched_getaffinity(0))
     ]
 

@@ -22,6 +22,7 @@ from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.hogs import Load, hogs
 from gfm_hil.benchmark.pair import Pair, Policy, pair
 from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.benchmark.turns import rounds
 from gfm_hil.loops.clock import now_ns, sleep_until, wait_until
 
 HYBRID, SPIN, SLEEP = range(3)
@@ -64,7 +65,8 @@ def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for: ways to wait, loads, policies, period in ns, s of a round, rounds."""
+    """What is asked for: ways to wait, loads, policies, period in ns, s of a round, rounds of each
+    (fewer if they would take longer than the budget)."""
 
     waits: Sequence[str]
     loads: Sequence[Load]
@@ -72,6 +74,7 @@ class Plan:
     period_ns: int
     seconds: float
     rounds: int
+    budget_s: float
 
 
 def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, Any]]:
@@ -88,7 +91,7 @@ def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, An
         }
         for each in two.values():
             each.both(pace_here, 0, 1, HYBRID, 1)  # compiled before anything is timed
-        for number in range(plan.rounds):
+        for number in rounds(plan.rounds, plan.budget_s):
             for n, (policy, load, wait) in enumerate(list(cells)[:: -1 if number % 2 else 1]):
                 tell(f"{policy}, {load}, {wait}", (number + n / len(cells)) / plan.rounds)
                 with load_is(load):

@@ -16,6 +16,7 @@ from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
 from gfm_hil.benchmark.hogs import Load, hogs
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.benchmark.turns import rounds
 from gfm_hil.errors import UserError
 
 Mode = Literal["lockstep", "realtime"]
@@ -38,7 +39,7 @@ class Plan:
         policy: how the two processes are scheduled.
         payload: bytes there; 84 stands for the bench's frames, 84 there and 68 back.
         seconds: of one round.
-        rounds: of each.
+        rounds: of each; fewer if they would take longer than ``budget_s``.
     """
 
     links: Sequence[str]
@@ -48,6 +49,7 @@ class Plan:
     payload: int
     seconds: float
     rounds: int
+    budget_s: float
 
 
 @dataclass
@@ -87,18 +89,22 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
                 remarks.append(f"{contender.name}: not measured: {problem}")
                 continue
             cells += [_Cell(contender, m, w, compiled) for w in plan.loads for m in plan.modes]
-        for number in range(-1, plan.rounds):  # the first to compile and to warm up
+
+        def one_round(number: int, seconds: float) -> None:
             for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
-                done = (max(number, 0) + k / len(cells)) / plan.rounds
-                tell(f"{cell.contender.name}, {cell.mode}, {cell.load}", done if number >= 0 else 0)
+                share = (number + k / len(cells)) / plan.rounds
+                tell(f"{cell.contender.name}, {cell.mode}, {cell.load}", max(share, 0.0))
                 period = PERIOD_NS if cell.mode == "realtime" else 0
                 with load(cell.load):
-                    seconds = plan.seconds if number >= 0 else _FIRST_S
                     times = two.round(cell.contender, period, seconds)
                 time.sleep(REST * seconds)
                 if number >= 0 and len(times):
                     cell.rounds[number] = times
                 cell.silent += not len(times)
+
+        one_round(-1, _FIRST_S)  # to compile and to warm up
+        for number in rounds(plan.rounds, plan.budget_s):
+            one_round(number, plan.seconds)
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
     results = [_result(c, by_key.get((c.contender.baseline, c.mode, c.load)), plan) for c in cells]
     return results, remarks

@@ -26,6 +26,7 @@ from gfm_hil.stopping import end_with_parent
 Policy = Literal["fifo", "other"]
 
 CAPACITY = 1 << 20  # round trips in a round
+_START_S = 120.0
 WARM_NS = 20_000_000
 
 # of one of the two processes
@@ -91,8 +92,16 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
         for side in SIDES
     }
     stop = np.memmap(path, np.int64, "r+")
+    two = Pair(pools, stop)
+    heard = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:  # both start now and inherit this: Ctrl-C is the parent's to handle
+        started = [pool.submit(_started) for pool in pools.values()]
+    finally:
+        signal.signal(signal.SIGINT, heard)
     try:
-        yield Pair(pools, stop)
+        for one in started:
+            one.result(_START_S)
+        yield two
     finally:
         stop[0] = 1
         for pool in pools.values():
@@ -104,7 +113,6 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
 
 def _set_up(side: Side, policy: Policy, stop: str) -> None:
     global _side, _took, _stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     end_with_parent()
     if policy == "fifo":
         ask_for_real_time(side)
@@ -114,6 +122,10 @@ def _set_up(side: Side, policy: Policy, stop: str) -> None:
     _took += 1  # no page is first touched in a round
     _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
     no_collector_pauses()
+
+
+def _started() -> None:
+    """The first task: it is done once ``_set_up`` is."""
 
 
 def _open(contender: Contender, payload: int) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -49,10 +50,10 @@ def _everything(options: Namespace) -> list[Step]:
         return Namespace(**{**_ALL, **vars(options), **numbers})
 
     return [
-        _latency(with_(seconds=0.1, rounds=5)),
-        _jitter(with_(seconds=0.1, rounds=5)),
+        _latency(with_(seconds=0.1, rounds=5, budget=40.0)),
+        _jitter(with_(seconds=0.1, rounds=5, budget=15.0)),
         _kernel(with_(rounds=3)),
-        _loop(with_(seconds=1.5, rounds=2, laws=",".join(_FEW_LAWS))),
+        _loop(with_(seconds=1.5, rounds=2, budget=30.0, laws=",".join(_FEW_LAWS))),
     ]
 
 
@@ -65,6 +66,7 @@ def _latency(options: Namespace) -> Step:
         payload=within("--payload", options.payload, 1, 504),
         seconds=within("--seconds", options.seconds, 0.01, 60),
         rounds=within("--rounds", options.rounds, 1, 1000),
+        budget_s=getattr(options, "budget", math.inf),
     )
 
     def step(content: dict[str, Any], tell: Tell) -> None:
@@ -83,6 +85,7 @@ def _jitter(options: Namespace) -> Step:
         period_ns=_PERIOD_NS,
         seconds=within("--seconds", options.seconds, 0.01, 60),
         rounds=within("--rounds", options.rounds, 1, 1000),
+        budget_s=getattr(options, "budget", math.inf),
     )
 
     def step(content: dict[str, Any], tell: Tell) -> None:
@@ -115,6 +118,7 @@ def _loop(options: Namespace) -> Step:
         lockstep_s=seconds,
         realtime_s=seconds,
         rounds=within("--rounds", options.rounds, 1, 1000),
+        budget_s=getattr(options, "budget", math.inf),
     )
 
     def step(content: dict[str, Any], tell: Tell) -> None:

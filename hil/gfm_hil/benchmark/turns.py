@@ -7,7 +7,8 @@ ratio is taken turn by turn, between runs that follow each other at once, before
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any
@@ -63,6 +64,18 @@ def take_turns(jobs: Mapping[str, Callable[[], float]], turns: int) -> dict[str,
         for name in list(jobs)[:: -1 if turn % 2 else 1]:
             found[name].append(jobs[name]())
     return found
+
+
+def rounds(count: int, budget_s: float) -> Iterator[int]:
+    """Numbers of rounds: ``count`` of them, or as many as by their length so far fit the budget.
+
+    At least one. On a machine that is busy with other things rounds take several times longer.
+    """
+    begin = time.monotonic()
+    for number in range(count):
+        if number and (time.monotonic() - begin) * (number + 1) / number > budget_s:
+            return
+        yield number
 
 
 def ratio(over: Sequence[float], under: Sequence[float]) -> Spread:
