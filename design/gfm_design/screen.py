@@ -16,8 +16,8 @@ from gfm_design.sizes import Sizes
 
 Vector = NDArray[np.float64]
 
-_BASE = np.concatenate(
-    [[1e-3], np.logspace(-2, 0, 10), np.logspace(0.05, 3, 70), np.logspace(3.1, 5, 20)]
+_BASE = np.concatenate(  # rad/s; as good as 0 and infinity at the ends, where many laws are worst
+    [[1e-6, 1e-3], np.logspace(-2, 0, 10), np.logspace(0.05, 3, 70), np.logspace(3.1, 5, 20), [1e7]]
 )
 _ACROSS = np.array([-2.0, -0.8, -0.3, 0.0, 0.3, 0.8, 2.0])  # half widths beside a resonance
 
