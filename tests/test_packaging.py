@@ -16,17 +16,22 @@ FOLDERS = {
     "gfm_plant": ROOT / "plant_emulator" / "gfm_plant",
     "gfm_design": ROOT / "design" / "gfm_design",
     "gfm_hil": ROOT / "hil" / "gfm_hil",
+    "gfm_pytest": ROOT / "hil" / "gfm_pytest",
 }
 MAY_IMPORT = {
     "gfm_runtime": (),
     "gfm_plant": ("gfm_runtime.signals",),
     "gfm_design": ("gfm_runtime", "gfm_plant"),
     "gfm_hil": ("gfm_runtime", "gfm_plant", "gfm_design"),
+    "gfm_pytest": ("gfm_hil",),
 }
 RUNTIME_NEEDS = {"numpy", "numba"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 BESIDE_THE_LOOP = {"lawfile.py": {"pydantic", "pydantic_core"}}
-SOURCES = [*FOLDERS.values(), *(ROOT / name for name in ("tests", "benchmarks", "docs"))]
+SOURCES = [
+    *FOLDERS.values(),
+    *(ROOT / name for name in ("tests", "benchmarks", "docs", "examples")),
+]
 TEXT = {".py", ".md", ".toml", ".yml", ".yaml", ".json", ".service", ".sh", ".dbc", ".html"}
 HOME = re.compile(r"/(home|Users|root|work)/")
 

@@ -37,9 +37,10 @@ def _thin(t: NDArray[Any], x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]
     return np.append(moments, t[n:]), np.append(pairs, x[n:])
 
 
-def _panel(
+def draw_panel(
     axes: Axes, title: str, curves: Sequence[tuple[NDArray[Any], NDArray[Any], str, str]]
 ) -> None:
+    """One quantity: curves of t [s], values, colour and label."""
     for t, x, colour, label in curves:
         axes.plot(*_thin(t, x), color=colour, lw=1.1, label=label)
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
@@ -106,7 +107,7 @@ def _draw_signals(
 
     def panel(axes: Axes, title: str, *names: tuple[str, str, str], factor: float = 1.0) -> None:
         drawn = [(t, signals[n] * factor, c, label) for n, c, label in names if n in signals]
-        _panel(axes, title, drawn)
+        draw_panel(axes, title, drawn)
         if len(drawn) > 1:
             axes.legend(fontsize=8, frameon=False, loc="best")
 
@@ -184,7 +185,7 @@ def draw_comparison(
             (s["t"], s[name] * factor, COLOURS[k % len(COLOURS)], law)
             for k, (law, s) in enumerate(runs.items())
         ]
-        _panel(a, title, curves)
+        draw_panel(a, title, curves)
     axes[0].legend(fontsize=8.5, frameon=False, ncols=min(4, len(runs)), loc="lower right")
     _mark(axes, events)
     figure.suptitle(scenario.title, fontsize=11, x=0.01, ha="left")

@@ -38,6 +38,9 @@ class Processes:
         folder: where both record.
         progress, notice: as for ``run_scenario``.
         interrupt: set when the operator wants it to end.
+        controller_command: program and arguments to start as the controller; ours if empty.
+            ``{endpoint}`` and ``{scenario}`` in an argument become the endpoint and the path of
+            the resolved scenario.
     """
 
     scenario: Scenario
@@ -45,6 +48,7 @@ class Processes:
     progress: Progress
     notice: Callable[[str], None]
     interrupt: Interrupt
+    controller_command: tuple[str, ...] = ()
 
     def run(self) -> tuple[float, Outcome | None]:
         """Start both, watch them to their end.
@@ -86,16 +90,25 @@ class Processes:
         self.notice("compiling the kernels (once a machine) …")
         bench = make_bench(self.scenario)
         with scratch.temporary("gfmhil-run-") as place:
-            for side in SIDES:
+            for side in ("plant",) if self.controller_command else SIDES:
                 compile_side(side, bench, Part.create(place, side, 1))
 
     def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
+        scenario = str(self.folder / "scenario.toml")
         # -P: a file of the operator's folder must not stand in for a module
-        command = [sys.executable, "-P", "-m", "gfm_hil", side, str(self.folder / "scenario.toml")]
+        command = [sys.executable, "-P", "-m", "gfm_hil", side, scenario]
         command += ["--endpoint", endpoint, "--out", str(self.folder), "--part", "--quiet"]
+        if side == "controller" and self.controller_command:
+            command = [
+                argument.replace("{endpoint}", endpoint).replace("{scenario}", scenario)
+                for argument in self.controller_command
+            ]
         with self._log(side).open("wb") as log:
-            # own session: Ctrl-C reaches the sides through us, once
-            return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            try:
+                # own session: Ctrl-C reaches the sides through us, once
+                return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            except OSError as problem:
+                raise UserError(f"{command[0]}: cannot be started: {problem.strerror}") from None
 
     def _log(self, side: Side) -> Path:
         return self.folder / f"{side}.log"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gfm_hil.bench import Bench, make_bench
@@ -31,6 +31,7 @@ def run_scenario(
     progress: Progress = lambda ticks, misses: None,
     notice: Notice = lambda text: None,
     figures: bool = True,
+    controller_command: Sequence[str] = (),
 ) -> Run:
     """Run a scenario and leave a run folder.
 
@@ -40,6 +41,8 @@ def run_scenario(
         progress: told how far the run is.
         notice: told what a person should know while waiting.
         figures: draw the figures and write report.html.
+        controller_command: program and arguments of another controller instead of ours, for a
+            link that is none of ``inproc``; see ``Processes``.
 
     Raises:
         UserError: the folder is in use, no operating point, an endpoint that is occupied. The
@@ -55,7 +58,10 @@ def run_scenario(
             began = _run_here(bench, folder, progress, notice, interrupt)
         else:
             try:
-                began, outside = Processes(scenario, folder, progress, notice, interrupt).run()
+                processes = Processes(
+                    scenario, folder, progress, notice, interrupt, tuple(controller_command)
+                )
+                began, outside = processes.run()
             except UserError:
                 remove_parts(folder)
                 shutil.rmtree(folder)

@@ -1,0 +1,160 @@
+"""What an assertion looks for in one signal: None, or what is wrong and where to see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.errors import UserError
+from gfm_hil.metrics import dominant_oscillation
+from gfm_hil.testing.signals import unit
+
+Vector = NDArray[np.float64]
+
+_TAIL = 0.05  # the last part of a window, whose mean is the final value
+
+
+@dataclass(frozen=True)
+class Window:
+    """A signal from a step on.
+
+    Attributes:
+        name: of the signal.
+        t: time, s, shape (n,).
+        x: its values, shape (n,).
+        before: its value just before the step.
+        since: time of the step, s.
+    """
+
+    name: str
+    t: Vector
+    x: Vector
+    before: float
+    since: float
+
+    def show(self, value: float) -> str:
+        """A value with its unit."""
+        return f"{value:.4g}{unit(self.name)}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is wrong.
+
+    Attributes:
+        text: in a sentence or two.
+        at: time of the worst point, s.
+        t, low, high: the band that the signal should have kept to, each of shape (n,); NaN: none.
+    """
+
+    text: str
+    at: float
+    t: Vector
+    low: Vector
+    high: Vector
+
+
+def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | None:
+    """The signal is within ``to`` ± ``tolerance`` from ``within`` s after the step to the end."""
+    begin = w.since + within
+    late = w.t >= begin - 1e-9
+    if not late.any():
+        raise UserError(f"within = {within:g}: the run ends {w.t[-1] - w.since:g} s after the step")
+    away = np.abs(w.x - to)
+    outside = np.flatnonzero(~(away <= tolerance))  # NaN is outside too
+    if not len(outside) or not late[outside[-1]]:
+        return None
+    last = int(outside[-1])
+    never = last >= len(w.t) - 1
+    worst = int(np.flatnonzero(late)[np.nanargmax(away[late])])
+    ending = w.x[-max(1, round(_TAIL * len(w.x))) :]
+    how = (
+        "it had not at the end of the run" if never else f"it took {w.t[last + 1] - w.since:.4g} s"
+    )
+    text = (
+        f"{w.name} should settle at {w.show(to)} ± {tolerance:g} within {within:g} s, but {how}: "
+        f"after these {within:g} s it was as far off as {w.show(w.x[worst])} "
+        f"(at t = {w.t[worst]:.4f} s); the end of the run lies in "
+        f"[{ending.min():.4g}, {ending.max():.4g}]."
+    )
+    nothing = np.full(len(w.t), np.nan)
+    low, high = nothing.copy(), nothing.copy()
+    low[late], high[late] = to - tolerance, to + tolerance
+    return Finding(text, float(w.t[worst]), w.t, low, high)
+
+
+def overshoot(w: Window, percent: float, to: float | None) -> Finding | None:
+    """Beyond ``to`` (or the final value) the signal goes by at most ``percent`` of the step."""
+    final = float(np.mean(w.x[-max(1, round(_TAIL * len(w.x))) :])) if to is None else to
+    step = final - w.before
+    if abs(step) < 1e-3:
+        raise UserError(f"signal = {w.name!r}: did not step ({w.before:.4g} to {final:.4g})")
+    beyond = 100 * (w.x - final) / step
+    worst = int(np.argmax(beyond))
+    if beyond[worst] <= percent:
+        return None
+    limit = np.full(len(w.t), final + percent / 100 * step)
+    none = np.full(len(w.t), np.nan)
+    text = (
+        f"{w.name} should overshoot its step from {w.before:.4g} to {w.show(final)} by at most "
+        f"{percent:g} %, but it went to {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, "
+        f"{beyond[worst]:.3g} %."
+    )
+    low, high = (none, limit) if step > 0 else (limit, none)
+    return Finding(text, float(w.t[worst]), w.t, low, high)
+
+
+def envelope(w: Window, low: Vector, high: Vector) -> Finding | None:
+    """The signal stays between ``low`` and ``high``, each of shape (n,); NaN: no limit there."""
+    beyond = np.fmax(np.fmax(low - w.x, w.x - high), 0.0)
+    beyond[np.isnan(w.x)] = np.inf
+    if not beyond.any():
+        return None
+    first, worst = int(np.flatnonzero(beyond)[0]), int(np.argmax(beyond))
+    side, limit = ("below", low) if w.x[worst] < low[worst] else ("above", high)
+    text = (
+        f"{w.name} should stay within its envelope, but it left it at t = {w.t[first]:.4f} s and "
+        f"was {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, {beyond[worst]:.3g} {side} the limit "
+        f"of {limit[worst]:.4g}."
+    )
+    return Finding(text, float(w.t[worst]), w.t, low, high)
+
+
+def damped(w: Window, min_ratio: float, T_s: float) -> Finding | None:
+    """The strongest oscillation after the step has at least this damping ratio."""
+    ratio, f = dominant_oscillation(w.x, T_s)
+    if ratio is None or ratio >= min_ratio:
+        return None
+    none = np.full(len(w.t), np.nan)
+    text = (
+        f"{w.name} should be damped with a ratio of at least {min_ratio:g}, but its strongest "
+        f"oscillation after the step, at {f:.3g} Hz, has {ratio:.3g}"
+        + (": it grows." if ratio < 0 else ".")
+    )
+    return Finding(text, float(w.t[np.argmax(np.abs(w.x - w.x[-1]))]), w.t, none, none)
+
+
+def read_envelope(path: Path, t: Vector) -> tuple[Vector, Vector]:
+    """The limits of a CSV file with the columns t, low, high at the times ``t`` after the step.
+
+    Between its lines it is interpolated; before the first and after the last there is no limit,
+    nor where a field is empty.
+
+    Raises:
+        UserError: no such file, or not of this form.
+    """
+    try:
+        table = np.genfromtxt(path, delimiter=",", names=True, dtype=float, ndmin=1)
+    except (OSError, ValueError) as problem:
+        raise UserError(f"csv = {str(path)!r}: {problem}") from None
+    if set(table.dtype.names or ()) != {"t", "low", "high"}:
+        raise UserError(f"csv = {str(path)!r}: its first line must be t,low,high")
+    if np.isnan(table["t"]).any() or (np.diff(table["t"]) < 0).any():
+        raise UserError(f"csv = {str(path)!r}: its times must be numbers that do not go back")
+    low, high = (
+        np.interp(t, table["t"], table[name], left=np.nan, right=np.nan) for name in ("low", "high")
+    )
+    return low, high

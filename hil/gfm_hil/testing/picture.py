@@ -1,0 +1,94 @@
+"""The figure that a failing assertion leaves: the signal beside what was wanted, and the rest."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from gfm_hil.figures import COLOURS, draw_panel
+from gfm_hil.testing.checks import Finding
+from gfm_hil.testing.signals import unit
+
+_BLUE, _RED, _GREEN, *_ = COLOURS
+_CONTEXT = ("p", "f_hz", "V", "i")
+_FOLLOWS = {"p": "ref_P_ref", "q": "ref_Q_ref", "V": "ref_V_ref", "v_dc": "ref_V_dcref"}
+
+
+def draw(
+    path: Path,
+    text: str,
+    signal: str,
+    signals: Mapping[str, NDArray[Any]],
+    steps: Sequence[tuple[float, str]],
+    finding: Finding | None,
+) -> None:
+    """Draw one failure.
+
+    Args:
+        path: of the picture.
+        text: what failed, for the head.
+        signal, signals: the one it is about, and all of them.
+        steps: time in s and a few words each.
+        finding: its band and worst point, if it is about a curve.
+    """
+    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    rows = figure.subplot_mosaic(
+        [["main", "main"], ["a", "b"], ["c", "d"]], height_ratios=[2.2, 1, 1], sharex=True
+    )
+    main = rows["main"]
+    _curve(main, signal, signals)
+    if finding is not None:
+        _band(main, finding, signals[signal])
+        worst = int(np.searchsorted(signals["t"], finding.at - 1e-9))
+        main.plot(
+            finding.at, signals[signal][worst], "o", ms=8, mfc="none", mec=_RED, mew=1.8,
+            label="worst" if np.isfinite([*finding.low, *finding.high]).any() else "largest swing",
+        )  # fmt: skip
+    for k, (t, label) in enumerate(steps):
+        main.annotate(
+            label, (t, 1.0), (3, 4 + 10 * (k % 3)), xycoords=("data", "axes fraction"),
+            textcoords="offset points", fontsize=8, color="#444444",
+        )  # fmt: skip
+    main.set_title("")
+    main.set_ylabel(f"{signal} [{unit(signal).strip() or '1'}]", fontsize=9)
+    main.legend(fontsize=8, frameon=False, loc="best")
+    for place, name in zip("abcd", _CONTEXT, strict=True):
+        if name in signals:
+            _curve(rows[place], name, signals)
+    for axes in rows.values():
+        for t, _ in steps:
+            axes.axvline(t, color="#888888", lw=0.8, ls=(0, (4, 3)), zorder=0)
+    for place in "cd":
+        rows[place].set_xlabel("t [s]", fontsize=9)
+    figure.suptitle("\n".join(textwrap.wrap(text, 110)), fontsize=9.5, x=0.01, ha="left")
+    figure.savefig(path, dpi=110)
+
+
+def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:
+    curves = [(signals["t"], signals[name], _BLUE, name)]
+    follows = _FOLLOWS.get(name, "")
+    if follows in signals:
+        curves.append((signals["t"], signals[follows], "#888888", follows.removeprefix("ref_")))
+    draw_panel(axes, f"{name} [{unit(name).strip() or '1'}]", curves)
+
+
+def _band(axes: Axes, finding: Finding, x: NDArray[Any]) -> None:
+    """The band, green; a limit on one side only is shaded as far as the curve goes."""
+    low, high = finding.low, finding.high
+    if not (np.isfinite(low).any() or np.isfinite(high).any()):
+        return
+    bottom, top = axes.get_ylim()
+    lower = np.where(np.isnan(low) & ~np.isnan(high), bottom, low)
+    upper = np.where(np.isnan(high) & ~np.isnan(low), top, high)
+    axes.fill_between(finding.t, lower, upper, color=_GREEN, alpha=0.18, lw=0, label="allowed")
+    for limit in (low, high):
+        axes.plot(finding.t, limit, color=_GREEN, lw=0.9)

@@ -1,0 +1,96 @@
+"""What a test runs on: the scenario to begin with, as the test and the command line want it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.errors import UserError
+from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.scenario_model import INPROC
+
+_PLAIN = "pref_step"  # of which the grid and the converter are meant, not the step
+_PATIENCE_S = 10.0  # in lockstep a busy machine is no reason to fail
+
+
+class Unfit(UserError):
+    """A test that cannot be run over the link that the command line asks for."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One test's bench before its steps.
+
+    Attributes:
+        scenario: checked, with its own events.
+        controller_command: program and arguments of somebody's own controller process, or empty;
+            ``{endpoint}`` and ``{scenario}`` in it are replaced.
+        near: folder in which files are looked for first.
+    """
+
+    scenario: Scenario
+    controller_command: tuple[str, ...]
+    near: Path
+
+    @property
+    def realtime(self) -> bool:
+        """Whether the run keeps pace with the clock."""
+        return self.scenario.mode == "realtime"
+
+
+def beside(near: Path, name: str) -> str:
+    """A file beside the test by its name, or the name as it is: a path, or one of the catalogue."""
+    found = near / name
+    return str(found) if found.is_file() else name
+
+
+def make_setting(
+    near: Path,
+    scenario: str | None = None,
+    *,
+    law: str | None = None,
+    link: str | None = None,
+    mode: str | None = None,
+    controller_command: Sequence[str] = (),
+    link_wanted: str | None = None,
+    **changed: Any,
+) -> Setting:
+    """Read and check what a test asks for.
+
+    Args:
+        near: folder of the test; scenario and law files are looked for there first.
+        scenario: shipped name or file; by default the paper's grid and converter, without events.
+        law, link, mode: instead of the scenario's law, of in process, of lockstep.
+        controller_command: of somebody's own controller; the link is then zmq by default.
+        link_wanted: of the command line; replaces the link of the test.
+        changed: any other key of a scenario by its path with ``__`` for the dot, as
+            ``references__P_ref=0.2`` or ``events=[]``.
+
+    Raises:
+        UserError: one line a mistake. ``Unfit`` where only ``link_wanted`` does not fit the test.
+    """
+    chosen = link or ("zmq" if controller_command else INPROC)
+    if controller_command and chosen == INPROC:
+        raise UserError("link = 'inproc': a controller_command is a process, which needs a link")
+    if link_wanted not in (None, chosen):
+        if controller_command:
+            raise Unfit(f"the controller of this test is a process that talks {chosen}")
+        if link_wanted == INPROC and mode == "realtime":
+            raise Unfit("this test is about real time, which a run in process has not")
+        if chosen != INPROC:  # they are of the test's own link
+            changed = {k: v for k, v in changed.items() if not k.startswith("link__")}
+        chosen = str(link_wanted)
+    if scenario is None:
+        changed = {"events": [], "title": "on the paper's grid", **changed}
+    if (mode or "lockstep") == "lockstep":
+        changed = {"link__peer_timeout_s": _PATIENCE_S, **changed}
+    loaded = load_scenario(
+        beside(near, scenario or _PLAIN),
+        law=None if law is None else beside(near, law),
+        link__type=chosen,
+        mode=mode or "lockstep",
+        **changed,
+    )
+    return Setting(loaded, tuple(map(str, controller_command)), near)
