@@ -9,7 +9,7 @@ from typing import Any
 
 from gfm_hil.links.base import Side
 
-_PRIORITY = 50  # of SCHED_FIFO: above what a desktop runs, below the kernel's own threads
+PRIORITY = 50  # of SCHED_FIFO: above what a desktop runs, below the kernel's own threads
 _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 
 
@@ -46,10 +46,10 @@ def own_processor(side: Side) -> int | None:
 
 def _fifo() -> str:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (AttributeError, OSError):
         return ""
-    return f"fifo {_PRIORITY}"
+    return f"fifo {PRIORITY}"
 
 
 def ordinary_priority() -> str:

@@ -28,6 +28,7 @@ MODULES = {
     "laws": "laws",
     "design": "design",
     "dbc": "dbc",
+    "doctor": "doctor",
     "scenarios": "scenarios",
     "keys": "keys",
     "controller": "sides",
