@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import time
 from collections import deque
 from pathlib import Path
@@ -26,6 +27,9 @@ from gfm_hil.links.can.subrate import Subrate
 from gfm_hil.links.can.vectors import CanFrame, VectorReceiver, VectorSender
 from gfm_hil.links.port import Port
 from gfm_runtime.signals import Group, names
+
+# what python-can logs is in what it raises, which is told in a line of ours
+logging.getLogger("can").addHandler(logging.NullHandler())
 
 _FULL = (errno.ENOBUFS, errno.EAGAIN, None)  # python-can has no number for a full buffer
 _ROOM_S = 0.2  # how long a segment waits for room: a kernel's queue takes ten frames

@@ -1,0 +1,166 @@
+"""Real SocketCAN: run by ``test_can_uml`` inside user-mode Linux, where vcan0 is a CAN FD bus."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from gfm_hil.links.base import SIDES
+from gfm_hil.links.can.dbc import write_dbc
+from gfm_hil.recording import Part
+from gfm_hil.scenario import load_scenario
+from gfm_hil.toml_out import toml_text
+
+from .can_reference import quantised_run
+
+ENDPOINT = "can://vcan0"
+LINK = {"type": "can", "endpoint": ENDPOINT, "peer_timeout_s": 20.0, "start_timeout_s": 100.0}
+EVENTS = [
+    {"tick": 50, "type": "reference", "P_ref": 0.55},
+    {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},
+]
+
+pytestmark = pytest.mark.timeout(400)  # the first one compiles everything
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def write(name: str, link: dict[str, Any], **content: Any) -> str:
+    text = {"title": "test", "duration": 0.3, "events": EVENTS, "link": {**LINK, **link}, **content}
+    Path(name).write_text(toml_text(text))
+    return name
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "gfm_hil", *arguments]
+    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def run_while(scenario: str, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
+    """``gfmhil run``, something else once it has done that many ticks; returns its summary."""
+    process = start("run", scenario, "--out", "out", "--quiet")
+    while True:
+        part = Part.open(Path("out"), "plant")
+        if part is not None and int(part.progress[0]) >= ticks:
+            break
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.01)
+    meanwhile()
+    said = process.communicate(timeout=200)[0]
+    assert "Traceback" not in said
+    return json.loads(Path("out/summary.json").read_text(encoding="utf-8"))
+
+
+def assert_as_in_process(scenario: str, summary: dict[str, Any]) -> None:
+    assert (summary["status"], summary["ticks"]) == ("completed", 3000), summary
+    expected = quantised_run(load_scenario(scenario), Path())
+    with np.load("out/signals.npz") as signals:
+        for name, column in expected.items():
+            assert signals[name].tobytes() == column.tobytes(), name
+
+
+@pytest.mark.parametrize("options", [{}, {"heartbeat": 7}])
+def test_lockstep_over_vcan_is_a_run_in_process_in_counts(options):
+    scenario = write("scenario.toml", {"options": options})
+    assert_as_in_process(scenario, run_while(scenario, 0, lambda: None))
+
+
+def test_a_flooded_bus():
+    """A third process, which wins every arbitration, sends as fast as it can for a while."""
+    scenario = write("scenario.toml", {})
+    flooder = [sys.executable, "-c", _FLOOD]
+
+    def flood() -> None:
+        subprocess.run(flooder, check=True)
+
+    summary = run_while(scenario, 100, flood)
+    assert_as_in_process(scenario, summary)
+
+
+_FLOOD = """
+import time, can
+with can.Bus(interface="socketcan", channel="vcan0", fd=True) as bus:
+    message = can.Message(arbitration_id=1, is_extended_id=False, data=bytes(8))
+    until = time.monotonic() + 0.5
+    while time.monotonic() < until:
+        for _ in range(10):
+            bus.send(message)
+        time.sleep(1e-3)
+"""
+
+
+def test_another_dbc_is_refused_by_both_processes():
+    Path("other.dbc").write_text(write_dbc(True).replace("(0.0002,0.0)", "(0.0004,0.0)"))
+    sides = {
+        "controller": start("controller", write("one.toml", {}), "--out", "one"),
+        "plant": start(
+            "plant", write("two.toml", {"options": {"dbc": "other.dbc"}}), "--out", "two"
+        ),
+    }
+    for side, process in sides.items():
+        said = process.communicate(timeout=200)[0]
+        other = SIDES[1 - SIDES.index(side)]
+        assert f"the {other} uses another DBC" in " ".join(said.split())
+        assert process.returncode == 3
+
+
+def test_an_interface_that_goes_down_ends_the_run_in_safe():
+    scenario = write("scenario.toml", {}, duration=60.0)
+    try:
+        summary = run_while(scenario, 100, lambda: link("down"))
+    finally:
+        link("up")
+    assert summary["status"] == "safe"
+    # whichever came first, a send or a look
+    assert re.match("the CAN bus vcan0 is gone: .*: Network is down", summary["reason"])
+
+
+def link(state: str) -> None:
+    subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
+
+
+def test_bus_off_ends_the_run_in_safe():
+    def bus_off() -> None:
+        with can.Bus(interface="socketcan", channel="vcan0", fd=True) as bus:
+            bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
+
+    summary = run_while(write("scenario.toml", {}, duration=60.0), 100, bus_off)
+    assert summary["status"] == "safe"
+    assert summary["reason"] == "the CAN controller of vcan0 went bus off"
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "mtu", "said"),
+    [
+        ("can://vcan7", 72, "'can://vcan7': cannot be opened: "),
+        (ENDPOINT, 16, "not set up for CAN FD (mtu 72); link.options.fd = false?"),
+    ],
+)
+def test_a_bus_that_is_not_to_be_had(endpoint, mtu, said):
+    def set_mtu(size: int) -> None:
+        link("down")
+        subprocess.run(["ip", "link", "set", "vcan0", "mtu", str(size)], check=True)
+        link("up")
+
+    set_mtu(mtu)
+    try:
+        process = start("plant", write("scenario.toml", {"endpoint": endpoint}), "--out", "out")
+        output = process.communicate(timeout=200)[0]
+    finally:
+        set_mtu(72)
+    assert said in output
+    assert output.count("\n") == 1
+    assert process.returncode == 2
