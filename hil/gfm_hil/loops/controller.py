@@ -90,12 +90,13 @@ def _next_frame(
     if told[RING] != r.bell:
         r.bell = told[RING]
         return BELL
-    if r.realtime and r.done > 0 and told[STOP] == 0:
-        wake = r.t0 + int(r.expected) - AHEAD_NS
-        if wake - now_ns() > 0:
-            sleep_until(min(wake, now_ns() + r.T))
     gap = 0
     before = now_ns()
+    if r.realtime and r.done > 0 and told[STOP] == 0:
+        wake = min(r.t0 + int(r.expected) - AHEAD_NS, before + r.T)
+        if wake > before:
+            sleep_until(wake)
+            before = wake  # what it sleeps beyond that is a gap like any other
     looks = 0
     while True:
         size = receive(handle, got_bytes)
