@@ -5,8 +5,9 @@ parts, and the one that took most beyond what it takes in a tick that was met is
 
 - late wake-up: the plant began after its deadline, though nothing kept it busy;
 - own work: the plant's or the controller's computing, or an event that fell on the tick;
-- stalled host: a side that was looking for a frame, or computing, did not run for a while: the
-  host of a virtual machine, the kernel or other work had its processor;
+- stalled host: a side that was looking for a frame, or computing, did not run for a while, or the
+  controller slept beyond its time: the host of a virtual machine, the kernel or other work had its
+  processor;
 - link: all else between y[k] sent and u[k] received.
 
 A tick that began while a side was still behind from the missed one before has the cause of that.
