@@ -14,7 +14,7 @@ from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_controller
 from gfm_hil.timeline import Timeline
-from gfm_hil.waiting import await_message, send_last
+from gfm_hil.waiting import await_message, part_from
 from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED, missed
 
 
@@ -38,7 +38,7 @@ def run_controller(
 
     def leave(status: str, reason: str, state: int, code: int) -> None:
         timeline.end(status, reason, tick)  # type: ignore[arg-type]
-        send_last(link, writer, tick, state, code, bench.u)
+        part_from(link, writer, reader, tick, state, code, bench.u)
 
     while timeline.running:
         wait_ns = T_ns if realtime else patience_ns
@@ -66,9 +66,9 @@ def run_controller(
             break
         if reader.state == STOPPED:
             if reader.reason:
-                timeline.end("interrupted", "the plant ended before the scenario did", tick)
+                leave("interrupted", "the plant ended before the scenario did", STOPPED, 0)
             else:
-                timeline.end("completed", "", tick)
+                leave("completed", "", STOPPED, 0)
             break
         if done and newest <= tick:  # the plant asks again: our answer was lost
             link.send(writer.pack(tick, int(c.ctl["state"][0]), int(c.ctl["reason"][0]), bench.u))

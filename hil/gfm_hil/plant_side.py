@@ -17,7 +17,7 @@ from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_plant
 from gfm_hil.timeline import Timeline
-from gfm_hil.waiting import await_message, send_last
+from gfm_hil.waiting import await_message, part_from
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.controller import REASONS, SAFE, STOPPED
 
@@ -147,5 +147,5 @@ def run_plant(
     assert timeline.outcome is not None
     state = SAFE if timeline.outcome.status == "tripped" else STOPPED
     failed = int(timeline.outcome.status != "completed")
-    send_last(link, p.writer, tick, state, failed, bench.y)
+    part_from(link, p.writer, p.reader, tick, state, failed, bench.y)
     return p.reader

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,7 +125,8 @@ class Timeline:
         """The run is over; the first reason stays."""
         if self.outcome is None:
             self.outcome = Outcome(status, reason, tick)
-            self.write(tick, "end", status=status, reason=reason, side="+".join(self._sides))
+            side, now = "+".join(self._sides), time.monotonic_ns()  # the clock of timing.npz
+            self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now)
 
     def write(self, tick: int, kind: str, **more: Any) -> None:
         """One line of the log; on disk at once, or at the next ``flush`` if that is put off."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable
@@ -9,8 +10,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.frames import FrameWriter
+from gfm_hil.errors import PeerLost
+from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
+from gfm_runtime.controller import SAFE, STOPPED
+from gfm_runtime.signals import names
 
 _SPIN_NS = 50_000  # longer takes processor time from the very threads that bring the answer
 
@@ -49,3 +53,30 @@ def send_last(
         message = writer.pack(tick, state, reason, values)
         while not link.send(message) and time.monotonic_ns() < give_up:
             time.sleep(0.001)
+
+
+def part_from(
+    link: Link,
+    writer: FrameWriter,
+    reader: FrameReader,
+    tick: int,
+    state: int,
+    reason: int,
+    values: NDArray[np.float64],
+) -> None:
+    """Send the frames that end a run and wait a moment for the other side's.
+
+    Whoever closes at once may take with it what is still on its way: libzmq drops what a socket
+    has sent and a peer that is 64 frames behind has not read yet.
+    """
+    send_last(link, writer, tick, state, reason, values)
+    give_up = time.monotonic_ns() + _LAST_NS
+    unused = np.empty(len(names(reader.group)))
+    with contextlib.suppress(PeerLost):
+        while reader.state not in (SAFE, STOPPED) and time.monotonic_ns() < give_up:
+            message = link.receive()
+            if message is None:
+                link.wait(0.01)
+                continue
+            with contextlib.suppress(FrameError):
+                reader.unpack(message, unused)

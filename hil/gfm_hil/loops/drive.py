@@ -33,7 +33,7 @@ from gfm_hil.loops.records import (
 )
 from gfm_hil.recording import Part
 from gfm_hil.timeline import Timeline
-from gfm_hil.waiting import send_last
+from gfm_hil.waiting import part_from
 from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED
 from gfm_runtime.signals import Group
 
@@ -77,7 +77,8 @@ class _Loop:
 
     def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
         """Tell the other side how this one ends."""
-        send_last(self.link, self.writer, max(self.tick, 0), state, reason, values)
+        tick = max(self.tick, 0)
+        part_from(self.link, self.writer, self.reader, tick, state, reason, values)
 
 
 def drive_plant(
@@ -140,6 +141,7 @@ def drive_controller(
                 timeline.end("interrupted", "the plant ended before the scenario did", tick)
             else:
                 timeline.end("completed", "", tick)
+            loop.last_words(STOPPED, 0, bench.u)
         elif why == SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
             loop.last_words(SAFE, LOST_PEER, bench.u)

@@ -1,0 +1,397 @@
+"""The compiled loops do what the loops in Python do, and what the rules of real time say.
+
+Nothing here depends on how fast the machine is: what a run missed is read off its recording, and
+the rules must hold for it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.bench import make_bench
+from gfm_hil.controller_side import run_controller
+from gfm_hil.frames import FrameReader, FrameWriter
+from gfm_hil.links import Link, Port, open_link, port_function
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.loops.records import TOLD
+from gfm_hil.loops.thread import run_compiled
+from gfm_hil.plant_side import run_plant
+from gfm_hil.recording import Part
+from gfm_hil.scenario import Scenario
+from gfm_hil.side import compile_side
+from gfm_hil.timeline import Timeline, read_log
+from gfm_runtime import law_names
+from gfm_runtime.controller import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
+from gfm_runtime.signals import names
+
+from .conftest import home_plant
+from .pairs import PATIENT, run_pair
+from .test_frames import resealed
+
+PORTS = ("shm", "zmq")
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder of short path, for an ipc endpoint."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
+        yield Path(folder)
+
+
+def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    """Bit for bit, NaN included."""
+    assert set(one) == set(other)
+    for name in one:
+        assert one[name].tobytes() == other[name].tobytes(), name
+
+
+def three_ways(content: dict[str, Any], link: str, make: Any, run: Any, place: Path) -> Any:
+    """A run by compiled loops, by loops in Python and in process; returns the first and the last.
+
+    The log of all but the order in which the sides end must be the same too.
+    """
+    scenario = make(**content)
+    compiled = run_pair(scenario, place / "c", link)
+    python = run_pair(scenario, place / "p", "zmq", {"portable": True})
+    together = run(**content)
+    assert_same(compiled.signals, together.signals)
+    assert_same(python.signals, together.signals)
+    assert compiled.ends() == python.ends()
+    events = [[e for e in pair.log if e["event"] != "end"] for pair in (compiled, python)]
+    assert events[0] == events[1]
+    return compiled, together
+
+
+@pytest.mark.parametrize("link", PORTS)
+@pytest.mark.parametrize("law", law_names())
+def test_every_law_in_lockstep(law, link, make, run, place):
+    content = {
+        "law": law,
+        "duration": 0.03,
+        "seed": 7,
+        "link": PATIENT,
+        "plant": {
+            "delay": {"samples": 1, "fraction": 0.3},
+            "adc": "DS2004",
+            "sensors": {"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-4, "V": 1e-4}},
+            **home_plant(law),
+        },
+        "events": [
+            {"tick": 50, "type": "reference", "P_ref": 0.55},
+            {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},
+        ],
+    }
+    scenario = make(**content)
+    assert_same(run_pair(scenario, place, link).signals, run(**content).signals)
+
+
+@pytest.mark.parametrize("link", PORTS)
+def test_every_event_and_changes_of_law(link, make, run, place):
+    content = {
+        "law": "mimo-gfm",
+        "duration": 0.08,
+        "link": PATIENT,
+        "plant": {"factors": {"L_g": 10.0, "R_g": 10.0}, "grid": {"load_R": 36.1, "load_L": 1e-3}},
+        "events": [
+            {"tick": 0, "type": "reference", "V_ref": 1.001},
+            {"tick": 50, "type": "law", "law": "vsg-2"},
+            {"tick": 60, "type": "reference", "P_ref": 0.6, "ramp_s": 0.01},
+            {"tick": 200, "type": "grid-voltage", "V_g": 0.98, "duration": 0.005},
+            {"tick": 300, "type": "grid-phase-jump", "degrees": 0.5},
+            {"tick": 400, "type": "grid-impedance", "L_g": 9.0, "R_g": 9.0},
+            {"tick": 500, "type": "grid-breaker", "closed": False},
+            {"tick": 600, "type": "grid-breaker", "closed": True},
+            {"tick": 700, "type": "law", "law": "droop-1"},
+            {"tick": 799, "type": "reference", "Q_ref": 0.01},
+        ],
+    }
+    compiled, _ = three_ways(content, link, make, run, place)
+    assert [e["law"] for e in compiled.log if e["event"] == "law-active"] == ["vsg-2", "droop-1"]
+
+
+@pytest.mark.parametrize("link", PORTS)
+@pytest.mark.parametrize(
+    ("plant", "status"),
+    [
+        ({"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}}, "tripped"),
+        ({"protection": {"over_current": {"enabled": False}}}, "safe"),
+    ],
+)
+def test_a_trip_and_a_safe_state(plant, status, link, make, run, place):
+    content = {
+        "duration": 1.0,
+        "link": PATIENT,
+        "plant": plant,
+        "events": [{"tick": 30, "type": "grid-phase-jump", "degrees": 120.0}],
+    }
+    compiled, together = three_ways(content, link, make, run, place)
+    assert together.summary["status"] == status
+    ends = compiled.ends()
+    assert {ends[side][0] for side in SIDES} == {status}
+    own = "plant" if status == "tripped" else "controller"
+    assert ends[own][1] == together.summary["reason"]
+
+
+# Real time
+
+
+@port_function
+def _never(handle, message):
+    return 0
+
+
+class Deaf:
+    """An end that hears nothing and whose frames still go out."""
+
+    def __init__(self, link: Link) -> None:
+        self._link, p = link, link.port
+        assert p is not None
+        self.port = Port(p.handle, p.send, _never, p.spins)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+
+def deaf(which: Side) -> Callable[[Side, Link], Any]:
+    return lambda side, link: Deaf(link) if side == which else link
+
+
+LIVE = {**PATIENT, "type": "shm"}
+REALTIME = {"mode": "realtime", "law": "vsg-2", "link": LIVE, "duration": 1.0}
+
+
+@pytest.mark.parametrize("link", PORTS)
+def test_misses_are_the_ticks_whose_u_was_not_received_in_time(link, make, place):
+    content = {**REALTIME, "duration": 0.2, "late_policy": {"hold": 10**6}}
+    pair = run_pair(make(**content), place, link)
+    due, received = pair.timing["plant_scheduled"], pair.timing["plant_received"]
+    assert (np.diff(due) == 100_000).all()
+    assert (pair.timing["plant_woke"] >= due).all()
+    there = received >= 0
+    assert (received[there] >= pair.timing["plant_sent"][there]).all()
+    u = np.stack([pair.signals[f"u_{n}"] for n in names("u")], axis=1)
+    held = np.flatnonzero(~there[1:]) + 1
+    for k in held[received[held - 1] >= 0]:  # a first miss: u of the tick before, or an older one
+        assert u[k].tobytes() == u[k - 1].tobytes()
+
+
+@pytest.mark.parametrize("hold", [0, 1, 37])
+def test_a_plant_that_hears_nothing_blocks_after_hold_and_one_more(hold, make, place):
+    content = {**REALTIME, "late_policy": {"hold": hold}}
+    pair = run_pair(make(**content), place, "shm", touch=deaf("plant"))
+    why = "no fresh u for longer than late_policy.hold allows"
+    assert pair.ends()["plant"] == ("safe", why, hold + 1)
+    assert len(pair.signals["t"]) == hold + 1
+    assert (pair.timing["plant_received"] == -1).all()
+    assert pair.ends()["controller"][1] in (  # it may have been late itself
+        "the plant ended before the scenario did",
+        REASONS[STALE],
+    )
+
+
+def frames(group: str, *ticks: int, state: int = RUNNING, reason: int = 0) -> list[bytes]:
+    """Good frames of those ticks, in sequence; the values tell them apart."""
+    writer = FrameWriter(group)
+    width = len(names(group))
+    return [writer.pack(k, state, reason, ONES[group] + 0.001 * k * np.arange(width))
+            for k in ticks]  # fmt: skip
+
+
+ONES = {"y": np.array([1.0, 0.5, 1.0, 0.0, 1.0]), "u": np.array([0.3, 1.0, 1.0])}
+
+
+def after(sent: list[bytes], group: str, tick: int, state: int, reason: int = 0) -> list[bytes]:
+    """``sent`` and one more frame in its sequence."""
+    writer = FrameWriter(group)
+    writer.sequence[0] = len(sent)
+    return [*sent, writer.pack(tick, state, reason, ONES[group])]
+
+
+@dataclass
+class Alone:
+    """What one side's compiled loop left, whose other side was played."""
+
+    faults: dict[str, int]
+    part: Part
+    log: list[dict[str, Any]]
+    said: list[tuple[int, int, int]]  # tick, state, reason of each frame that it sent
+
+    @property
+    def end(self) -> tuple[str, str, int]:
+        """Status, reason, tick."""
+        (end,) = [e for e in self.log if e["event"] == "end"]
+        return end["status"], end["reason"], end["tick"]
+
+
+def alone(
+    side: Side,
+    scenario: Scenario,
+    folder: Path,
+    heard: list[bytes],
+    link: str = "shm",
+    stopped: Callable[[], bool] = lambda: False,
+    compiled: bool = True,
+) -> Alone:
+    """Run one side's loop over messages that are there before it starts, however slow it is."""
+    endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
+    bench = make_bench(scenario)
+    part = Part.create(folder, side, scenario.ticks)
+    compile_side(side, bench, part)
+    ends = {s: open_link(link, s, endpoint) for s in SIDES}
+    other: Side = "plant" if side == "controller" else "controller"
+    timeline = Timeline(bench, folder / "events.jsonl", (side,))
+    try:
+        for message in heard:
+            assert ends[other].send(message)
+        assert not heard or ends[side].wait(30)
+        t0 = time.monotonic_ns()
+        if compiled:
+            told = np.zeros(TOLD, np.int64)
+            reader = run_compiled(side, bench, ends[side], part, timeline, t0, stopped, told)
+        else:
+            run = run_controller if side == "controller" else run_plant
+            reader = run(bench, ends[side], part, timeline, t0, stopped)
+        answers = FrameReader("u" if side == "controller" else "y")
+        values, said = np.zeros(len(names(answers.group))), []
+        while ends[other].wait(0.05):
+            message = ends[other].receive()
+            assert message is not None
+            answers.unpack(message, values)
+            said.append((answers.tick, answers.state, answers.reason))
+    finally:
+        for end in ends.values():
+            end.close()
+        timeline.close()
+    return Alone(dict(reader.faults), part, read_log(folder / "events.jsonl"), said)
+
+
+def test_extrapolation_is_a_straight_line_through_the_last_two_and_then_hold(place, make):
+    content = {**REALTIME, "late_policy": {"hold": 20, "extrapolate": 6}}
+    plant = alone("plant", make(**content), place, frames("u", 0, 1))
+    u = plant.part.signals[:, 5:8]
+    assert plant.end == ("safe", "no fresh u for longer than late_policy.hold allows", 23)
+    first, last = ONES["u"], ONES["u"] + 0.001 * np.arange(3)
+    assert (u[0] == first).all() and (u[1] == last).all()
+    for n in range(1, 7):
+        assert u[1 + n].tobytes() == (last + n * (last - first)).tobytes()
+    assert (u[7:23] == u[7]).all()
+    assert np.isnan(u[23:]).all()
+    assert plant.said[-1] == (23, STOPPED, 1)
+
+
+@pytest.mark.parametrize("hold", [0, 30])
+def test_a_controller_whose_plant_falls_silent_is_safe_after_hold_and_one_more(hold, place, make):
+    scenario = make(**REALTIME, late_policy={"hold": hold})
+    controller = alone("controller", scenario, place, frames("y", 0, 1, 2))
+    # before the third frame it may already have waited for too long
+    status, reason, tick = controller.end
+    assert (status, reason) == ("safe", REASONS[STALE])
+    assert controller.said[-1] == (tick, SAFE, STALE)
+    assert int(controller.part.progress[0]) == tick + 1
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+@pytest.mark.parametrize("side", SIDES)
+def test_silence_of_the_other_side_ends_either(side, mode, place, make):
+    scenario = make(
+        mode=mode, link={**LIVE, "peer_timeout_s": 0.3}, late_policy={"hold": 10**6}, duration=60
+    )
+    other = "plant" if side == "controller" else "controller"
+    found = alone(side, scenario, place, [])
+    assert found.end[:2] == ("safe", f"the {other}'s process is gone")
+    if side == "controller":  # the plant has filled the link with what nobody took
+        assert found.said[-1][1:] == (SAFE, LOST_PEER)
+
+
+@pytest.mark.parametrize("link", PORTS)
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_the_stop_flag_ends_both(mode, link, place, make):
+    begin = time.monotonic()
+    content = {"mode": mode, "law": "vsg-2", "duration": 60.0, "link": LIVE}
+    scenario = make(**content, late_policy={"hold": 10**6})
+    pair = run_pair(scenario, place, link, stopped=lambda: time.monotonic() - begin > 1.0)
+    ends = pair.ends()
+    assert {ends[side][0] for side in SIDES} == {"interrupted"}
+    assert "stopped by the operator" in {ends[side][1] for side in SIDES}
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_an_event_whose_tick_was_lost_is_carried_out_with_the_next_frame(compiled, place, make):
+    content = {
+        "link": LIVE,
+        "law": "vsg-2",
+        "events": [
+            {"tick": 4, "type": "reference", "P_ref": 0.6},
+            {"tick": 6, "type": "reference", "P_ref": 0.7},
+            {"tick": 9, "type": "law", "law": "droop-1"},
+        ],
+    }
+    heard = frames("y", 0, 1, 5, 6, 11, 12)
+    heard = after(heard, "y", 13, STOPPED)
+    found = alone("controller", make(**content), place, heard, compiled=compiled)
+    assert found.end == ("completed", "", 12)
+    happened = [(e["tick"], e["event"]) for e in found.log if "label" in e]
+    assert happened == [(5, "reference"), (6, "reference"), (11, "law")]
+    P_ref, law = found.part.signals[:13, 1], found.part.signals[:13, 5]
+    assert np.isnan(P_ref[[2, 3, 4, 7, 8, 9, 10]]).all()
+    assert P_ref[[0, 1, 5, 6, 11, 12]].tolist() == [0.5, 0.5, 0.6, 0.7, 0.7, 0.7]
+    assert law[[0, 6, 11, 12]].tolist() == [0, 0, 1, 1]
+    assert [k for k, _, _ in found.said] == [0, 1, 5, 6, 11, 12]
+
+
+def test_frames_of_another_kind_are_counted_and_never_used(place, make):
+    good = frames("y", 0, 1, 2, 3)
+    stop = after(good, "y", 4, STOPPED)[-1]
+    foreign = frames("y", *range(2**16, 2**16 + 2))
+    heard = [
+        good[0],
+        resealed(good[1], 2, good[1][2] + 1),  # another version
+        resealed(good[1], 3, 2),  # u in place of y
+        frames("u", 1)[0],
+        good[0],
+        good[1],
+        resealed(foreign[1], 11, 0xC0),  # a sequence from far behind
+        good[1][:20] + bytes([good[1][20] ^ 4]) + good[1][21:],
+        good[2],
+        good[3],
+        stop,
+    ]
+    found = alone("controller", make(link=LIVE, law="vsg-2"), place, heard)
+    counted = {fault: n for fault, n in found.faults.items() if n}
+    assert counted == {
+        "version": 1, "source": 1, "size": 1, "repeated": 1, "out_of_sequence": 1, "crc": 1
+    }  # fmt: skip
+    assert found.end[0] == "completed"
+    assert [k for k, _, _ in found.said] == [0, 1, 2, 3]
+
+
+def test_a_tick_beyond_the_run_is_refused(place, make):
+    scenario = make(link=LIVE, law="vsg-2", duration=0.001)
+    heard = after(frames("y", 0, 1, 10_000_000), "y", 2, STOPPED)
+    found = alone("controller", scenario, place, heard)
+    assert found.faults["out_of_sequence"] == 1
+    assert [k for k, _, _ in found.said] == [0, 1]
+
+
+@pytest.mark.parametrize("link", PORTS)
+def test_a_link_that_pauses_for_longer_than_hold_ends_in_safe(link, place, make):
+    hold = 50
+    pause = {"pause_at": 100, "pause": 20.0, "towards": "plant"}
+    content = {**REALTIME, "duration": 20.0, "link": {**LIVE, "impairment": pause}}
+    pair = run_pair(make(**content, late_policy={"hold": hold}), place, link)
+    status, reason, tick = pair.ends()["plant"]
+    assert (status, reason) == ("safe", "no fresh u for longer than late_policy.hold allows")
+    received = pair.timing["plant_received"]
+    assert len(received) == tick  # latched: nothing is sampled any more
+    assert (received[-hold - 1 :] < 0).all()
+    assert tick == hold + 1 or received[-hold - 2] >= 0
+    assert pair.ends()["controller"][0] in ("interrupted", "safe")
+    assert pair.ends()["controller"][1]
