@@ -84,7 +84,7 @@ class Subrate:
         else:
             self._mine, self._theirs, self._next = Frame("u"), Frame("y"), self._measurement
         self._made: deque[bytes] = deque()  # ready to be given out
-        self._last = b""  # measurement received
+        self._held, self._last = Frame("y"), b""  # measurement received last
         self._due = -1  # tick for which the plant wants a command
         # by the tick they answer: commands and their sequences but for those sent again
         self._commands: dict[int, tuple[bytes, int]] = {}
@@ -109,10 +109,10 @@ class Subrate:
         if message is None or not self._theirs.read(message):
             return message
         tick, sequence = self._theirs.tick, self._theirs.sequence
-        before = Frame("y")
-        if before.read(self._last):
-            missing = min(self._every - 1, tick - before.tick - 1)
-            self._made += [before.under(tick - k, sequence - k) for k in range(missing, 0, -1)]
+        held = self._held
+        if held.read(self._last):
+            missing = min(self._every - 1, tick - held.tick - 1)
+            self._made += [held.under(tick - k, sequence - k) for k in range(missing, 0, -1)]
         self._last = message
         self._made.append(message)
         return self._made.popleft()

@@ -1,0 +1,108 @@
+"""What is held between two exchanges, and how its faults are counted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gfm_hil.frames import FrameError, FrameReader, FrameWriter
+from gfm_hil.links.can.subrate import Subrate
+from gfm_runtime.controller import RUNNING, SAFE, STOPPED
+from gfm_runtime.signals import Group, names
+
+EVERY = 4
+
+
+class Side:
+    """One side's stage, what the bus brings it, and the reader behind it."""
+
+    def __init__(self, group: Group) -> None:
+        self.inbox: list[bytes] = []
+        side = "plant" if group == "u" else "controller"
+        self.stage = Subrate(side, EVERY, lambda: self.inbox.pop(0) if self.inbox else None)
+        self.reader = FrameReader(group)
+        self.values = np.zeros(len(names(group)))
+
+    def heard(self) -> list:
+        """(tick, value) of what was taken, or the fault."""
+        out: list = []
+        while (message := self.stage.receive()) is not None:
+            try:
+                out.append((self.reader.unpack(message, self.values), self.values[0]))
+            except FrameError as problem:
+                out.append(problem.fault)
+        return out
+
+    def faults(self) -> dict[str, int]:
+        return {fault: count for fault, count in self.reader.faults.items() if count}
+
+
+def frame(group: Group, tick: int, sequence: int, state: int | None = None) -> bytes:
+    writer = FrameWriter(group)
+    writer.sequence[0] = sequence
+    ordinary = RUNNING if group == "u" else 0
+    values = np.full(len(names(group)), float(tick))
+    return writer.pack(tick, ordinary if state is None else state, 0, values)
+
+
+def test_what_goes_is_every_nth_and_the_last_word():
+    stage = Side("u").stage
+    went = [tick for tick in range(12) if stage.goes(frame("y", tick, tick))]
+    assert went == [0, 4, 8]
+    assert stage.goes(frame("y", 9, 13, STOPPED))
+    assert stage.goes(b"a message of the handshake")
+
+
+def test_the_controller_gets_what_is_between_before_the_next():
+    side = Side("y")
+    side.inbox = [frame("y", tick, tick) for tick in (0, 4, 8)]
+    assert side.heard() == [(0, 0), *((t, 0) for t in (1, 2, 3)), (4, 4),
+                            *((t, 4) for t in (5, 6, 7)), (8, 8)]  # fmt: skip
+    side.inbox = [frame("y", 8, 9)]  # asked again
+    assert side.heard() == [(8, 8)]
+    side.inbox = [frame("y", 12, 13), frame("y", 14, 15, STOPPED)]
+    assert side.heard() == [*((t, 8) for t in (9, 10, 11)), (12, 12), (13, 12), (14, 14)]
+    assert (side.faults(), side.reader.state) == ({}, STOPPED)
+
+
+def test_a_lost_measurement_counts_as_every_tick_that_it_stood_for():
+    side = Side("y")
+    side.inbox = [frame("y", 0, 0), frame("y", 8, 8)]
+    assert side.heard() == [(0, 0), *((t, 0) for t in (5, 6, 7)), (8, 8)]
+    assert side.faults() == {"lost": EVERY}
+
+
+def test_the_plant_gets_a_command_a_tick_n_ticks_late():
+    side = Side("u")
+    found = []
+    for tick in range(16):
+        side.stage.goes(frame("y", tick, tick))
+        if tick % EVERY == 0:
+            side.inbox.append(frame("u", tick, tick))
+        found += side.heard()
+    assert found == [(t, max(0, t // EVERY - 1) * EVERY) for t in range(16)]
+    assert side.faults() == {}
+
+
+def test_a_lost_command_is_missed_for_n_ticks_and_one_sent_again_is_not():
+    side = Side("u")
+    found: dict[int, list] = {}
+    for tick in range(32):
+        side.stage.goes(frame("y", tick, tick))
+        if tick % EVERY == 0 and tick != 8:
+            side.inbox.append(frame("u", tick, tick + (tick > 16)))
+        if tick == 16:
+            side.inbox.append(frame("u", tick, tick + 1))
+        found[tick] = side.heard()
+    assert [tick for tick, heard in found.items() if not heard] == [12, 13, 14, 15]
+    assert "repeated" in found[16] or "repeated" in found[17]
+    assert side.faults() == {"lost": EVERY, "repeated": 1}
+
+
+def test_damage_and_the_last_word_come_through_at_once():
+    side = Side("u")
+    side.stage.goes(frame("y", 0, 0))
+    side.inbox = [frame("u", 0, 0)]
+    assert side.heard() == [(0, 0)]
+    side.inbox = [frame("u", 4, 4)[:-1] + b"?", frame("u", 2, 3, SAFE)]
+    assert side.heard() == ["crc", (2, 2)]
+    assert side.reader.state == SAFE
