@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,11 +15,16 @@ import pytest
 from gfm_hil.errors import UserError
 from gfm_hil.testing import Experiment
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+CONTROLLER = EXAMPLES / "own_controller" / "controller.py"
+
+Lab = Callable[..., Experiment]
+
 pytest_plugins = ["pytester"]
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> Callable[..., Experiment]:
+def lab(tmp_path: Path) -> Lab:
     """An experiment as the fixture makes it, begun with what is given."""
     count = iter(range(100))
 
@@ -29,7 +36,7 @@ def lab(tmp_path: Path) -> Callable[..., Experiment]:
     return make
 
 
-def test_steps_happen_at_their_ticks(lab: Callable[..., Experiment]) -> None:
+def test_steps_happen_at_their_ticks(lab: Lab) -> None:
     bench = lab()
     bench.run(0.02)
     bench.set(p_ref=0.6)
@@ -43,7 +50,7 @@ def test_steps_happen_at_their_ticks(lab: Callable[..., Experiment]) -> None:
     assert s["f_hz"] == pytest.approx(s["omega_u"] * 50)
 
 
-def test_going_on_after_a_look_is_the_same_run(lab: Callable[..., Experiment]) -> None:
+def test_going_on_after_a_look_is_the_same_run(lab: Lab) -> None:
     bench = lab()
     bench.run(0.02)
     first = bench.signals["p"]
@@ -130,9 +137,7 @@ def test_what_is_not_looked_at_is_run_all_the_same(pytester: pytest.Pytester) ->
         ("bench.start(link='tin-can')", "tin-can"),
     ],
 )
-def test_wrong_use_is_told_in_one_line(
-    lab: Callable[..., Experiment], steps: str, says: str
-) -> None:
+def test_wrong_use_is_told_in_one_line(lab: Lab, steps: str, says: str) -> None:
     bench = lab()
     with pytest.raises(UserError) as told:
         exec(steps, {"bench": bench})
@@ -145,3 +150,56 @@ def test_unused_plugin_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     heavy = {"numpy", "numba", "gfm_hil", "pydantic", "zmq", "matplotlib"}
     assert heavy & set(done.stdout.split()) == set()
+
+
+def project(name: str, tmp_path: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """What pytest alone says in a copy of an example project."""
+    copy = tmp_path / name
+    shutil.copytree(EXAMPLES / name, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options]
+    return subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
+
+
+def test_example_law_passes_its_tests(tmp_path: Path) -> None:
+    done = project("own_law", tmp_path)
+    assert done.returncode == 0, done.stdout
+    assert "7 passed" in done.stdout
+
+
+def test_wrong_law_fails_with_the_reason_and_figures(tmp_path: Path) -> None:
+    done = project("own_law", tmp_path, "--law=too-stiff", "--gfmhil-out=figures", "-k", "not do")
+    assert done.returncode == 1
+    assert "4 failed, 1 passed" in done.stdout
+    assert "p should settle at 0.7 p.u. ± 0.01 within 0.2 s, but it took 0.4" in done.stdout
+    assert "strongest oscillation after the step, at 8.27 Hz, has 0.168" in done.stdout
+    named = re.findall(r"^tests/.*: (.*\.png)$", done.stdout, re.MULTILINE)
+    assert len(named) == 4
+    assert all(Path(name).is_file() for name in named)
+
+
+def test_example_controller_passes_its_tests(tmp_path: Path) -> None:
+    done = project("own_controller", tmp_path)
+    assert done.returncode == 0, done.stdout
+    assert "3 passed" in done.stdout
+
+
+def test_example_controller_is_droop_5_but_for_its_integrator(lab: Lab, tmp_path: Path) -> None:
+    """Euler there, Tustin here: a response of the same law, to a part in a hundred."""
+    source = (EXAMPLES / "own_law" / "laws" / "my-droop.toml").read_text(encoding="utf-8")
+    (tmp_path / "law.toml").write_text(source, encoding="utf-8")
+    p = []
+    for own in ((), (sys.executable, str(CONTROLLER), "{endpoint}", "{scenario}")):
+        bench = lab(
+            "pref_step",
+            events=[],
+            law="law.toml",
+            controller_command=own,
+            plant__dc_source={"mode": "regulated"},
+            plant__factors={"L_g": 3.0},
+        )
+        bench.run(0.01)
+        bench.set(P_ref=0.7)
+        bench.run(0.09)
+        p.append(bench.signals["p"])
+    assert np.ptp(p[0]) > 0.2
+    assert np.max(np.abs(p[1] - p[0])) < 0.01 * 0.2

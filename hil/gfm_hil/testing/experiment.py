@@ -1,198 +1,23 @@
-"""An experiment in a test: steps as calls, run when first looked at, and assertions about it."""
+"""What a test says about an experiment: assertions that explain how they fail, with a figure."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
 
 from gfm_hil.errors import UserError
-from gfm_hil.run_folder import Run
-from gfm_hil.runner import run_scenario
-from gfm_hil.summary import nominal_frequency
 from gfm_hil.testing import checks
-from gfm_hil.testing.plan import Plan
-from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
-from gfm_hil.testing.signals import Signals, same
-from gfm_runtime.signals import REF_NAMES
-
-_REFERENCES = {name.lower(): name for name in REF_NAMES}
+from gfm_hil.testing.setting import beside
+from gfm_hil.testing.steps import Steps
 
 
-class Experiment:
-    """What the fixture ``bench`` gives a test.
+class Experiment(Steps):
+    """What the fixture ``bench`` gives a test: steps, results, and assertions.
 
-    Steps (``set``, ``grid``, ``phase_jump``, ``switch``, …, ``run``) are gathered; the whole
-    experiment is run from its beginning when something is first asked of it. Each step thereby
-    happens at its tick exactly, on every link. Steps after that are run again from the beginning
-    too, which in lockstep gives the same ticks again (it is checked); in real time it would be
-    another run, and is refused.
-
-    Args:
-        near: folder of the test, where scenario and law files are looked for first.
-        new_folder: called for the folder of each run.
-        link_wanted: link of the command line, instead of the test's.
-        notice: told of each figure that an assertion leaves.
-        skip: told why a test cannot be run over ``link_wanted``; must not return.
+    An assertion about a signal looks at it from the last step on, or from ``since`` (s), to the
+    end, and fails where the run did not come to its end.
     """
-
-    def __init__(
-        self,
-        near: Path,
-        new_folder: Callable[[], Path],
-        link_wanted: str | None = None,
-        notice: Callable[[Path], None] = lambda figure: None,
-        skip: Callable[[str], NoReturn] | None = None,
-    ) -> None:
-        self._near, self._new_folder = near, new_folder
-        self._link_wanted, self._notice, self._skip = link_wanted, notice, skip
-        self._setting: Setting | None = None
-
-    def start(self, scenario: str | None = None, **setting: Any) -> None:
-        """Begin anew; arguments as of ``make_setting``.
-
-        Raises:
-            UserError: one line a mistake.
-        """
-        __tracebackhide__ = True
-        try:
-            self._setting = make_setting(
-                self._near, scenario, link_wanted=self._link_wanted, **setting
-            )
-        except Unfit as problem:
-            if self._skip is None:
-                raise
-            self._skip(f"--gfmhil-link {self._link_wanted}: {problem}")
-        self._plan = Plan(self._setting.scenario)
-        self._run: Run | None = None
-        self._ran = 0  # ticks of the plan that ``_run`` was to have
-
-    # steps
-
-    def set(self, ramp_s: float = 0.0, **references: float) -> None:
-        """New references: ``p_ref=1.0``, or spread over ``ramp_s`` seconds."""
-        known = {_REFERENCES.get(k.lower(), k): float(v) for k, v in references.items()}
-        self._planned.step("reference", ramp_s=float(ramp_s), **known)
-
-    def grid(
-        self,
-        f_hz: float | None = None,
-        V_g: float | None = None,
-        rate: float | None = None,
-        duration: float | None = None,
-    ) -> None:
-        """Grid frequency [Hz] or voltage [p.u.]: a step, a ramp at ``rate`` [1/s], or of the
-        voltage a sag of ``duration`` [s]."""
-        if (f_hz is None) == (V_g is None):
-            raise UserError(f"f_hz = {f_hz}, V_g = {V_g}: give one of them")
-        if V_g is None:
-            self._planned.step("grid-frequency", f_hz=f_hz, rate=rate, duration=duration)
-        else:
-            self._planned.step("grid-voltage", V_g=V_g, rate=rate, duration=duration)
-
-    def phase_jump(self, degrees: float) -> None:
-        """The grid's angle jumps ahead."""
-        self._planned.step("grid-phase-jump", degrees=degrees)
-
-    def grid_impedance(self, L_g: float, R_g: float | None = None) -> None:
-        """The line becomes so many times its nominal elements; without ``R_g`` it is the same
-        line, longer or shorter."""
-        self._planned.step("grid-impedance", L_g=L_g, R_g=L_g if R_g is None else R_g)
-
-    def breaker(self, closed: bool) -> None:
-        """The grid breaker opens onto the local load, or closes."""
-        self._planned.step("grid-breaker", closed=closed)
-
-    def switch(self, law: str) -> None:
-        """Change to another law, of the catalogue or a file, bumpless."""
-        plan = self._planned
-        if self.setting.controller_command:
-            raise UserError(f"law = {law!r}: a controller of one's own has laws of its own")
-        plan.step("law", law=beside(self._near, law))
-
-    def run(self, seconds: float | None = None) -> None:
-        """Go on for a time [s]; without one, to the scenario's end."""
-        self._planned.run(seconds)
-
-    # results
-
-    @property
-    def setting(self) -> Setting:
-        """What the experiment runs on."""
-        if self._setting is None:
-            self.start()
-        assert self._setting is not None
-        return self._setting
-
-    @property
-    def time(self) -> float:
-        """Simulated time of the next step, s."""
-        return self._planned.tick * self.setting.scenario.T_s
-
-    @property
-    def pending(self) -> bool:
-        """There are ticks planned that were never run."""
-        return self._setting is not None and self._plan.tick > self._ran
-
-    @property
-    def signals(self) -> Signals:
-        """What was recorded, by name; see ``Signals``."""
-        return Signals(self.result.signals, nominal_frequency(self.setting.scenario))
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """Content of summary.json."""
-        return self.result.summary
-
-    @property
-    def folder(self) -> Path:
-        """The run folder, whose scenario.toml repeats the run."""
-        return self.result.folder
-
-    @property
-    def result(self) -> Run:
-        """The run of all steps so far.
-
-        Raises:
-            UserError: nothing to run, or nothing that could be run again.
-        """
-        plan, before = self._planned, self._run
-        if before is not None and self._ran == plan.tick:
-            return before
-        if plan.tick == 0:
-            raise UserError("nothing has been run: call run(seconds) before asking for results")
-        if before is not None and self.setting.realtime:
-            raise UserError(
-                "in real time a run cannot be repeated: make all steps before asking for results, "
-                "or begin anew with start()"
-            )
-        run = run_scenario(
-            plan.scenario(plan.tick),
-            self._new_folder(),
-            figures=False,
-            controller_command=self.setting.controller_command,
-        )
-        if run.summary["reason"] == "stopped by the operator":
-            raise KeyboardInterrupt
-        if before is not None and not same(before.signals, run.signals):
-            raise UserError(
-                "the same steps gave another run: a controller that does not repeat itself must be "
-                f"asked for results only at the end ({before.folder}, {run.folder})"
-            )
-        self._run, self._ran = run, plan.tick
-        return run
-
-    @property
-    def _planned(self) -> Plan:
-        return self._plan if self._setting is not None else self._begun()
-
-    def _begun(self) -> Plan:
-        self.start()
-        return self._plan
-
-    # assertions
 
     def assert_settles(
         self,

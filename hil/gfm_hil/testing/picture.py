@@ -18,7 +18,7 @@ from gfm_hil.testing.checks import Finding
 from gfm_hil.testing.signals import unit
 
 _BLUE, _RED, _GREEN, *_ = COLOURS
-_CONTEXT = ("p", "f_hz", "V", "i")
+_CONTEXT = ("p", "f_hz", "V", "i", "v_dc")  # the first four that are not the signal itself
 _FOLLOWS = {"p": "ref_P_ref", "q": "ref_Q_ref", "V": "ref_V_ref", "v_dc": "ref_V_dcref"}
 
 
@@ -58,12 +58,11 @@ def draw(
             label, (t, 1.0), (3, 4 + 10 * (k % 3)), xycoords=("data", "axes fraction"),
             textcoords="offset points", fontsize=8, color="#444444",
         )  # fmt: skip
-    main.set_title("")
-    main.set_ylabel(f"{signal} [{unit(signal).strip() or '1'}]", fontsize=9)
+    main.tick_params(labelbottom=True)
     main.legend(fontsize=8, frameon=False, loc="best")
-    for place, name in zip("abcd", _CONTEXT, strict=True):
-        if name in signals:
-            _curve(rows[place], name, signals)
+    beside = [name for name in _CONTEXT if name != signal]
+    for place, name in zip("abcd", beside, strict=False):
+        _curve(rows[place], name, signals)
     for axes in rows.values():
         for t, _ in steps:
             axes.axvline(t, color="#888888", lw=0.8, ls=(0, (4, 3)), zorder=0)
