@@ -148,7 +148,7 @@ def test_a_flood_of_frames_of_others_changes_nothing(make, tmp_path, endpoint, s
     assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()
     for faults, counters in found.values():
         assert not any(faults.values())
-        assert counters["foreign"] > 100
+        assert counters["foreign"] > 0
 
 
 def test_frames_in_our_name_without_our_check_are_refused(make, tmp_path, endpoint, stranger):
@@ -270,6 +270,7 @@ def test_another_dbc_is_refused_on_both_sides(make, tmp_path, endpoint):
         ("can+udp://192.168.0.1:5000", {}, r"must be can://channel"),
         ("can://", {}, "must be can://channel"),
         ("can://can0", {"interface": "pigeon"}, "cannot be opened: .*pigeon"),
+        ("can:///dev/ttyX", {"interface": "slcan"}, "'can:///dev/ttyX': cannot be opened: "),
         ("can://nocan", {}, "'can://nocan': cannot be opened: "),
         ("can://x", {"bitrate": 5}, "bitrate"),
         ("can://x", {"dbc": "nowhere.dbc"}, "dbc = 'nowhere.dbc': No such file"),

@@ -193,7 +193,10 @@ def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:
             rates["data_bitrate"] = options.data_bitrate
         return can.Bus(interface=options.interface, channel=channel, **rates)
     except (can.CanError, OSError, ValueError, ImportError, TypeError) as problem:
-        raise UserError(f"link.endpoint = {endpoint!r}: cannot be opened: {problem}") from None
+        said = str(problem)
+        if isinstance(problem, OSError) and problem.errno == errno.EAFNOSUPPORT:
+            said = f"this kernel has no CAN; {LOOPBACK}://127.0.0.1:port does without"
+        raise UserError(f"link.endpoint = {endpoint!r}: cannot be opened: {said}") from None
 
 
 def _check_mtu(channel: str, fd: bool) -> None:
