@@ -335,3 +335,12 @@ def test_an_emulated_bus_changes_when_and_not_what(make, tmp_path, endpoint):
     apart, _ = both_sides(scenario, tmp_path, endpoint, emulate=True)
     assert time.monotonic() - began > scenario.ticks * 90e-6  # of 97.1 µs an exchange
     assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()
+
+
+def test_without_cantools_it_says_what_to_install(make, monkeypatch):
+    monkeypatch.setattr("gfm_hil.links.can.find_spec", lambda name: None)
+    said = r"needs cantools: pip install 'gfmhil\[can\]'"
+    with pytest.raises(UserError, match=said):
+        make(link={"type": "can"})
+    with pytest.raises(UserError, match=said):
+        open_link("can", "plant", "can://can0")

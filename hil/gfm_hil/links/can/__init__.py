@@ -14,7 +14,12 @@ from gfm_hil.links.can.options import LOOPBACK, CanOptions
 _PLACES = 4  # of a loopback bus, UDP ports in a row
 
 
+_NEEDS = "link.type = 'can' needs cantools: pip install 'gfmhil[can]'"
+
+
 def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
+    if find_spec("cantools") is None:
+        raise UserError(_NEEDS)
     from gfm_hil.links.can.link import CanLink
 
     return CanLink(side, endpoint, options)
@@ -22,7 +27,7 @@ def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
 
 def _check(options: CanOptions, T_s: float) -> None:
     if find_spec("cantools") is None:
-        raise ValueError("link.type = 'can' needs cantools: pip install 'gfmhil[can]'")
+        raise ValueError(_NEEDS)
     from gfm_hil.links.can.bus_budget import check_budget
 
     check_budget(options, T_s)
