@@ -14,6 +14,7 @@ import pytest
 
 from gfm_hil.errors import UserError
 from gfm_hil.testing import Experiment
+from gfm_hil.testing.checks import Window, damped, envelope, overshoot, read_envelope, settles
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CONTROLLER = EXAMPLES / "own_controller" / "controller.py"
@@ -135,6 +136,9 @@ def test_what_is_not_looked_at_is_run_all_the_same(pytester: pytest.Pytester) ->
         ("bench.run(0.01); bench.assert_settles('p', 1, within=1)", "within = 1"),
         ("bench.start('nowhere')", "nowhere"),
         ("bench.start(link='tin-can')", "tin-can"),
+        ("bench.start(link='inproc', controller_command=['c'])", "needs a link"),
+        ("bench.start(controller_command=['c']); bench.switch('vsg-2')", "laws of its own"),
+        ("bench.grid()", "f_hz = None, V_g = None"),
     ],
 )
 def test_wrong_use_is_told_in_one_line(lab: Lab, steps: str, says: str) -> None:
@@ -203,3 +207,143 @@ def test_example_controller_is_droop_5_but_for_its_integrator(lab: Lab, tmp_path
         p.append(bench.signals["p"])
     assert np.ptp(p[0]) > 0.2
     assert np.max(np.abs(p[1] - p[0])) < 0.01 * 0.2
+
+
+T = np.linspace(0.0, 1.0, 1001)
+
+
+def window(x: np.ndarray, before: float = 0.0) -> Window:
+    return Window("p", 0.5 + T, x, before, 0.5)
+
+
+def test_settles_counts_from_the_last_time_outside() -> None:
+    w = window(np.where((T > 0.3) & (T < 0.6), 1.5, 1.0))
+    assert settles(w, to=1.0, within=0.61, tolerance=0.02) is None
+    found = settles(w, to=1.0, within=0.2, tolerance=0.02)
+    assert found is not None
+    assert "it took 0.6 s" in found.text
+    assert 0.8 <= found.at <= 1.1
+    assert np.isnan(found.low[T < 0.2 - 1e-6]).all()
+    assert settles(window(np.full(1001, np.nan)), to=1.0, within=0.2, tolerance=9.0) is not None
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_overshoot_is_a_part_of_the_step(sign: int) -> None:
+    w = window(2 + sign * np.where(T < 0.1, 1.25, 1.0), before=2.0)
+    assert overshoot(w, percent=25.1, to=None) is None
+    found = overshoot(w, percent=24.9, to=None)
+    assert found is not None
+    assert "25 %" in found.text
+    with pytest.raises(UserError, match="did not step"):
+        overshoot(w, percent=1.0, to=2.0)
+
+
+def test_envelope_of_a_file_ends_with_its_lines(tmp_path: Path) -> None:
+    file = tmp_path / "limits.csv"
+    file.write_text("t,low,high\n0.2,0,1\n0.4,,2\n")
+    low, high = read_envelope(file, T)
+    assert np.isnan(low[T < 0.199]).all()
+    assert high[300] == pytest.approx(1.5)
+    assert np.isnan(high[T > 0.401]).all()
+    assert envelope(window(np.where(T < 0.19, 9.0, 0.5)), low, high) is None
+    found = envelope(window(np.where(T < 0.3, 0.5, 1.8)), low, high)
+    assert found is not None
+    assert found.at == pytest.approx(0.8)
+    assert "above the limit of 1.5" in found.text
+    for text in (
+        "",
+        "t,low\n1,2\n",
+        "t,low,high\n2,0,1\n1,0,1\n",
+        "t,low,high\n,0,1\n",
+        "t,low,high\n7,0,1\n",
+    ):
+        file.write_text(text)
+        with pytest.raises(UserError, match=r"limits\.csv"):
+            read_envelope(file, T)
+
+
+def test_damped_reads_the_ratio() -> None:
+    x = 1 + np.exp(-0.2 * 20 * T) * np.cos(20 * np.sqrt(1 - 0.2**2) * T)
+    assert damped(window(x), 0.19, 1e-3) is None
+    found = damped(window(x), 0.21, 1e-3)
+    assert found is not None
+    assert "has 0.2" in found.text
+    assert damped(window(np.ones(1001)), 0.9, 1e-3) is None
+
+
+def test_change_of_law_and_its_bump(lab: Lab) -> None:
+    bench = lab(plant__dc_source={"mode": "regulated"})
+    bench.run(0.01)
+    bench.switch("vsg-2")
+    bench.run(0.01)
+    bench.assert_bump_below(1e-9)
+    with pytest.raises(AssertionError, match=r"law vsg-2 at t = 0\.01 s should move no input"):
+        bench.assert_bump_below(-1.0)
+
+
+def test_results_over_can_are_those_in_process_but_for_its_sixteen_bits(lab: Lab) -> None:
+    p = []
+    for link in ("inproc", "can"):
+        bench = lab(link=link)
+        bench.run(0.01)
+        bench.phase_jump(-1)
+        bench.run(0.03)
+        p.append(bench.signals["p"])
+    assert np.ptp(p[0]) > 0.05
+    assert (p[0] != p[1]).any()
+    np.testing.assert_allclose(p[1], p[0], atol=2e-3)
+
+
+def test_real_time_is_run_once_and_counts_its_misses(lab: Lab) -> None:
+    bench = lab("rig_pref_step", events=[], link="shm", mode="realtime")
+    bench.run(0.05)
+    bench.set(P_ref=0.6)
+    bench.run(0.05)
+    assert np.flatnonzero(np.diff(bench.signals["ref_P_ref"])).size
+    bench.assert_no_miss(at_most=bench.summary["ticks"])
+    with pytest.raises(AssertionError, match=r"At most -1 of 1000 ticks should go without"):
+        bench.assert_no_miss(at_most=-1)
+    bench.run(0.05)
+    with pytest.raises(UserError, match="in real time a run cannot be repeated"):
+        _ = bench.summary
+
+
+def test_link_of_the_command_line_replaces_or_skips(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import pytest
+
+        def test_any(bench):
+            bench.start(link="zmq", link__options={"portable": True})
+            bench.run(0.01)
+            assert bench.summary["link"] == "inproc"
+
+        @pytest.mark.gfmhil(mode="realtime", link="shm")
+        def test_clock(bench):
+            raise AssertionError("skipped before it begins")
+
+        @pytest.mark.gfmhil(controller_command=["controller"])
+        def test_process(bench):
+            raise AssertionError("skipped before it begins")
+        """
+    )
+    result = pytester.runpytest("--gfmhil-link=inproc", "-rs")
+    result.assert_outcomes(passed=1, skipped=2)
+    result.stdout.fnmatch_lines(["*the controller of this test is a process that talks zmq*"])
+    assert pytester.runpytest("--gfmhil-link=tin").ret == pytest.ExitCode.USAGE_ERROR
+
+
+@pytest.mark.parametrize(
+    ("command", "error", "says"),
+    [
+        (["no-such-program"], UserError, "no-such-program: cannot be started"),
+        ([sys.executable, "-c", "raise SystemExit(3)"], AssertionError, "the controller failed"),
+    ],
+)
+def test_controller_that_does_not_run_is_told(
+    lab: Lab, command: list[str], error: type[Exception], says: str
+) -> None:
+    bench = lab(controller_command=command)
+    bench.run(0.01)
+    with pytest.raises(error, match=says):
+        bench.assert_no_trip()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from gfm_hil.testing.signals import unit
 
 Vector = NDArray[np.float64]
 
+_COLUMNS = ("t", "low", "high")
 _TAIL = 0.05  # the last part of a window, whose mean is the final value
 
 
@@ -63,13 +65,13 @@ def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | 
     late = w.t >= begin - 1e-9
     if not late.any():
         raise UserError(f"within = {within:g}: the run ends {w.t[-1] - w.since:g} s after the step")
-    away = np.abs(w.x - to)
-    outside = np.flatnonzero(~(away <= tolerance))  # NaN is outside too
+    away = np.nan_to_num(np.abs(w.x - to), nan=np.inf)
+    outside = np.flatnonzero(away > tolerance)
     if not len(outside) or not late[outside[-1]]:
         return None
     last = int(outside[-1])
     never = last >= len(w.t) - 1
-    worst = int(np.flatnonzero(late)[np.nanargmax(away[late])])
+    worst = int(np.flatnonzero(late)[np.argmax(away[late])])
     ending = w.x[-max(1, round(_TAIL * len(w.x))) :]
     how = (
         "it had not at the end of the run" if never else f"it took {w.t[last + 1] - w.since:.4g} s"
@@ -147,14 +149,22 @@ def read_envelope(path: Path, t: Vector) -> tuple[Vector, Vector]:
         UserError: no such file, or not of this form.
     """
     try:
-        table = np.genfromtxt(path, delimiter=",", names=True, dtype=float, ndmin=1)
-    except (OSError, ValueError) as problem:
+        with path.open(encoding="utf-8", newline="") as file:
+            lines = list(csv.DictReader(file))
+        table = {
+            name: np.array([float(line[name] or "nan") for line in lines]) for name in _COLUMNS
+        }
+    except OSError as problem:
+        raise UserError(f"csv = {str(path)!r}: {problem.strerror}") from None
+    except (KeyError, TypeError, UnicodeDecodeError, csv.Error):
+        raise UserError(f"csv = {str(path)!r}: must have the columns t,low,high") from None
+    except ValueError as problem:
         raise UserError(f"csv = {str(path)!r}: {problem}") from None
-    if set(table.dtype.names or ()) != {"t", "low", "high"}:
-        raise UserError(f"csv = {str(path)!r}: its first line must be t,low,high")
-    if np.isnan(table["t"]).any() or (np.diff(table["t"]) < 0).any():
+    if not lines or np.isnan(table["t"]).any() or (np.diff(table["t"]) < 0).any():
         raise UserError(f"csv = {str(path)!r}: its times must be numbers that do not go back")
     low, high = (
         np.interp(t, table["t"], table[name], left=np.nan, right=np.nan) for name in ("low", "high")
     )
+    if np.isnan(low).all() and np.isnan(high).all():
+        raise UserError(f"csv = {str(path)!r}: has no limit within the {t[-1]:g} s after the step")
     return low, high
