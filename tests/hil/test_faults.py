@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterator
 from functools import cache
@@ -99,4 +100,18 @@ def test_every_fault_is_counted_and_no_result_changes(link, kind, place):
 @pytest.mark.parametrize("kind", IMPAIRMENTS)
 @pytest.mark.parametrize("link", LINKS)
 def test_every_fault_is_counted_in_a_hundred_thousand_ticks(link, kind, place):
-    check(lockstep(place, link, MANY, IMPAIRMENTS[kind]), link, MANY)
+    """With GFMHIL_FAULTS_REPORT=file, a row of the table in docs/protection.md."""
+    pair = lockstep(place, link, MANY, IMPAIRMENTS[kind])
+    check(pair, link, MANY)
+    if "GFMHIL_FAULTS_REPORT" in os.environ:
+        with Path(os.environ["GFMHIL_FAULTS_REPORT"]).open("a", encoding="utf-8") as file:
+            file.write(row(link, kind, pair) + "\n")
+
+
+def row(link: str, kind: str, pair: Pair) -> str:
+    """Both sides' counters together, as a row of a table in Markdown."""
+    i = {name: sum(pair.injected[s][name] for s in SIDES) for name in pair.injected["plant"]}
+    f = {name: sum(pair.faults[s][name] for s in SIDES) for name in pair.faults["plant"]}
+    told = [i[n] for n in ("seen", "lost", "corrupted", "duplicated", "reordered", "refused")]
+    counted = [f[n] for n in ("lost", "crc", "repeated", "out_of_sequence")]
+    return f"| {link} | {kind} | " + " | ".join(f"{n:,}" for n in (*told, *counted)) + " |"

@@ -1,0 +1,168 @@
+"""kill -9 and SIGSTOP at any moment: the other side is safe in time, and nothing is left behind.
+
+20 rounds by default; GFMHIL_KILLS=100 for as many as the acceptance test asks for, and
+GFMHIL_KILLS_REPORT=file for a line a round: link, mode, who was killed, ticks recorded, and the time
+in s from the last frame of the killed side to the end of the other.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.links.base import SIDES
+
+from .test_processes import end, has_run, sides_of, signals, summary, wait_for, write
+
+ROUNDS = int(os.environ.get("GFMHIL_KILLS", "20"))
+REPORT = os.environ.get("GFMHIL_KILLS_REPORT")
+PEER_TIMEOUT_S, HOLD = 0.5, 200
+GENEROUS_S = 10.0  # on top: a crowded machine may not run a process for seconds
+
+
+def places(folder: Path) -> set[Path]:
+    """What a run that is going on has outside its folder: memory, the folder of a socket."""
+    words = Path(f"/proc/{sides_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
+    kind, _, name = words[words.index("--endpoint") + 1].partition("://")
+    found = {Path("/dev/shm") / f"gfmhil-link-{name}" if kind == "shm" else Path(name).parent}
+    if (folder / "parts").is_symlink():
+        found.add((folder / "parts").resolve())
+    assert all(path.exists() for path in found)
+    return found
+
+
+def log_of(folder: Path) -> list[dict[str, Any]]:
+    """The lines of events.jsonl."""
+    return [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+
+
+def watchdog_s(folder: Path, victim: str) -> float:
+    """Time from the last frame of the killed side to the end of the other one."""
+    other = "plant" if victim == "controller" else "controller"
+    (last,) = [e for e in log_of(folder) if e["event"] == "end"]
+    assert last["side"] == other and last["status"] == "safe"
+    with np.load(folder / "timing.npz") as file:
+        return (last["clock_ns"] - file[f"{other}_received"].max()) * 1e-9
+
+
+@pytest.mark.timeout(30 + 30 * ROUNDS)
+def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
+    chance = random.Random(4)
+    for k in range(ROUNDS):
+        link, mode, victim = (
+            chance.choice(("shm", "zmq")),
+            chance.choice(("lockstep", "realtime")),
+            chance.choice(SIDES),
+        )
+        ticks = chance.randrange(1, 3000)
+        folder = tmp_path / f"run{k}"
+        scenario = write(
+            tmp_path,
+            mode=mode,
+            law="vsg-2",
+            duration=60.0,
+            late_policy={"hold": HOLD},
+            link={"type": link, "peer_timeout_s": PEER_TIMEOUT_S},
+        )
+        process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+        wait_for(lambda f=folder, n=ticks: has_run(f, n), process)
+        outside = places(folder)
+        assert len(outside) == (2 if mode == "realtime" else 1)
+        os.kill(sides_of(folder)[victim], signal.SIGKILL)
+        code, out, _ = end(process)
+        found = json.loads(out)
+        assert (code, found["status"]) == (3, "safe")
+        assert found["reason"] == f"the {victim} was ended by SIGKILL"
+        took = watchdog_s(folder, victim)
+        assert took < PEER_TIMEOUT_S + GENEROUS_S
+        recorded = signals(folder)
+        n = len(recorded["t"])
+        assert n == found["ticks"] >= ticks
+        for name in ("true_p", "y_p", "u_omega_u"):
+            assert np.isfinite(recorded[name]).all()
+        if victim == "controller" and mode == "realtime":
+            with np.load(folder / "timing.npz") as file:
+                late = file["plant_received"] < 0
+            # the plant itself counts ticks, however long they took
+            assert late[-HOLD - 1 :].all() and n > HOLD
+        assert sides_of(folder) == {}
+        assert not any(path.exists() for path in outside)
+        if REPORT:
+            with Path(REPORT).open("a", encoding="utf-8") as file:
+                file.write(json.dumps([link, mode, victim, n, took]) + "\n")
+    scenario = write(tmp_path, law="vsg-2", link={"type": "shm", "peer_timeout_s": 60.0})
+    code, out, _ = end(start("run", scenario, "--out", str(tmp_path / "next"), "--json",
+                             "--no-figures"))  # fmt: skip
+    assert (code, json.loads(out)["status"]) == (0, "completed")
+
+
+def test_without_a_survivor_the_next_run_clears_up(start, tmp_path):
+    folder = tmp_path / "run"
+    content = {"mode": "realtime", "law": "vsg-2", "link": {"type": "shm"}}
+    patient = {"late_policy": {"hold": 10**6}}
+    scenario = write(tmp_path, **content, **patient, duration=60.0)
+    process = start("run", scenario, "--out", str(folder), "--no-figures")
+    wait_for(lambda: has_run(folder, 300), process)
+    sides, outside = sides_of(folder), places(folder)
+    for number in (process.pid, *sides.values()):
+        os.kill(number, signal.SIGKILL)
+    process.communicate()
+    wait_until(lambda: sides_of(folder) == {})
+    assert all(path.exists() for path in outside)
+    scenario = write(tmp_path, **content, **patient)
+    code, *_ = end(start("run", scenario, "--out", str(tmp_path / "next"), "--no-figures"))
+    assert code in (0, 3)  # by how crowded the machine is
+    assert not any(path.exists() for path in outside)
+    assert {path.name for path in (folder / "parts").iterdir()} == {
+        f"{side}_{what}.npy" for side in SIDES for what in ("signals", "times", "progress")
+    }
+    assert np.isfinite(np.load(folder / "parts" / "plant_signals.npy")[:300]).all()
+
+
+def wait_until(what: Any) -> None:
+    """Poll until it is true."""
+    give_up = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < give_up
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("link", ["shm", "zmq"])
+@pytest.mark.parametrize("victim", SIDES)
+def test_a_side_that_hangs_makes_the_other_safe_and_ends_when_it_goes_on(
+    victim, link, start, tmp_path
+):
+    """SIGSTOP of one side, and SIGCONT once the other has ended."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
+        endpoint = f"ipc://{place}/link" if link == "zmq" else f"shm://{Path(place).name}"
+        options = {"type": link, "peer_timeout_s": 1.0, "endpoint": endpoint}
+        scenario = write(
+            tmp_path, mode="realtime", law="vsg-2", duration=60.0, link=options,
+            late_policy={"hold": 5000},
+        )  # fmt: skip
+        sides = {
+            side: start(side, scenario, "--out", str(tmp_path / side), "--quiet") for side in SIDES
+        }
+        other = "plant" if victim == "controller" else "controller"
+        wait_for(lambda: has_run(tmp_path / "plant", 300), sides["plant"])
+        os.kill(sides[victim].pid, signal.SIGSTOP)
+        try:
+            assert end(sides[other])[0] == 3
+        finally:
+            os.kill(sides[victim].pid, signal.SIGCONT)
+        assert end(sides[victim])[0] in (3, 130)
+        for side in SIDES:
+            found = summary(tmp_path / side)
+            assert found["reason"], side
+        assert summary(tmp_path / other)["status"] == "safe"
+        recorded = signals(tmp_path / other)
+        assert np.isfinite(recorded["ref_P_ref" if other == "controller" else "true_p"]).any()
