@@ -18,12 +18,22 @@ from gfm_hil.links import Link
 from gfm_hil.links.base import Side
 from gfm_hil.scenario import Scenario
 from gfm_hil.waiting import await_message
-from gfm_runtime.signals import TABLE_VERSION
+from gfm_runtime.signals import TABLE_VERSION, table_hash
 
 _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
+_AGAIN_NS = 2_000_000_000  # after which a link that knows how reaches out anew
 _LEAD_NS = 20_000_000  # from START to tick 0
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux; CLOCK_MONOTONIC counts from that boot
+
+#: what both sides must have in common, in the order of looking, and its name in words
+_MUST_FIT = {
+    "version": "version of the signal table",
+    "table": "signal table",
+    "T_s": "sampling time T_s",
+    "laws": "law or law file",
+    "digest": "scenario",
+}
 
 Notice = Callable[[str], None]
 
@@ -53,12 +63,13 @@ def shake_hands(
         PeerLost: nobody came within ``link.start_timeout_s``, or they run something else.
     """
     boot = _boot()
-    mine = {"side": side, "table": TABLE_VERSION, "digest": scenario.digest(), "boot": boot}
+    mine = {"side": side, "boot": boot, **_what_runs(scenario)}
     begin = time.monotonic_ns()
     deadline = begin + int(scenario.link.start_timeout_s * 1e9)
-    say_at = begin + 500_000_000
+    say_at, again_at = begin + 500_000_000, begin + _AGAIN_NS
     other = "plant" if side == "controller" else "controller"
     met = one_clock = False
+    answered = -_REPEAT_NS
     while not stopped():
         if side == "plant":
             link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
@@ -67,7 +78,9 @@ def shake_hands(
         if message is not None and message.startswith(_PREFIX):
             content = _read(message)
             if content["kind"] == "hello":
-                if side == "controller" and not met:  # answer first: both shall see a misfit
+                # answer first: both shall see a misfit; and once for all that had piled up
+                if side == "controller" and now - answered >= _REPEAT_NS:
+                    answered = now
                     link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
                 _compare(mine, content)
                 one_clock = bool(boot) and content["boot"] == boot
@@ -78,10 +91,13 @@ def shake_hands(
                     go: dict[str, Any] = {"kind": "start", "t0": start}
                     link.send(_PREFIX + json.dumps(go).encode())
                     return Start(start, one_clock)
-            elif content["kind"] == "start":
-                return Start(int(content["t0"]) if one_clock else now + _LEAD_NS, one_clock)
+            elif met:
+                return Start(content["t0"] if one_clock else now + _LEAD_NS, one_clock)
         if now >= deadline:
             break
+        if now >= again_at and not met:
+            getattr(link, "again", _nothing)()
+            again_at = now + _AGAIN_NS
         if now >= say_at and not met:
             notice(f"waiting for the {other} at {scenario.link.endpoint} …")
             say_at = now + 5_000_000_000
@@ -95,6 +111,21 @@ def shake_hands(
     )
 
 
+def _nothing() -> None:
+    """Of a link that has no second way."""
+
+
+def _what_runs(scenario: Scenario) -> dict[str, Any]:
+    """The values of ``_MUST_FIT``."""
+    return {
+        "version": TABLE_VERSION,
+        "table": table_hash(),
+        "T_s": scenario.T_s,
+        "laws": scenario.laws_digest(),
+        "digest": scenario.digest(),
+    }
+
+
 def _boot() -> str:
     try:
         return _BOOT.read_text("ascii").strip()
@@ -105,8 +136,9 @@ def _boot() -> str:
 def _read(message: bytes) -> dict[str, Any]:
     try:
         content = json.loads(message[len(_PREFIX) :])
-        expected = {"hello": ("side", "table", "digest", "boot"), "start": ("t0",)}[content["kind"]]
-        return {"kind": content["kind"], **{key: content[key] for key in expected}}
+        expected = {"hello": ("side", "boot", *_MUST_FIT), "start": ("t0",)}[content["kind"]]
+        found = {"kind": content["kind"], **{key: content[key] for key in expected}}
+        return found if content["kind"] == "hello" else {**found, "t0": int(content["t0"])}
     except (ValueError, KeyError, TypeError):
         raise PeerLost(f"the other side speaks another language: {message[:60]!r}") from None
 
@@ -114,7 +146,7 @@ def _read(message: bytes) -> dict[str, Any]:
 def _compare(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
     if theirs["side"] == mine["side"]:
         raise PeerLost(f"the other side is a {theirs['side']} too")
-    for what in ("table", "digest"):
+    for what, name in _MUST_FIT.items():
         if theirs[what] != mine[what]:
-            name = "signal table" if what == "table" else "scenario or law file"
-            raise PeerLost(f"the {theirs['side']} runs another {name} ({theirs[what]})")
+            values = f"{theirs[what]}, ours is {mine[what]}"
+            raise PeerLost(f"the {theirs['side']} runs another {name} ({values})")

@@ -67,6 +67,10 @@ class Link(_Model):
         return self
 
 
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
 class References(_Model):
     """Y_ref at the start, p.u."""
 
@@ -152,9 +156,11 @@ class Scenario(_Model):
             {**e.model_dump(), **({"law": names.index(e.law)} if isinstance(e, LawChange) else {})}
             for e in self.sorted_events()
         ]
-        laws = [law_file(name).model_dump() for name in names]
-        text = json.dumps([content, events, laws, table_hash()], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return _hash([content, events, self.laws_digest(), table_hash()])
+
+    def laws_digest(self) -> str:
+        """Hash over the content of every law that the run uses."""
+        return _hash([law_file(name).model_dump() for name in self.laws()])
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:

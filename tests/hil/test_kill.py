@@ -1,8 +1,8 @@
 """kill -9 and SIGSTOP at any moment: the other side is safe in time, and nothing is left behind.
 
 20 rounds by default; GFMHIL_KILLS=100 for as many as the acceptance test asks for, and
-GFMHIL_KILLS_REPORT=file for a line a round: link, mode, who was killed, ticks recorded, and the time
-in s from the last frame of the killed side to the end of the other.
+GFMHIL_KILLS_REPORT=file for a line a round: link, mode, who was killed, ticks recorded, and the
+time in s from the last frame of the killed side to the end of the other.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 import time
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gfm_hil import handshake
 from gfm_hil.bench import make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import PeerLost, UserError
@@ -267,12 +269,59 @@ def test_the_drift_of_two_clocks_is_read_off_the_earliest_arrivals():
     assert clock_drift({}, 1e-4) is None
 
 
-def test_a_misfit_of_scenarios_is_refused_on_both_sides(make, endpoint):
-    found = meet({"controller": make(link=PATIENT), "plant": make(link=PATIENT, seed=3)}, endpoint)
+@pytest.mark.parametrize(
+    ("other", "name"),
+    [
+        ({"seed": 3}, "scenario"),
+        ({"plant": {"grid": {"V_g": 0.99}}}, "scenario"),
+        ({"late_policy": {"hold": 3}}, "scenario"),
+        ({"law": "vsg-2"}, "law or law file"),
+        ({"events": [{"tick": 5, "type": "law", "law": "vsg-2"}]}, "law or law file"),
+        ({"T_s": 5e-5}, "sampling time T_s (5e-05, ours is 0.0001)"),
+    ],
+)
+def test_a_misfit_is_refused_on_both_sides_and_named(other, name, make, endpoint):
+    found = meet({"controller": make(link=PATIENT), "plant": make(link=PATIENT, **other)}, endpoint)
     assert isinstance(found["controller"], PeerLost)
     assert isinstance(found["plant"], PeerLost)
-    assert "the plant runs another scenario or law file" in str(found["controller"])
-    assert "the controller runs another scenario or law file" in str(found["plant"])
+    assert f"the plant runs another {name}" in str(found["controller"])
+    assert f"the controller runs another {name.partition(' (')[0]}" in str(found["plant"])
+
+
+@pytest.mark.parametrize(
+    ("what", "name"),
+    [("TABLE_VERSION", "version of the signal table"), ("table_hash", "signal table")],
+)
+def test_a_misfit_of_signal_tables_is_named(what, name, make, endpoint, monkeypatch):
+    given = iter("ab")
+    new = 77 if what == "TABLE_VERSION" else lambda: next(given)
+    link, scenario = ZmqLink("plant", endpoint), make(link=PATIENT)
+    monkeypatch.setattr(handshake, what, new)
+    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    monkeypatch.undo()
+    controller = ZmqLink("controller", endpoint)
+    try:
+        link.send(b"GFMHIL " + json.dumps(hello).encode())
+        with pytest.raises(PeerLost, match=f"the plant runs another {name} "):
+            shake_hands("controller", controller, scenario, lambda: False, print)
+        assert len(json.dumps({**hello, "boot": "x" * 36})) < 300
+    finally:
+        link.close()
+        controller.close()
+
+
+def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
+    """From the first HELLO on, silence means what it always does."""
+    link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
+    scenario = make(link={**PATIENT, "peer_timeout_s": 0.3})
+    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    try:
+        link.send(b"GFMHIL " + json.dumps(hello).encode())
+        with pytest.raises(PeerLost, match="the plant came but did not start"):
+            shake_hands("controller", controller, scenario, lambda: False, print)
+    finally:
+        link.close()
+        controller.close()
 
 
 @pytest.mark.parametrize(
