@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.apt, pytest.mark.uml]
 @pytest.mark.skipif(
     "GFMHIL_UML" not in os.environ, reason="boots a kernel; GFMHIL_UML=1 asks for it"
 )
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1200)
 def test_socketcan_inside_user_mode_linux(tmp_path):
     job, status, log = (tmp_path / name for name in ("job.sh", "status", "log"))
     # hostfs cuts times of files to seconds, so that a cache of compiled code shared with the host
@@ -55,7 +55,7 @@ def test_socketcan_inside_user_mode_linux(tmp_path):
         start_new_session=True,
     )  # fmt: skip
     try:
-        kernel.wait(timeout=880)
+        kernel.wait(timeout=1150)
     finally:
         if kernel.poll() is None:  # it is several processes
             os.killpg(kernel.pid, signal.SIGKILL)
