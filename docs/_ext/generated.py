@@ -10,13 +10,14 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from _ext import design_pages, law_pages, outputs, scenario_pages
+from _ext import design_pages, law_pages, outputs, scenario_pages, testing_pages
 
 _LINE = re.compile(r"^<!-- generate: (\S+) ?(.*?) *-->$", re.MULTILINE)
 
 MAKERS: dict[str, Callable[..., str]] = {
     "design-gammas": design_pages.gammas,
     "design-weights": design_pages.weights,
+    "impairment-keys": scenario_pages.impairment_table,
     "law-overview": law_pages.overview,
     "law-catalogue": law_pages.catalogue,
     "law-keys": scenario_pages.law_tables,
@@ -25,6 +26,8 @@ MAKERS: dict[str, Callable[..., str]] = {
     "scenario-mistakes": outputs.scenario_mistakes,
     "event-keys": scenario_pages.event_tables,
     "command": outputs.command,
+    "frame-layout": testing_pages.frame_layout,
+    "testing-calls": testing_pages.calls,
 }
 
 

@@ -48,7 +48,7 @@ class Steps:
         self._setting: Setting | None = None
 
     def start(self, scenario: str | None = None, **setting: Any) -> None:
-        """Begin anew; arguments as of ``make_setting``.
+        """Begin anew; the arguments are those of ``make_setting`` and of the marker.
 
         Raises:
             UserError: one line a mistake.
