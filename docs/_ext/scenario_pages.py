@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from gfm_hil import events, scenario
+from gfm_hil.links.impaired import Impairment
 from gfm_plant import options
 from gfm_runtime import lawfile
 from gfm_runtime.signals import group
@@ -24,6 +25,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("top level", scenario.Scenario),
     ("[references]", _REFERENCE_TABLE),
     ("[link]", _table_of("link")),
+    ("[link.impairment]", Impairment),
     ("[late_policy]", _table_of("late_policy")),
     ("[plant]", options.Plant),
     ("[plant.dc_source]", options.DcSource),

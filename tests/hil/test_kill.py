@@ -1,8 +1,9 @@
 """kill -9 and SIGSTOP at any moment: the other side is safe in time, and nothing is left behind.
 
-20 rounds by default; GFMHIL_KILLS=100 for as many as the acceptance test asks for, and
-GFMHIL_KILLS_REPORT=file for a line a round: link, mode, who was killed, ticks recorded, and the
-time in s from the last frame of the killed side to the end of the other.
+20 rounds by default; GFMHIL_KILLS=100 for as many as the acceptance test asks for,
+GFMHIL_KILLS_SEED for others, and GFMHIL_KILLS_REPORT=file for a line a round: link, mode, who was
+killed, ticks recorded, and the time in s from the last frame of the killed side to the end of the
+other.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from gfm_hil.links.base import SIDES
 from .test_processes import end, has_run, sides_of, signals, summary, wait_for, write
 
 ROUNDS = int(os.environ.get("GFMHIL_KILLS", "20"))
+SEED = int(os.environ.get("GFMHIL_KILLS_SEED", "4"))
 REPORT = os.environ.get("GFMHIL_KILLS_REPORT")
-PEER_TIMEOUT_S, HOLD = 0.5, 200
+PEER_TIMEOUT_S, HOLD = 0.5, 2000
 GENEROUS_S = 10.0  # on top: a crowded machine may not run a process for seconds
 
 
@@ -56,8 +58,11 @@ def watchdog_s(folder: Path, victim: str) -> float:
 
 @pytest.mark.timeout(30 + 30 * ROUNDS)
 def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
-    chance = random.Random(4)
-    for k in range(ROUNDS):
+    chance = random.Random(SEED)
+    done = 0
+    for k in range(2 * ROUNDS):
+        if done == ROUNDS:
+            break
         link, mode, victim = (
             chance.choice(("shm", "zmq")),
             chance.choice(("lockstep", "realtime")),
@@ -80,6 +85,9 @@ def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
         os.kill(sides_of(folder)[victim], signal.SIGKILL)
         code, out, _ = end(process)
         found = json.loads(out)
+        if sum(e["event"] == "end" for e in log_of(folder)) == 2:
+            continue  # a stall of the machine ended the run before we did
+        done += 1
         assert (code, found["status"]) == (3, "safe")
         assert found["reason"] == f"the {victim} was ended by SIGKILL"
         took = watchdog_s(folder, victim)
@@ -99,6 +107,7 @@ def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
         if REPORT:
             with Path(REPORT).open("a", encoding="utf-8") as file:
                 file.write(json.dumps([link, mode, victim, n, took]) + "\n")
+    assert done == ROUNDS
     scenario = write(tmp_path, law="vsg-2", link={"type": "shm", "peer_timeout_s": 60.0})
     code, out, _ = end(start("run", scenario, "--out", str(tmp_path / "next"), "--json",
                              "--no-figures"))  # fmt: skip

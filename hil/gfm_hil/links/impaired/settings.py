@@ -18,7 +18,7 @@ class Impairment(LinkOptions):
     towards: Literal["both", "controller", "plant"] = Field(
         "both", description="the side whose incoming frames are hit"
     )
-    seed: int = Field(1, ge=1, lt=2**32)
+    seed: int = Field(1, ge=1, lt=2**32, description="each side draws its own sequence from it")
     loss: float = Field(0.0, ge=0, le=1, description="a frame is lost")
     burst: float = Field(1.0, ge=1, le=1e6, description="frames lost in a row, on average")
     corrupt: float = Field(0.0, ge=0, le=1, description="bits of a frame are flipped")
@@ -26,7 +26,7 @@ class Impairment(LinkOptions):
     duplicate: float = Field(0.0, ge=0, le=1, description="a frame arrives twice")
     reorder: float = Field(0.0, ge=0, le=1, description="a frame arrives after the next one")
     delay: float = Field(0.0, ge=0, le=10, description="every frame is late by that, s")
-    jitter: float = Field(0.0, ge=0, le=10, description="and by up to that more, drawn evenly, s")
+    jitter: float = Field(0.0, ge=0, le=2, description="and by up to that more, drawn evenly, s")
     pause_at: int | None = Field(None, ge=0, description="frame from which the link is silent")
     pause: float = Field(0.1, gt=0, le=60, description="for so long, s")
     kill_at: int | None = Field(None, ge=0, description="frame at which the process is killed")
