@@ -17,7 +17,6 @@ _LINE = re.compile(r"^<!-- generate: (\S+) ?(.*?) *-->$", re.MULTILINE)
 MAKERS: dict[str, Callable[..., str]] = {
     "design-gammas": design_pages.gammas,
     "design-weights": design_pages.weights,
-    "impairment-keys": scenario_pages.impairment_table,
     "law-overview": law_pages.overview,
     "law-catalogue": law_pages.catalogue,
     "law-keys": scenario_pages.law_tables,
