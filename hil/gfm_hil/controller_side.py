@@ -6,6 +6,7 @@ without a frame are counted and, beyond ``late_policy.hold``, lead to the safe s
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -13,7 +14,7 @@ from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_controller
-from gfm_hil.timeline import Timeline
+from gfm_hil.timeline import PLANT_LEFT, Timeline, safe_reason
 from gfm_hil.waiting import await_message, part_from
 from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED, missed
 
@@ -34,7 +35,7 @@ def run_controller(
     reader, writer = FrameReader("y"), FrameWriter("u")
     signals, times, progress = part.signals, part.times, part.progress
     done, tick = 0, 0  # ticks processed; the tick of the newest frame
-    heard = time.monotonic_ns()
+    heard = max(time.monotonic_ns(), t0_ns)
 
     def leave(status: str, reason: str, state: int, code: int) -> None:
         timeline.end(status, reason, tick)  # type: ignore[arg-type]
@@ -47,7 +48,11 @@ def run_controller(
         if stopped():
             leave("interrupted", "stopped by the operator", STOPPED, 0)
             break
-        if frame is None:
+        newest = -1
+        if frame is not None:
+            with contextlib.suppress(FrameError):  # counted; in lockstep the plant will ask again
+                newest = reader.unpack(frame, bench.y)
+        if newest < 0:
             if now - heard >= patience_ns:
                 leave("safe", REASONS[LOST_PEER], SAFE, LOST_PEER)
             elif realtime and done:  # before tick 0 nothing can be stale
@@ -57,16 +62,12 @@ def run_controller(
                     leave("safe", REASONS[STALE], SAFE, STALE)
             continue
         heard = now
-        try:
-            newest = reader.unpack(frame, bench.y)
-        except FrameError:
-            continue  # counted; in lockstep the plant will ask again
         if reader.state == SAFE:
             leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
             break
         if reader.state == STOPPED:
             if reader.reason:
-                leave("interrupted", "the plant ended before the scenario did", STOPPED, 0)
+                leave("interrupted", PLANT_LEFT, STOPPED, 0)
             else:
                 leave("completed", "", STOPPED, 0)
             break
@@ -83,5 +84,7 @@ def run_controller(
         record_controller(signals[tick], c.ctl, c.est)
         timeline.look(tick)
         done += 1
-        progress[0] = done
+        progress[0] = tick + 1
+        if int(c.ctl["state"][0]) == SAFE:
+            leave("safe", safe_reason(c.ctl), SAFE, int(c.ctl["reason"][0]))
     return reader

@@ -16,7 +16,7 @@ from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_plant
-from gfm_hil.timeline import Timeline
+from gfm_hil.timeline import CONTROLLER_LEFT, Timeline
 from gfm_hil.waiting import await_message, part_from
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.controller import REASONS, SAFE, STOPPED
@@ -63,7 +63,7 @@ class _Plant:
             self.timeline.end("safe", REASONS[self.reader.reason], tick)
             return
         if self.reader.state == STOPPED:
-            self.timeline.end("interrupted", "the controller was stopped", tick)
+            self.timeline.end("interrupted", CONTROLLER_LEFT, tick)
             return
         plant_advance(b.par, b.st, b.u)
 

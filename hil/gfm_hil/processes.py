@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -97,7 +98,8 @@ class Processes:
         scenario = str(self.folder / "scenario.toml")
         # -P: a file of the operator's folder must not stand in for a module
         command = [sys.executable, "-P", "-m", "gfm_hil", side, scenario]
-        command += ["--endpoint", endpoint, "--out", str(self.folder), "--part", "--quiet"]
+        command += ["--endpoint", endpoint, "--out", str(self.folder), "--quiet"]
+        command += ["--part", str(os.getpid())]
         if side == "controller" and self.controller_command:
             command = [
                 argument.replace("{endpoint}", endpoint).replace("{scenario}", scenario)

@@ -13,6 +13,9 @@ PRIORITY = 50  # of SCHED_FIFO: above what a desktop runs, below the kernel's ow
 _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 
 
+_before: set[int] = set()  # processors that this process might use before it chose one
+
+
 def ask_for_real_time(side: Side) -> dict[str, Any]:
     """Ask for a processor, a real-time priority and memory that stays, for this thread.
 
@@ -39,6 +42,7 @@ def own_processor(side: Side) -> int | None:
     if not hasattr(os, "sched_setaffinity"):
         return None
     allowed = sorted(os.sched_getaffinity(0))
+    _before.update(allowed)
     mine = allowed[-1] if side == "controller" else allowed[0]
     os.sched_setaffinity(0, {mine})
     return mine
@@ -71,10 +75,11 @@ def _lock_memory() -> bool:
 
 
 def stand_back() -> None:
-    """Give the calling thread ordinary priority on any processor: it only watches."""
+    """Give the calling thread ordinary priority on what processors it had: it only watches."""
     try:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))
+        if _before:
+            os.sched_setaffinity(0, _before)
     except (AttributeError, OSError):
         return
 

@@ -8,6 +8,7 @@ written survives the process, however it ends. ``merge`` turns the parts into ``
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import shutil
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil import scratch
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
 
@@ -86,6 +89,11 @@ class Part:
         def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
             path = parts / f"{side}_{what}.npy"
             array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+            with path.open("r+b") as file:  # a page that is not to be had would end the process
+                try:
+                    os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+                except OSError as problem:
+                    raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
@@ -163,6 +171,12 @@ def remove_parts(folder: Path) -> None:
         scratch.let_go(_holds.pop(parts))
 
 
+def _recorded(part: Part) -> int:
+    """Ticks up to the last one that was recorded."""
+    rows = np.flatnonzero(~np.isnan(part.signals[:, 0]))
+    return int(rows[-1]) + 1 if len(rows) else 0
+
+
 def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
     """Write signals.npz and timing.npz from the parts, remove the parts, return the signals.
 
@@ -170,17 +184,16 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
     """
     signals: dict[str, NDArray[Any]] = {}
     timing: dict[str, NDArray[Any]] = {}
-    done = 0
+    parts = {side: part for side in SIDES if (part := Part.open(folder, side)) is not None}
+    counts = {side: _recorded(part) for side, part in parts.items()}
+    done = counts.get("plant") or counts.get("controller", 0)
     for side, columns, times in (
         ("plant", PLANT_COLUMNS, PLANT_TIMES),
         ("controller", CONTROLLER_COLUMNS, CONTROLLER_TIMES),
     ):
-        part = Part.open(folder, side)
-        if part is None:
+        if side not in parts:
             continue
-        recorded = np.flatnonzero(~np.isnan(part.signals[:, 0]))
-        count = int(recorded[-1]) + 1 if len(recorded) else 0
-        done = count if side == "plant" else (done or count)
+        part = parts[side]
         for j, name in enumerate(columns):
             signals[name] = np.array(part.signals[:done, j])
         if (part.times >= 0).any():

@@ -87,6 +87,8 @@ def finish(
         if "injected" in content:
             injected[content["side"]] = content["injected"]
         path.unlink()
+    for path in folder.glob("desk_*.json"):  # of a side that was killed
+        path.unlink()
     outcome = worst(log, outside)
     (folder / "events.jsonl").write_text("".join(json.dumps(e) + "\n" for e in log), "utf-8")
     for path in logs:

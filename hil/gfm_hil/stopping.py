@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import os
 import signal
 import sys
 from typing import Any
@@ -45,7 +46,12 @@ class Interrupt:
             signal.signal(number, before)
 
 
-def end_with_parent() -> None:
-    """Have Linux send us SIGTERM when the parent is gone, even if it was killed."""
+def end_with_parent(parent: int | None = None) -> None:
+    """Have Linux send us SIGTERM when the parent is gone, even if it was killed.
+
+    ``parent`` is its process id, to see whether it is gone already.
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
+        if parent not in (None, os.getppid()):
+            os.kill(os.getpid(), signal.SIGTERM)

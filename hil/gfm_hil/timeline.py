@@ -5,6 +5,7 @@ The log is one JSON object a line, written at once, so that it is there however 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -21,6 +22,10 @@ from gfm_runtime.controller import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
 Status = Literal["completed", "tripped", "safe", "interrupted"]
+
+PLANT_LEFT = "the plant ended before the scenario did"
+CONTROLLER_LEFT = "the controller was stopped"
+_HEARSAY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT)  # the other side knows why
 SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
 
 
@@ -40,6 +45,11 @@ class Ticket:
     done: threading.Event = field(default_factory=threading.Event)
     tick: int = -1
     error: str = ""
+    _owner: threading.Lock = field(default_factory=threading.Lock)
+
+    def claim(self) -> bool:
+        """True for the first who asks: the loop to carry it out, or who put it in to withdraw."""
+        return self._owner.acquire(blocking=False)
 
 
 class Timeline:
@@ -87,6 +97,8 @@ class Timeline:
             self._carry_out(self._todo.pop(0)[1], tick)
         while self._inbox:
             event, ticket = self._inbox.popleft()
+            if not ticket.claim():
+                continue
             try:
                 self._carry_out(event, tick, by="operator")
                 ticket.tick = tick
@@ -159,7 +171,9 @@ def read_log(*paths: Path) -> list[dict[str, Any]]:
     lines: list[dict[str, Any]] = []
     for path in paths:
         if path.is_file():
-            lines += [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+            for line in path.read_text("utf-8").splitlines():
+                with contextlib.suppress(ValueError):  # the last one of a side that was killed
+                    lines.append(json.loads(line))
     return sorted(lines, key=lambda line: line["tick"])
 
 
@@ -170,5 +184,4 @@ def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     found = [outside, *ends] if outside else ends
     if not found:
         return Outcome("safe", "both sides ended without a word", 0)
-    hearsay = REASONS[PLANT_TRIP]  # what the controller says; the plant knows of what
-    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason != hearsay))
+    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _HEARSAY))

@@ -89,7 +89,7 @@ def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
     [
         ({"type": "reference", "P_ref": 9.0}, r"P_ref = 9\.0: must lie in \[-2, 2\]"),
         ({"type": "law", "law": "droop-1"}, "not made ready"),
-        ({"type": "reference", "P_ref": 0.6, "t": 1.0}, "t: a command is carried out at once"),
+        ({"type": "reference", "P_ref": 0.6, "t": 1.0}, "t = 1.0: a command is carried out"),
         ({"type": "grid-impedance", "L_g": 1e-9, "R_g": 1.0}, "too fast"),
         ({"type": "grid-breaker", "closed": False}, "load"),
         ({"type": "nonsense"}, "must be one of"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import time
@@ -156,3 +157,24 @@ for end in ends:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "frames go by pyzmq" in done.stderr
+
+
+def test_a_plant_that_was_turned_away_reaches_the_controller_when_the_other_has_left(endpoint):
+    """As when a run starts anew while the plant of the one before is still in its patience."""
+    with contextlib.ExitStack() as stack:
+        controller, old = ZmqLink("controller", endpoint), ZmqLink("plant", endpoint)
+        stack.callback(controller.close)
+        old.send(b"old")
+        assert controller.wait(30)
+        assert controller.receive() == b"old"
+        new = ZmqLink("plant", endpoint)
+        stack.callback(new.close)
+        time.sleep(0.1)  # for it to be turned away
+        old.close()
+        until = time.monotonic() + 60
+        while controller.receive() != b"new":
+            assert time.monotonic() < until
+            new.again()
+            new.wait(0.2)
+            new.send(b"new")
+            controller.wait(0.2)

@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
         command.add_argument("--law", help="override law: catalogue name or law file")
         command.add_argument("--out", help="run folder; runs/<side>-<time> by default")
         command.add_argument("--quiet", action="store_true", help="say nothing but errors")
-        command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
+        command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
         command.set_defaults(call=call, side=side)
 
 
@@ -41,8 +41,8 @@ def call(options: argparse.Namespace) -> int:
     if scenario.link.type == INPROC:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     folder = new_folder(options.out, side)
-    if options.part:  # of `gfmhil run`, which puts the parts together
-        end_with_parent()
+    if options.part is not None:  # of `gfmhil run`, which puts the parts together
+        end_with_parent(options.part)
         run_side(side, scenario, folder, notice=lambda text: None)
         return 0
     check_free(folder, scenario.ticks)

@@ -27,7 +27,8 @@ from gfm_runtime.controller import RUNNING, SAFE, STOPPED, control, missed
 
 _Y_ID = 1
 _PHASE, _RATE = 1 / 16, 1 / 512  # of the phase lock, critically damped: 16 ticks
-_CLIP = 0.25  # of a tick: a stall must not throw the lock
+_CLIP = 0.25  # of a tick: what is later says nothing of the clock, what is earlier no more
+_CREEP = 1e-3  # of a tick
 
 
 @njit(cache=True, nogil=True)
@@ -74,7 +75,7 @@ def controller_ticks(
         times[k, 3] = now_ns()
         record_controller(rows[k], ctl, est)
         r.done += 1
-        progress[0] = r.done
+        progress[0] = k + 1
         if ctl[0].state != RUNNING or ctl[0].changes != changes:
             return LOOK
         if k + 1 >= event:
@@ -106,13 +107,12 @@ def _next_frame(
             gap = max(gap, now - before)
             before = now
             if size > 0:
-                r.heard = now
                 k = unpack(reader, _Y_ID, got, got_bytes, size, y)
                 if k >= ticks and reader[0].state != SAFE and reader[0].state != STOPPED:
                     reader[0].faults[OUT_OF_SEQUENCE] += 1
                 elif k >= 0:
+                    r.heard = now
                     break
-                continue
             if now - r.heard >= r.patience:
                 return SILENT
             if r.realtime and r.done > 0:  # before tick 0 nothing can be stale
@@ -125,7 +125,8 @@ def _next_frame(
         if told[RING] != r.bell:
             r.bell = told[RING]
             return BELL
-        between_looks(looks, spins, not r.realtime)
+        if size <= 0:
+            between_looks(looks, spins, not r.realtime)
     if reader[0].state == SAFE:
         return PEER_SAFE
     if reader[0].state == STOPPED:
@@ -147,6 +148,10 @@ def _lock(r, k, now):
     else:
         r.expected += (k - r.tick - 1) * r.period
     most = _CLIP * r.T
-    error = min(max(now - r.t0 - r.expected, -most), most)
+    error = now - r.t0 - r.expected
+    if error > most:  # late by a stall, not by the clock; a lock that is lost creeps back
+        r.expected += _CREEP * r.T + r.period
+        return
+    error = max(error, -most)
     r.period += _RATE * error
     r.expected += _PHASE * error + r.period

@@ -32,9 +32,9 @@ from gfm_hil.loops.records import (
     make_loop,
 )
 from gfm_hil.recording import Part
-from gfm_hil.timeline import Timeline
+from gfm_hil.timeline import CONTROLLER_LEFT, PLANT_LEFT, Timeline
 from gfm_hil.waiting import part_from
-from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED
+from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 from gfm_runtime.signals import Group
 
 _FAR = 2**62  # as of a timeline without events
@@ -99,7 +99,7 @@ def drive_plant(
         elif why == PEER_SAFE:
             timeline.end("safe", REASONS[loop.reader.reason], tick)
         elif why == PEER_STOPPED:
-            timeline.end("interrupted", "the controller was stopped", tick)
+            timeline.end("interrupted", CONTROLLER_LEFT, tick)
         elif why == SILENT:
             timeline.end("safe", "the controller's process is gone", tick)
         elif why == LATE:
@@ -117,7 +117,7 @@ def drive_controller(
     """Run the controller's side of a scenario after the handshake; returns its frame counters."""
     loop, ctl = _Loop("controller", bench, link, part, t0_ns, told), bench.controller.ctl
     why = EVENT
-    loop.loop["heard"] = time.monotonic_ns()
+    loop.loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running:
         event = timeline.next_tick()
         if loop.loop["pending"][0]:  # frames were lost on the way to the event
@@ -138,16 +138,15 @@ def drive_controller(
             loop.last_words(SAFE, PLANT_TRIP, bench.u)
         elif why == PEER_STOPPED:
             if loop.reader.reason:
-                timeline.end("interrupted", "the plant ended before the scenario did", tick)
+                timeline.end("interrupted", PLANT_LEFT, tick)
             else:
                 timeline.end("completed", "", tick)
             loop.last_words(STOPPED, 0, bench.u)
         elif why == SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
             loop.last_words(SAFE, LOST_PEER, bench.u)
-        elif why == LOOK and int(ctl["reason"][0]) == STALE:
-            timeline.end("safe", REASONS[STALE], tick)
-            loop.last_words(SAFE, STALE, bench.u)
+        elif why == LOOK and int(ctl["state"][0]) == SAFE:  # which the look has written down
+            loop.last_words(SAFE, int(ctl["reason"][0]), bench.u)
     return loop.reader
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 
@@ -58,7 +59,9 @@ def run_compiled(
             timeline.flush()
     finally:  # a second Ctrl-C: the thread must not outlive what it writes to
         told[STOP] = 1
-        thread.join()
+        while thread.is_alive():
+            with contextlib.suppress(KeyboardInterrupt):
+                thread.join()
         timeline.put_off = False
     if failed:
         raise failed[0]

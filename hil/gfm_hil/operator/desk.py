@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
-import tempfile
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,9 @@ from typing import Any
 import zmq
 from pydantic import TypeAdapter, ValidationError
 
+from gfm_hil import scratch
 from gfm_hil.bench import Bench
-from gfm_hil.errors import lines
+from gfm_hil.errors import UserError, lines
 from gfm_hil.events import CONTROLLER_EVENTS, Event, LawChange, apply_grid_event
 from gfm_hil.links.base import Side
 from gfm_hil.timeline import Timeline
@@ -58,12 +58,20 @@ class Desk:
         self._over = threading.Event()
 
     def __enter__(self) -> Desk:
-        self._place = Path(tempfile.mkdtemp(prefix="gfmhil-desk-"))
-        endpoint = f"ipc://{self._place}/{self._side}"
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.REP)
         self._socket.set(zmq.MAXMSGSIZE, _LARGEST)
-        self._socket.bind(endpoint)
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._context.destroy, linger=0)
+            place = stack.enter_context(scratch.temporary("gfmhil-desk-"))
+            endpoint = f"ipc://{place}/{self._side}"
+            try:
+                self._socket.bind(endpoint)
+            except zmq.ZMQError as problem:
+                raise UserError(
+                    f"TMPDIR = {place.parent}: no socket can be made there: {problem}"
+                ) from None
+            self._resources = stack.pop_all()
         self._thread = threading.Thread(target=self._serve, name=f"{self._side}-desk", daemon=True)
         self._thread.start()
         self._announcement.write_text(json.dumps({"endpoint": endpoint}), encoding="utf-8")
@@ -73,9 +81,7 @@ class Desk:
         self._announcement.unlink(missing_ok=True)
         self._over.set()
         self._thread.join()
-        self._socket.close(linger=0)
-        self._context.term()
-        shutil.rmtree(self._place, ignore_errors=True)
+        self._resources.close()
 
     def _serve(self) -> None:
         while not self._over.is_set():
@@ -99,7 +105,7 @@ class Desk:
             return self._carry_out(self._checked(content))
         except ValidationError as problem:
             return {"ok": False, "error": "; ".join(lines(problem))}
-        except (ValueError, UnicodeDecodeError) as problem:
+        except (ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
 
     def _checked(self, content: Any) -> Any:
@@ -123,8 +129,12 @@ class Desk:
     def _carry_out(self, event: Any) -> dict[str, Any]:
         ticket = self._timeline.insert(event)
         self._ring()
-        if not ticket.done.wait(_TAKEN_OVER_S):
-            return {"ok": False, "error": f"not taken over within {_TAKEN_OVER_S:g} s"}
+        until = time.monotonic() + _TAKEN_OVER_S
+        while not ticket.done.wait(_LOOK_MS * 1e-3):
+            over = self._over.is_set()
+            if (over or time.monotonic() >= until) and ticket.claim():
+                late = f"not taken over within {_TAKEN_OVER_S:g} s"
+                return {"ok": False, "error": "the run is over" if over else late}
         if ticket.error:
             return {"ok": False, "error": ticket.error}
         return {"ok": True, "tick": ticket.tick, "label": event.label()}

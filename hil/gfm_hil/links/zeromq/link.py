@@ -25,7 +25,7 @@ from gfm_hil.links.zeromq.options import ZmqOptions
 if TYPE_CHECKING:
     from gfm_hil.links.zeromq.curve import Curve
 
-_LAST_WORDS = 500  # ms
+_LAST_WORDS, _FAREWELL = 500, 50  # ms
 
 # What a stalled peer leaves unread is bounded, and more is dropped: at each end so many messages,
 _ROOM = 64
@@ -57,6 +57,7 @@ class ZmqLink:
     def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
         if side == "controller" and endpoint.startswith("ipc://"):
             _refuse_if_served(endpoint)
+        self._side, self._endpoint = side, endpoint
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PAIR)
         self._socket.set(zmq.SNDHWM, _ROOM)
@@ -103,6 +104,14 @@ class ZmqLink:
     def wait(self, seconds: float) -> bool:
         """Sleep until a message is there, at most ``seconds`` (rounded up to a millisecond)."""
         return bool(self._socket.poll(max(1, round(seconds * 1000)), zmq.POLLIN))
+
+    def again(self) -> None:
+        """Reach out anew: libzmq turns a second plant away once and for all, even if the first
+        one, of a run before, is about to leave."""
+        if self._side == "plant":
+            self._socket.disconnect(self._endpoint)
+            self._socket.poll(_FAREWELL)  # a PAIR takes no other peer while it parts from one
+            self._socket.connect(self._endpoint)
 
     def close(self) -> None:
         """Free the endpoint; the last words get a moment to leave."""
