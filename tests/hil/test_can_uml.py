@@ -32,6 +32,7 @@ def test_socketcan_inside_user_mode_linux(tmp_path):
     settings = {
         **{name: os.environ[name] for name in ("PATH", "PYTHONPATH") if name in os.environ},
         "HOME": str(tmp_path),
+        "TMPDIR": "/dev/shm",  # in the host's, what belongs to no process of the host is tidied up
         "NUMBA_CACHE_DIR": str(HERE.parents[1] / ".pytest_cache" / "uml"),
         "MPLBACKEND": "Agg",
         "OPENBLAS_NUM_THREADS": "1",
