@@ -8,6 +8,7 @@ before.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import time
 from collections import Counter
@@ -31,6 +32,7 @@ from gfm_hil.benchmark.spread import summary
 from gfm_hil.benchmark.turns import Spread, quickest, rounds
 from gfm_hil.errors import UserError
 from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.base import SIDES
 from gfm_hil.runner import Progress, run_scenario
 from gfm_hil.scenario import Scenario, check_scenario
 
@@ -50,7 +52,7 @@ Timing = dict[str, NDArray[np.int64]]
 @dataclass(frozen=True)
 class Plan:
     """What is asked for: links, loads of real time, its policy, s and rounds of both modes (fewer
-    if those of a mode would take longer than the budget)."""
+    if they would not end by ``until``)."""
 
     links: Sequence[str]
     loads: Sequence[Load]
@@ -58,7 +60,7 @@ class Plan:
     lockstep_s: float
     realtime_s: float
     rounds: int
-    budget_s: float
+    until: float = math.inf
 
 
 @dataclass
@@ -105,7 +107,7 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
-        for number in rounds(plan.rounds, plan.budget_s):
+        for number in rounds(plan.rounds, plan.until):
             plant_ns = quickest(alone.plant_part)
             for k, name in enumerate(list(rates)[:: -1 if number % 2 else 1]):
                 tell(f"lockstep, {name}", (number + k / len(rates)) / plan.rounds)
@@ -143,7 +145,7 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
         load_is = stack.enter_context(hogs())
         two = stack.enter_context(pair(plan.policy, place))
         two.both(pace_here, 0, 1, HYBRID, 1)
-        for number in rounds(plan.rounds, plan.budget_s):
+        for number in rounds(plan.rounds, plan.until):
             for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
                 share = (number + k / len(cells)) / plan.rounds
                 tell(f"real time, {cell.link}, {cell.load}", share)
@@ -244,6 +246,13 @@ def _run(
     with np.load(folder / "timing.npz") as file:
         timing = dict(file)
     log = [json.loads(line) for line in (folder / "events.jsonl").read_text("utf-8").splitlines()]
-    shutil.rmtree(folder)
+    said = [_last_line(folder / f"{side}.log") for side in SIDES]
     policies = [f"{e['side']}: {e['policy']}" for e in log if e["event"] == "scheduling"]
-    return timing, policies, " ".join(filter(None, (summary["status"], summary["reason"])))
+    shutil.rmtree(folder)
+    why = " / ".join(dict.fromkeys(filter(None, said))) or summary["reason"]
+    return timing, policies, " ".join(filter(None, (summary["status"], why)))
+
+
+def _last_line(log: Path) -> str:
+    """What a side that failed said last."""
+    return log.read_text("utf-8").strip().splitlines()[-1] if log.exists() else ""

@@ -6,6 +6,7 @@ can win back: it is the host's own share of the misses.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -66,7 +67,7 @@ def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
 @dataclass(frozen=True)
 class Plan:
     """What is asked for: ways to wait, loads, policies, period in ns, s of a round, rounds of each
-    (fewer if they would take longer than the budget)."""
+    (fewer if they would not end by ``until``)."""
 
     waits: Sequence[str]
     loads: Sequence[Load]
@@ -74,7 +75,7 @@ class Plan:
     period_ns: int
     seconds: float
     rounds: int
-    budget_s: float
+    until: float = math.inf
 
 
 def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, Any]]:
@@ -91,7 +92,7 @@ def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, An
         }
         for each in two.values():
             each.both(pace_here, 0, 1, HYBRID, 1)  # compiled before anything is timed
-        for number in rounds(plan.rounds, plan.budget_s):
+        for number in rounds(plan.rounds, plan.until):
             for n, (policy, load, wait) in enumerate(list(cells)[:: -1 if number % 2 else 1]):
                 tell(f"{policy}, {load}, {wait}", (number + n / len(cells)) / plan.rounds)
                 with load_is(load):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -39,7 +40,7 @@ class Plan:
         policy: how the two processes are scheduled.
         payload: bytes there; 84 stands for the bench's frames, 84 there and 68 back.
         seconds: of one round.
-        rounds: of each; fewer if they would take longer than ``budget_s``.
+        rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
     """
 
     links: Sequence[str]
@@ -49,7 +50,7 @@ class Plan:
     payload: int
     seconds: float
     rounds: int
-    budget_s: float
+    until: float = math.inf
 
 
 @dataclass
@@ -103,7 +104,7 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
                 cell.silent += not len(times)
 
         one_round(-1, _FIRST_S)  # to compile and to warm up
-        for number in rounds(plan.rounds, plan.budget_s):
+        for number in rounds(plan.rounds, plan.until):
             one_round(number, plan.seconds)
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
     results = [_result(c, by_key.get((c.contender.baseline, c.mode, c.load)), plan) for c in cells]

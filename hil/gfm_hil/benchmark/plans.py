@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -46,14 +47,19 @@ def steps_of(options: Namespace) -> list[Step]:
 
 
 def _everything(options: Namespace) -> list[Step]:
+    """Three minutes: each part ends by its time, with fewer rounds if need be."""
+    begin = time.monotonic()
+
     def with_(**numbers: Any) -> Namespace:
         return Namespace(**{**_ALL, **vars(options), **numbers})
 
+    few = ",".join(_FEW_LAWS)
     return [
-        _latency(with_(seconds=0.1, rounds=5, budget=40.0)),
-        _jitter(with_(seconds=0.1, rounds=5, budget=15.0)),
-        _kernel(with_(rounds=3)),
-        _loop(with_(seconds=1.5, rounds=2, budget=30.0, laws=",".join(_FEW_LAWS))),
+        _latency(with_(seconds=0.1, rounds=5, until=begin + 45.0)),
+        _jitter(with_(seconds=0.1, rounds=5, until=begin + 62.0)),
+        _kernel(with_(rounds=2)),
+        _loop(with_(mode="lockstep", seconds=1.5, rounds=2, until=begin + 95.0, laws=few)),
+        _loop(with_(mode="realtime", seconds=1.5, rounds=2, until=begin + 140.0)),
     ]
 
 
@@ -66,7 +72,7 @@ def _latency(options: Namespace) -> Step:
         payload=within("--payload", options.payload, 1, 504),
         seconds=within("--seconds", options.seconds, 0.01, 60),
         rounds=within("--rounds", options.rounds, 1, 1000),
-        budget_s=getattr(options, "budget", math.inf),
+        until=getattr(options, "until", math.inf),
     )
 
     def step(content: dict[str, Any], tell: Tell) -> None:
@@ -85,7 +91,7 @@ def _jitter(options: Namespace) -> Step:
         period_ns=_PERIOD_NS,
         seconds=within("--seconds", options.seconds, 0.01, 60),
         rounds=within("--rounds", options.rounds, 1, 1000),
-        budget_s=getattr(options, "budget", math.inf),
+        until=getattr(options, "until", math.inf),
     )
 
     def step(content: dict[str, Any], tell: Tell) -> None:
@@ -118,14 +124,14 @@ def _loop(options: Namespace) -> Step:
         lockstep_s=seconds,
         realtime_s=seconds,
         rounds=within("--rounds", options.rounds, 1, 1000),
-        budget_s=getattr(options, "budget", math.inf),
+        until=getattr(options, "until", math.inf),
     )
 
     def step(content: dict[str, Any], tell: Tell) -> None:
-        found: dict[str, Any] = {}
+        found: dict[str, Any] = content.setdefault("loop", {})
         tell("trying the links", 0.0)
         usable, remarks = closed_loop.usable(links)
-        content["remarks"] += remarks
+        content["remarks"] += [one for one in remarks if one not in content["remarks"]]
         plan = replace(asked, links=usable)
         if "lockstep" in modes:
             with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
@@ -136,7 +142,6 @@ def _loop(options: Namespace) -> Step:
         if "realtime" in modes:
             found["realtime"], remarks = closed_loop.measure_realtime(plan, tell)
             content["remarks"] += remarks
-        content["loop"] = found
 
     return step
 

@@ -66,14 +66,19 @@ def take_turns(jobs: Mapping[str, Callable[[], float]], turns: int) -> dict[str,
     return found
 
 
-def rounds(count: int, budget_s: float) -> Iterator[int]:
-    """Numbers of rounds: ``count`` of them, or as many as by their length so far fit the budget.
+def rounds(count: int, until: float) -> Iterator[int]:
+    """Numbers of rounds: ``count`` of them, or as many as by their length so far end in time.
 
     At least one. On a machine that is busy with other things rounds take several times longer.
+
+    Args:
+        count: wanted.
+        until: time of ``time.monotonic``, s.
     """
     begin = time.monotonic()
     for number in range(count):
-        if number and (time.monotonic() - begin) * (number + 1) / number > budget_s:
+        now = time.monotonic()
+        if number and now + (now - begin) / number > until:
             return
         yield number
 
