@@ -40,7 +40,7 @@ _LATE_EVALUATIONS, _LATE_STARTS = 20, 2  # times the ideal search's; at the bord
 _SLOWEST = 1e-3  # Hz; what turns more slowly is no oscillation
 _SAME_GAMMA = 1e-4  # relative; by so much a gain may change gamma that makes no difference
 _NEAR = 0.99  # of the decay asked for
-_SAME = 5e-3  # relative; by so much a channel that is pinned may suffer
+_SAME = 0.03  # relative; so much the others must not cost a channel that is pinned
 _SETTLES = 3
 _GONE = 1e-9  # |z| below this is an emptied delay line
 
@@ -220,9 +220,15 @@ def gamma(channels: Sequence[Channel]) -> float:
 
 
 def _at_its_limit(channels: Sequence[Channel], fixed: Sequence[Pair]) -> Pair | None:
-    """The largest channel that is not among ``fixed``, if its peak is at omega = 0 or infinity."""
-    worst = max((c for c in channels if (c.i, c.j) not in fixed), key=lambda c: c.norm)
-    return (worst.i, worst.j) if worst.omega in (0.0, np.inf) else None
+    """The largest channel but ``fixed`` whose peak is at omega = 0 or infinity, if it is as good
+    as the largest of all: a search brings others up to one that it cannot lower."""
+    left = [c for c in channels if (c.i, c.j) not in fixed]
+    worst = max(c.norm for c in left)
+    ends = [c for c in left if c.omega in (0.0, np.inf) and c.norm >= (1 - _SAME) * worst]
+    if not ends:
+        return None
+    largest = max(ends, key=lambda c: c.norm)
+    return largest.i, largest.j
 
 
 def _no_worse(
