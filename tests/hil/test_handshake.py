@@ -1,0 +1,152 @@
+"""The start of a run: what both sides agree on, and how each is refused."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil import handshake
+from gfm_hil.errors import PeerLost
+from gfm_hil.handshake import shake_hands
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.zeromq.link import ZmqLink
+from gfm_hil.scenario import Scenario
+from gfm_hil.summary import clock_drift
+
+from .test_links import PATIENT, in_threads
+
+
+def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
+    """Shake hands with a scenario each."""
+
+    def call(side: Side) -> Any:
+        link = ZmqLink(side, endpoint)
+        try:
+            return shake_hands(side, link, scenarios[side], lambda: False, lambda text: None)
+        finally:
+            link.close()
+
+    return in_threads(call)
+
+
+def test_both_sides_agree_on_the_start(make, endpoint):
+    scenario = make(link=PATIENT)
+    found = meet(dict.fromkeys(SIDES, scenario), endpoint)
+    assert found["controller"] == found["plant"]
+    assert found["plant"].t0_ns > 0 and found["plant"].one_clock
+
+
+def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):
+    """The plant's boot differs: tick 0 is told by when START came, and the drift is measured."""
+    boots = iter(["one", "another"])
+    monkeypatch.setattr("gfm_hil.handshake._boot", lambda: next(boots))
+    before = time.monotonic_ns()
+    found = meet(dict.fromkeys(SIDES, make(link=PATIENT)), endpoint)
+    assert not found["plant"].one_clock and not found["controller"].one_clock
+    assert before < found["controller"].t0_ns < time.monotonic_ns() + 20_000_000
+
+
+def test_the_drift_of_two_clocks_is_read_off_the_earliest_arrivals():
+    """A plant 37 ppm fast, frames 0 to 400 us on their way."""
+    k = np.arange(20_000)
+    way = np.random.default_rng(1).exponential(4e4, len(k)).astype(np.int64)
+    received = 5_000_000 + np.round(k * 1e5 / (1 + 37e-6)).astype(np.int64) + way
+    assert clock_drift({"controller_received": received}, 1e-4) == pytest.approx(37, abs=0.1)
+    assert clock_drift({"controller_received": received[:10]}, 1e-4) is None
+    assert clock_drift({}, 1e-4) is None
+
+
+@pytest.mark.parametrize(
+    ("other", "name"),
+    [
+        ({"seed": 3}, "scenario"),
+        ({"plant": {"grid": {"V_g": 0.99}}}, "scenario"),
+        ({"late_policy": {"hold": 3}}, "scenario"),
+        ({"law": "vsg-2"}, "law or law file"),
+        ({"events": [{"tick": 5, "type": "law", "law": "vsg-2"}]}, "law or law file"),
+        ({"T_s": 5e-5}, "sampling time T_s (5e-05, ours is 0.0001)"),
+    ],
+)
+def test_a_misfit_is_refused_on_both_sides_and_named(other, name, make, endpoint):
+    found = meet({"controller": make(link=PATIENT), "plant": make(link=PATIENT, **other)}, endpoint)
+    assert isinstance(found["controller"], PeerLost)
+    assert isinstance(found["plant"], PeerLost)
+    assert f"the plant runs another {name}" in str(found["controller"])
+    assert f"the controller runs another {name.partition(' (')[0]}" in str(found["plant"])
+
+
+@pytest.mark.parametrize(
+    ("what", "name"),
+    [("TABLE_VERSION", "version of the signal table"), ("table_hash", "signal table")],
+)
+def test_a_misfit_of_signal_tables_is_named(what, name, make, endpoint, monkeypatch):
+    given = iter("ab")
+    new = 77 if what == "TABLE_VERSION" else lambda: next(given)
+    link, scenario = ZmqLink("plant", endpoint), make(link=PATIENT)
+    monkeypatch.setattr(handshake, what, new)
+    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    monkeypatch.undo()
+    controller = ZmqLink("controller", endpoint)
+    try:
+        link.send(b"GFMHIL " + json.dumps(hello).encode())
+        with pytest.raises(PeerLost, match=f"the plant runs another {name} "):
+            shake_hands("controller", controller, scenario, lambda: False, print)
+        assert len(json.dumps({**hello, "boot": "x" * 36})) < 300
+    finally:
+        link.close()
+        controller.close()
+
+
+def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
+    """From the first HELLO on, silence means what it always does."""
+    link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
+    scenario = make(link={**PATIENT, "peer_timeout_s": 0.3})
+    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    try:
+        link.send(b"GFMHIL " + json.dumps(hello).encode())
+        with pytest.raises(PeerLost, match="the plant came but did not start"):
+            shake_hands("controller", controller, scenario, lambda: False, print)
+    finally:
+        link.close()
+        controller.close()
+
+
+@pytest.mark.parametrize(
+    "message", [b"GFMHIL {}", b"GFMHIL nonsense", b'GFMHIL {"kind": "start"}', b"GFMHIL []"]
+)
+def test_a_stranger_is_refused_in_words(message, make, endpoint):
+    link, stranger = ZmqLink("controller", endpoint), ZmqLink("plant", endpoint)
+    try:
+        stranger.send(message)
+        with pytest.raises(PeerLost, match="another language"):
+            shake_hands("controller", link, make(link=PATIENT), lambda: False, print)
+    finally:
+        stranger.close()
+        link.close()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_nobody_comes(side, make, endpoint):
+    said: list[str] = []
+    link = ZmqLink(side, endpoint)
+    scenario = make(link={**PATIENT, "start_timeout_s": 0.8, "endpoint": endpoint})
+    other = {"controller": "plant", "plant": "controller"}[side]
+    try:
+        with pytest.raises(PeerLost, match=f"the {other} did not come within 0.8 s"):
+            shake_hands(side, link, scenario, lambda: False, said.append)
+    finally:
+        link.close()
+    assert said == [f"waiting for the {other} at {endpoint} …"]
+
+
+def test_an_interrupt_ends_the_waiting(make, endpoint):
+    link = ZmqLink("plant", endpoint)
+    try:
+        with pytest.raises(PeerLost, match="interrupted while waiting for the controller"):
+            shake_hands("plant", link, make(link=PATIENT), lambda: True, print)
+    finally:
+        link.close()
