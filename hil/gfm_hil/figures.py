@@ -90,7 +90,7 @@ def draw_run(
     if "true_p" in signals:
         pictures.append(_draw_signals(folder, scenario, signals, summary, laws))
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
-        pictures.append(_draw_timing(folder, scenario, timing, summary))
+        pictures.append(draw_timing(folder, scenario, timing, summary))
     return pictures
 
 
@@ -130,9 +130,8 @@ def _draw_signals(
     return path
 
 
-def _draw_timing(
-    folder: Path, scenario: Scenario, timing: Signals, summary: dict[str, Any]
-) -> Path:
+def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict[str, Any]) -> Path:
+    """Draw into timing.png how long round trips took and when a fresh u was missing."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)

@@ -11,6 +11,8 @@ from gfm_hil.testing import checks
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps
 
+_NEAR = 0.02  # s, what a figure shows on each side of a moment
+
 
 class Experiment(Steps):
     """What the fixture ``bench`` gives a test: steps, results, and assertions.
@@ -86,11 +88,11 @@ class Experiment(Steps):
             raise UserError("assert_bump_below: the law was never changed; use switch() first")
         worst = max(changes, key=lambda e: np.inf if e["bump_pu"] is None else e["bump_pu"])
         if worst["bump_pu"] is None or worst["bump_pu"] > limit:
-            bump = "unknown" if worst["bump_pu"] is None else f"{worst['bump_pu']:.3g} p.u."
+            bump = "one unknown" if worst["bump_pu"] is None else f"{worst['bump_pu']:.3g} p.u"
             self._fail(
                 f"The change to {worst['label']} at t = {worst['t']:g} s should move no input by "
                 f"more than {limit:g} p.u., but its bump was {bump}.",
-                "u_E_u", "bump",
+                "u_E_u", "bump", around=(worst["t"] - _NEAR, worst["t"] + _NEAR),
             )  # fmt: skip
 
     def assert_no_miss(self, at_most: int = 0) -> None:
@@ -100,12 +102,12 @@ class Experiment(Steps):
         missed = self.summary["misses"]
         self.assert_no_trip()
         if missed > at_most:
-            trip = self.summary["round_trip_us"] or {}
-            slow = ", ".join(f"{name} {us:g} µs" for name, us in trip.items())
+            times = self.summary["round_trip_us"] or {}
+            slow = ", ".join(f"{name} {us:g} µs" for name, us in times.items())
             self._fail(
                 f"At most {at_most} of {self.summary['ticks']} ticks should go without a fresh u, "
                 f"but {missed} did; round trips: {slow}; faults: {self.summary['faults']}.",
-                "p", "miss",
+                "u", "miss",
             )  # fmt: skip
 
     def assert_no_trip(self) -> None:
@@ -113,10 +115,11 @@ class Experiment(Steps):
         __tracebackhide__ = True
         s = self.summary
         if s["status"] != "completed":
+            end = s["duration_s"]
             self._fail(
-                f"The run should last {self._ran * s['T_s']:g} s, but it ended at "
-                f"{s['duration_s']:.4f} s: {s['status']}: {s['reason']}.",
-                "p", "trip",
+                f"The run should last {self._ran * s['T_s']:g} s, but it ended at {end:.4f} s: "
+                f"{s['status']}: {s['reason']}.",
+                "i", "trip", around=(end - _NEAR, end),
             )  # fmt: skip
 
     def _window(self, signal: str, since: float | None) -> checks.Window:
@@ -142,28 +145,31 @@ class Experiment(Steps):
             self._fail(finding.text, signal, what, finding)
 
     def _fail(
-        self, text: str, signal: str, what: str, finding: checks.Finding | None = None
+        self,
+        text: str,
+        signal: str,
+        what: str,
+        finding: checks.Finding | None = None,
+        around: tuple[float, float] | None = None,
     ) -> None:
         """Draw why, and say where."""
         __tracebackhide__ = True
-        from gfm_hil.testing.picture import draw  # half a second, which only failures need
-
-        run, scenario = self.result, self._plan.scenario(self._ran)
-        steps = [
-            (e.at(scenario.T_s) * scenario.T_s, e.label()) for e in self._plan.events(self._ran)
-        ]
-        lines = [text]
+        run, T_s = self.result, self.setting.scenario.T_s
+        steps = [(e.at(T_s) * T_s, e.label()) for e in self._plan.events(self._ran)]
+        done = "; ".join(f"{label} at {t:g} s" for t, label in steps) or "none"
+        link, mode = run.summary["link"], run.summary["mode"]
+        lines = [text, f"run: {' → '.join(run.summary['laws'])} over {link}, {mode}; steps: {done}"]
         if len(run.signals["tick"]):
+            # half a second of imports, which only failures need
+            from gfm_hil.testing.picture import draw, draw_times
+
             figure = run.folder / f"{what}_{signal}.png"
-            draw(figure, text, signal, self.signals, steps, finding)
+            if what == "miss":
+                draw_times(figure, run, self.setting.scenario)
+            else:
+                draw(figure, text, signal, self.signals, steps, finding, around)
             self._notice(figure)
             lines.append(f"figure: {figure}")
-        laws = " → ".join(run.summary["laws"])
-        lines.insert(
-            1,
-            f"run: {laws} over {run.summary['link']}, {run.summary['mode']}; steps: "
-            + ("; ".join(f"{label} at {t:g} s" for t, label in steps) or "none"),
-        )
         if not self.setting.controller_command:
             lines.append(f"again: gfmhil run {run.folder / 'scenario.toml'}")
         raise AssertionError("\n".join(lines))

@@ -13,7 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_hil.figures import COLOURS, draw_panel
+from gfm_hil.figures import COLOURS, draw_panel, draw_timing
+from gfm_hil.run_folder import Run
+from gfm_hil.scenario import Scenario
 from gfm_hil.testing.checks import Finding
 from gfm_hil.testing.signals import unit
 
@@ -29,6 +31,7 @@ def draw(
     signals: Mapping[str, NDArray[Any]],
     steps: Sequence[tuple[float, str]],
     finding: Finding | None,
+    around: tuple[float, float] | None = None,
 ) -> None:
     """Draw one failure.
 
@@ -38,14 +41,17 @@ def draw(
         signal, signals: the one it is about, and all of them.
         steps: time in s and a few words each.
         finding: its band and worst point, if it is about a curve.
+        around: of which times [s] the large panel is, all by default.
     """
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     FigureCanvasAgg(figure)
     rows = figure.subplot_mosaic(
-        [["main", "main"], ["a", "b"], ["c", "d"]], height_ratios=[2.2, 1, 1], sharex=True
+        [["main", "main"], ["a", "b"], ["c", "d"]], height_ratios=[2.2, 1, 1]
     )
     main = rows["main"]
-    _curve(main, signal, signals)
+    first, last = around or (signals["t"][0], signals["t"][-1])
+    shown = (signals["t"] >= first) & (signals["t"] <= last)
+    _curve(main, signal, {name: column[shown] for name, column in signals.items()})
     if finding is not None:
         _band(main, finding, signals[signal])
         worst = int(np.searchsorted(signals["t"], finding.at - 1e-9))
@@ -53,23 +59,31 @@ def draw(
             finding.at, signals[signal][worst], "o", ms=8, mfc="none", mec=_RED, mew=1.8,
             label="worst" if np.isfinite([*finding.low, *finding.high]).any() else "largest swing",
         )  # fmt: skip
-    for k, (t, label) in enumerate(steps):
+    seen = [(t, label) for t, label in steps if first <= t <= last]
+    for k, (t, label) in enumerate(seen):
+        right = t > first + 0.8 * (last - first)
         main.annotate(
-            label, (t, 1.0), (3, 4 + 10 * (k % 3)), xycoords=("data", "axes fraction"),
-            textcoords="offset points", fontsize=8, color="#444444",
+            label, (t, 1.0), (-3 if right else 3, 4 + 10 * (k % 3)),
+            xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
+            color="#444444", ha="right" if right else "left",
         )  # fmt: skip
-    main.tick_params(labelbottom=True)
     main.legend(fontsize=8, frameon=False, loc="best")
     beside = [name for name in _CONTEXT if name != signal]
     for place, name in zip("abcd", beside, strict=False):
         _curve(rows[place], name, signals)
     for axes in rows.values():
-        for t, _ in steps:
+        for t, _ in seen if axes is main else steps:
             axes.axvline(t, color="#888888", lw=0.8, ls=(0, (4, 3)), zorder=0)
     for place in "cd":
         rows[place].set_xlabel("t [s]", fontsize=9)
-    figure.suptitle("\n".join(textwrap.wrap(text, 110)), fontsize=9.5, x=0.01, ha="left")
+    figure.suptitle("\n".join(textwrap.wrap(text, 125)), fontsize=9.5, x=0.01, ha="left")
     figure.savefig(path, dpi=110)
+
+
+def draw_times(path: Path, run: Run, scenario: Scenario) -> None:
+    """Draw when a run in real time was late, as its report would."""
+    with np.load(run.folder / "timing.npz") as timing:
+        draw_timing(run.folder, scenario, dict(timing), run.summary).rename(path)
 
 
 def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:
