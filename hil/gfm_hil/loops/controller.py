@@ -26,9 +26,9 @@ from gfm_hil.recording import record_controller
 from gfm_runtime.controller import RUNNING, SAFE, STOPPED, control, missed
 
 _Y_ID = 1
-_PHASE, _RATE = 1 / 16, 1 / 512  # of the phase lock, critically damped: 16 ticks
-_CLIP = 0.25  # of a tick: what is later says nothing of the clock, what is earlier no more
-_CREEP = 1e-3  # of a tick
+_LOOKED_NS = 20_000
+_LEAK = 2e-4  # of a tick, in each: how much slower than ours the plant's clock may run
+_EARLIER = 0.05  # of a tick
 
 
 @njit(cache=True, nogil=True)
@@ -92,12 +92,15 @@ def _next_frame(
         r.bell = told[RING]
         return BELL
     gap = 0
+    slept = False
     before = now_ns()
     if r.realtime and r.done > 0 and told[STOP] == 0:
-        wake = min(r.t0 + int(r.expected) - AHEAD_NS, before + r.T)
+        wake = min(r.t0 + (r.tick + 1) * r.T + int(r.phase) - AHEAD_NS, before + r.T)
         if wake > before:
             sleep_until(wake)
+            slept = True
             before = wake  # what it sleeps beyond that is a gap like any other
+    awake = now_ns()
     looks = 0
     while True:
         size = receive(handle, got_bytes)
@@ -132,7 +135,7 @@ def _next_frame(
     if reader[0].state == STOPPED:
         return PEER_STOPPED
     if r.realtime:
-        _lock(r, k, now)
+        _lock(r, k, now, now - awake > _LOOKED_NS, slept)
     if k > r.tick:
         times[k, 0] = r.t0 + k * r.T
         times[k, 1], times[k, 4] = now, gap
@@ -141,17 +144,16 @@ def _next_frame(
 
 
 @njit(cache=True, nogil=True)
-def _lock(r, k, now):
-    """Learn from the arrival of frame k when the next one will come."""
-    if r.done == 0:
-        r.expected = float(now - r.t0)
-    else:
-        r.expected += (k - r.tick - 1) * r.period
-    most = _CLIP * r.T
-    error = now - r.t0 - r.expected
-    if error > most:  # late by a stall, not by the clock; a lock that is lost creeps back
-        r.expected += _CREEP * r.T + r.period
-        return
-    error = max(error, -most)
-    r.period += _RATE * error
-    r.expected += _PHASE * error + r.period
+def _lock(r, k, now, seen, slept):
+    """Learn from frame k when the next one will come.
+
+    ``phase`` follows the earliest arrivals against k T: what is late was held up, and says nothing
+    of the other side's clock. Only a frame that was awaited for some looks is ``seen`` to come:
+    others may have been there, in a link's own thread that has to run first. One that was there
+    after a sleep says that the sleep was too long.
+    """
+    away = float(now - r.t0 - k * r.T)
+    if seen:
+        r.phase = min(r.phase + _LEAK * r.T, away)
+    elif slept:
+        r.phase -= _EARLIER * r.T

@@ -28,7 +28,7 @@ from gfm_runtime.signals import NU
 
 _U_ID = 2
 FRESH, OVERDUE, LEAVING = range(3)
-_REST_NS = 8_000
+_UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 
 @njit(cache=True, nogil=True)
@@ -60,9 +60,8 @@ def plant_ticks(
         k = r.tick
         due = r.t0 + k * r.T
         gap = 0
-        rested = True
         if r.realtime:
-            rested = due - now_ns() > AHEAD_NS
+            r.unrested = 0 if due - now_ns() > AHEAD_NS else r.unrested + 1
             gap = wait_until(due, spins)
             times[k, 0], times[k, 1] = due, now_ns()
         plant_sample(par, st, y)
@@ -70,8 +69,9 @@ def plant_ticks(
         send(handle, message)
         sent = now_ns()
         times[k, 2] = sent
-        if not rested:  # or the kernel would have the whole loop rest, for 50 ms
+        if r.unrested > _UNRESTED:  # or the kernel would have the whole loop rest, for 50 ms
             sleep_until(sent + _REST_NS)
+            r.unrested = 0
         until = due + r.T if r.realtime else sent + r.patience
         again = sent + (r.patience if r.realtime else r.repeat)
         while True:

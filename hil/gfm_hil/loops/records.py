@@ -25,6 +25,7 @@ loop_dtype = np.dtype(
         ("extrapolate", "i8"),  # plant: misses in a row over which u goes on along its trend
         ("repeat", "i8"),  # lockstep: silence after which the plant sends y again, ns
         ("repeats", "i8"),  # how often it did
+        ("unrested", "i8"),  # plant: ticks in a row without a sleep
         ("late", "i8"),  # misses in a row
         ("misses", "i8"),
         ("heard", "i8"),  # when the last message came, ns
@@ -33,8 +34,7 @@ loop_dtype = np.dtype(
         ("bell", "i8"),  # as last heard
         ("u_last", "f8", (NU,)),  # the two newest u that came in time
         ("u_before", "f8", (NU,)),
-        ("expected", "f8"),  # arrival of the next frame by the phase lock, ns after t0
-        ("period", "f8"),  # of the other side's ticks by our clock, ns
+        ("phase", "f8"),  # controller: earliest arrivals of frames after t0 + k T, ns
     ],
     align=True,
 )
@@ -50,6 +50,6 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
     loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
-    loop["T"] = loop["period"] = round(scenario.T_s * 1e9)
+    loop["T"] = round(scenario.T_s * 1e9)
     loop["patience"], loop["repeat"] = int(link.peer_timeout_s * 1e9), int(link.repeat_s * 1e9)
     return loop
