@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,8 @@ from gfm_hil.run_folder import Run
 from gfm_hil.runner import run_scenario
 from gfm_hil.scenario import Scenario, check_scenario
 from gfm_runtime import get_law
+
+from .uml import Kernel
 
 Make = Callable[..., Scenario]
 RunIt = Callable[..., Run]
@@ -74,3 +77,30 @@ def start(tmp_path: Path) -> Iterator[Start]:
         if process.poll() is None:
             process.kill()
         process.communicate()
+
+
+_KERNEL: pytest.StashKey[Kernel] = pytest.StashKey()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What waits for a kernel that runs beside the other tests comes after them."""
+    items.sort(key=lambda item: item.get_closest_marker("uml") is not None)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Boot that kernel, if a test wants it."""
+    wanted = any(item.get_closest_marker("uml") for item in session.items)
+    if wanted and "GFMHIL_UML" in os.environ and not session.config.option.collectonly:
+        session.config.stash[_KERNEL] = Kernel()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Leave nothing behind, however the session ended."""
+    if _KERNEL in config.stash:
+        config.stash[_KERNEL].clear()
+
+
+@pytest.fixture
+def uml_kernel(request: pytest.FixtureRequest) -> Kernel:
+    """The kernel that was booted before the first test."""
+    return request.config.stash[_KERNEL]
