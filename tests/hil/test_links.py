@@ -25,10 +25,7 @@ from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
 from gfm_hil.timeline import Timeline, read_log, worst
 from gfm_hil.waiting import send_last
-from gfm_runtime import law_names
 from gfm_runtime.controller import RUNNING, SAFE
-
-from .conftest import home_plant
 
 PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
 RIG = {
@@ -93,70 +90,6 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
     assert set(one) == set(other)
     for name in one:
         assert one[name].tobytes() == other[name].tobytes(), name
-
-
-@pytest.mark.parametrize("law", law_names())
-def test_lockstep_over_zeromq_is_bit_for_bit_in_process(law, make, run, tmp_path, endpoint):
-    content = {
-        "law": law,
-        "duration": 0.03,
-        "seed": 7,
-        "link": PATIENT,
-        "plant": {**RIG, **home_plant(law)},
-        "events": [
-            {"tick": 50, "type": "reference", "P_ref": 0.55},
-            {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},
-        ],
-    }
-    apart = both_sides(make(**content), tmp_path, endpoint)
-    together = run(**content)
-    assert np.ptp(apart["true_p"]) > 0
-    assert_same(apart, together.signals)
-
-
-def test_a_change_of_law_and_every_grid_event_likewise(make, run, tmp_path, endpoint):
-    content = {
-        "law": "mimo-gfm",
-        "duration": 0.08,
-        "link": PATIENT,
-        "plant": {"factors": {"L_g": 10.0, "R_g": 10.0}, "grid": {"load_R": 36.1, "load_L": 1e-3}},
-        "events": [
-            {"tick": 50, "type": "law", "law": "vsg-2"},
-            {"tick": 60, "type": "reference", "P_ref": 0.6, "ramp_s": 0.01},
-            {"tick": 200, "type": "grid-voltage", "V_g": 0.98, "duration": 0.005},
-            {"tick": 300, "type": "grid-phase-jump", "degrees": 0.5},
-            {"tick": 400, "type": "grid-impedance", "L_g": 9.0, "R_g": 9.0},
-            {"tick": 500, "type": "grid-breaker", "closed": False},
-            {"tick": 600, "type": "grid-breaker", "closed": True},
-            {"tick": 700, "type": "law", "law": "droop-1"},
-        ],
-    }
-    apart = both_sides(make(**content), tmp_path, endpoint)
-    together = run(**content)
-    assert len(np.unique(apart["law"])) == 3
-    assert_same(apart, together.signals)
-
-
-@pytest.mark.parametrize(
-    ("plant", "status"),
-    [
-        ({"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}}, "tripped"),
-        ({"protection": {"over_current": {"enabled": False}}}, "safe"),
-    ],
-)
-def test_a_run_that_ends_early_ends_alike(plant, status, make, run, tmp_path, endpoint):
-    content = {
-        "duration": 1.0,
-        "link": PATIENT,
-        "plant": plant,
-        "events": [{"tick": 30, "type": "grid-phase-jump", "degrees": 120.0}],
-    }
-    apart = both_sides(make(**content), tmp_path, endpoint)
-    together = run(**content)
-    outcome = worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None)
-    assert together.summary["status"] == outcome.status == status
-    assert together.summary["reason"] == outcome.reason
-    assert_same(apart, together.signals)
 
 
 class Tampering:

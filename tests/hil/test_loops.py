@@ -35,7 +35,7 @@ from gfm_runtime.signals import names
 from .conftest import home_plant
 from .pairs import PATIENT, run_pair
 from .test_frames import resealed
-from .test_links import assert_same
+from .test_links import RIG, assert_same
 
 PORTS = ("shm", "zmq")
 
@@ -72,12 +72,7 @@ def test_every_law_in_lockstep(law, link, make, run, place):
         "duration": 0.03,
         "seed": 7,
         "link": PATIENT,
-        "plant": {
-            "delay": {"samples": 1, "fraction": 0.3},
-            "adc": "DS2004",
-            "sensors": {"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-4, "V": 1e-4}},
-            **home_plant(law),
-        },
+        "plant": {**RIG, **home_plant(law)},
         "events": [
             {"tick": 50, "type": "reference", "P_ref": 0.55},
             {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},

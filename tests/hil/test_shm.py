@@ -24,10 +24,6 @@ from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.shm import ring, segment
 from gfm_hil.links.shm.link import ShmLink
-from gfm_runtime import law_names
-
-from .conftest import home_plant
-from .test_links import PATIENT, RIG, assert_same, both_sides
 
 Pair = tuple[ShmLink, ShmLink]
 
@@ -52,25 +48,6 @@ def pair(endpoint: str) -> Iterator[Pair]:
     yield controller, plant
     plant.close()
     controller.close()
-
-
-@pytest.mark.parametrize("law", law_names()[::6])
-def test_lockstep_over_shared_memory_is_bit_for_bit_in_process(law, make, run, tmp_path, endpoint):
-    content = {
-        "law": law,
-        "duration": 0.03,
-        "seed": 7,
-        "link": PATIENT,
-        "plant": {**RIG, **home_plant(law)},
-        "events": [
-            {"tick": 50, "type": "reference", "P_ref": 0.55},
-            {"tick": 150, "type": "grid-frequency", "f_hz": 49.99},
-        ],
-    }
-    apart = both_sides(make(**content), tmp_path, endpoint, name="shm")
-    together = run(**content)
-    assert np.ptp(apart["true_p"]) > 0
-    assert_same(apart, together.signals)
 
 
 @pytest.mark.parametrize("back", [False, True])
