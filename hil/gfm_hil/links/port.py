@@ -31,8 +31,9 @@ class Port:
         spins: looks in vain before a waiting loop begins to yield its processor: many where
             the peer itself delivers, 0 where a thread of the link needs the processor for it.
         patient: as ``receive``, but may sleep for up to a millisecond until there is something:
-            for loops without deadlines, which on a crowded machine need not yield in vain.
-            None: ``receive`` has to do.
+            for loops without deadlines, once they have looked in vain for a while. On a crowded
+            machine a thread that yields for ever keeps the very peer from running that it waits
+            for. None: the loop takes naps.
     """
 
     handle: NDArray[np.int64]

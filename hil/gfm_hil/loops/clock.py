@@ -96,7 +96,8 @@ def end_this_process(typingctx):
     return types.int32(), make
 
 
-_YIELDS, _NAP_NS = 5_000, 100_000  # looks, about a ms; ns
+#: looks in vain, a fraction of a millisecond, after which a loop without deadlines may sleep
+LOOKS = 500
 
 
 @njit(cache=True, nogil=True)
@@ -121,16 +122,10 @@ def wait_until(deadline_ns, spins):
 
 
 @njit(cache=True, nogil=True)
-def between_looks(looks, spins, patient):
-    """What a waiting loop does after its ``looks``-th look in vain.
-
-    At first it spins, where the peer itself delivers (``spins`` looks), then it yields, and if it
-    is ``patient``, in simulated time, it sleeps in the end: on a crowded machine a thread that
-    yields for ever keeps the very peer from running that it waits for.
-    """
+def between_looks(looks, spins):
+    """What a waiting loop does after its ``looks``-th look in vain: at first it spins, where the
+    peer itself delivers (``spins`` looks), then it yields."""
     if looks <= spins:
         pause()
-    elif patient and looks > _YIELDS:
-        sleep_until(now_ns() + _NAP_NS)
     else:
         give_way()

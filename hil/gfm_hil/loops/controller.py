@@ -10,7 +10,7 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.codec import OUT_OF_SEQUENCE, pack, unpack
-from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until
+from gfm_hil.loops.clock import AHEAD_NS, LOOKS, between_looks, now_ns, sleep_until
 from gfm_hil.loops.records import (
     BELL,
     EVENT,
@@ -33,7 +33,7 @@ _EARLIER = 0.05  # of a tick
 
 @njit(cache=True, nogil=True)
 def controller_ticks(
-    send, receive, handle, spins, out, into, reader, loop, told, ctl, laws, states, est, y, u,
+    send, receive, patient, handle, spins, out, into, reader, loop, told, ctl, laws, states, est, y, u,
     rows, times, progress, event,
 ):  # fmt: skip
     """Answer frames; returns why it came back, one of ``gfm_hil.loops.records``.
@@ -42,7 +42,7 @@ def controller_ticks(
     before; if frames were lost on the way there, with that tick's y in hand (``pending``).
 
     Args:
-        send, receive, handle, spins, out, into, reader, loop, told: as for ``plant_ticks``.
+        send, receive, patient, handle, spins, out, into, reader, loop, told: as for ``plant_ticks``.
         ctl, laws, states, est: the controller's records.
         y, u: vectors of ``gfm_hil.bench.Bench``.
         rows, times, progress: of the recording's part.
@@ -53,7 +53,7 @@ def controller_ticks(
         if not r.pending:
             before = r.tick
             why = _next_frame(
-                receive, handle, spins, into, reader, r, told, ctl, y, times, len(rows)
+                receive, patient, handle, spins, into, reader, r, told, ctl, y, times, len(rows)
             )
             if why >= 0:
                 return why
@@ -84,7 +84,7 @@ def controller_ticks(
 
 @njit(cache=True, nogil=True)
 def _next_frame(
-    receive, handle, spins, into, reader, r, told, ctl, y, times, ticks
+    receive, patient, handle, spins, into, reader, r, told, ctl, y, times, ticks
 ):  # fmt: skip
     """Wait for a good frame of the plant: -1, its tick in ``r``; or why to come back."""
     got, got_bytes = into
@@ -105,7 +105,9 @@ def _next_frame(
     while True:
         size = receive(handle, got_bytes)
         looks += 1
-        if size > 0 or looks % r.clock_every == 0:
+        if size <= 0 and looks > LOOKS and not r.realtime:
+            size = patient(handle, got_bytes)
+        if size > 0 or looks % r.clock_every == 0 or looks > LOOKS:
             now = now_ns()
             gap = max(gap, now - before)
             before = now
@@ -129,7 +131,7 @@ def _next_frame(
             r.bell = told[RING]
             return BELL
         if size <= 0:
-            between_looks(looks, spins, not r.realtime)
+            between_looks(looks, spins)
     if reader[0].state == SAFE:
         return PEER_SAFE
     if reader[0].state == STOPPED:

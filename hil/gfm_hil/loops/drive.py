@@ -16,6 +16,7 @@ from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameReader, FrameWriter
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.base import Side
+from gfm_hil.loops.clock import now_ns, sleep_until
 from gfm_hil.loops.controller import controller_ticks
 from gfm_hil.loops.plant import plant_ticks
 from gfm_hil.loops.records import (
@@ -38,6 +39,7 @@ from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 from gfm_runtime.signals import Group
 
 _FAR = 2**62  # as of a timeline without events
+_NAP_NS = 100_000
 
 
 class _Loop:
@@ -55,14 +57,10 @@ class _Loop:
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         w, r, c = self.writer, self.reader, bench.controller
         records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
-        receive, spins = port.receive, port.spins
-        if scenario.mode == "lockstep" and port.patient is not None:
-            receive, spins = port.patient, _FAR  # it sleeps by itself, so that a look takes long
-            self.loop["clock_every"] = 1
         self._arguments: tuple[Any, ...] = (
-            port.send, receive, port.handle, spins, (w.sequence, w.frame, w.message),
-            (r.frame, r.message), r.record, self.loop, told, *records, bench.y, bench.u,
-            part.signals, part.times, part.progress,
+            port.send, port.receive, port.patient or _rest, port.handle, port.spins,
+            (w.sequence, w.frame, w.message), (r.frame, r.message), r.record, self.loop, told,
+            *records, bench.y, bench.u, part.signals, part.times, part.progress,
         )  # fmt: skip
         self._call = plant_ticks if plant else controller_ticks
 
@@ -154,6 +152,13 @@ def compile_loops(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
     loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(TOLD, np.int64))
     loop.go(_FAR if side == "controller" else 0)
+
+
+@port_function
+def _rest(handle, message):
+    """What a loop without deadlines does where the link cannot sleep until a message comes."""
+    sleep_until(now_ns() + _NAP_NS)
+    return 0
 
 
 @port_function

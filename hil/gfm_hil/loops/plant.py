@@ -8,7 +8,7 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.codec import pack, unpack
-from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until, wait_until
+from gfm_hil.loops.clock import AHEAD_NS, LOOKS, between_looks, now_ns, sleep_until, wait_until
 from gfm_hil.loops.records import (
     BELL,
     DONE,
@@ -33,13 +33,13 @@ _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 @njit(cache=True, nogil=True)
 def plant_ticks(
-    send, receive, handle, spins, out, into, reader, loop, told, par, st, y, u, rows, times,
+    send, receive, patient, handle, spins, out, into, reader, loop, told, par, st, y, u, rows, times,
     progress, last,
 ):  # fmt: skip
     """Run ticks until ``last``; returns why it came back, one of ``gfm_hil.loops.records``.
 
     Args:
-        send, receive, handle, spins: of the link's ``Port``.
+        send, receive, patient, handle, spins: of the link's ``Port``.
         out: sequence, record and bytes of the frame to send; ``into``: record and bytes to
             receive into; see ``gfm_hil.codec``.
         reader: counters of what was received.
@@ -76,7 +76,7 @@ def plant_ticks(
         again = sent + (r.patience if r.realtime else r.repeat)
         while True:
             came, gap = _answer(
-                receive, handle, spins, got, got_bytes, reader, r, told, u, times, k,
+                receive, patient, handle, spins, got, got_bytes, reader, r, told, u, times, k,
                 min(until, again), gap,
             )  # fmt: skip
             if came != OVERDUE or again >= until:
@@ -117,7 +117,7 @@ def plant_ticks(
 
 @njit(cache=True, nogil=True)
 def _answer(
-    receive, handle, spins, got, got_bytes, reader, r, told, u, times, k, until, gap
+    receive, patient, handle, spins, got, got_bytes, reader, r, told, u, times, k, until, gap
 ):  # fmt: skip
     """Wait for u[k]: whether it is FRESH, OVERDUE or not awaited any more (LEAVING), and the
     longest gap between two looks at the clock."""
@@ -125,6 +125,8 @@ def _answer(
     looks = 0
     while True:
         size = receive(handle, got_bytes)
+        if size <= 0 and looks > LOOKS and not r.realtime:
+            size = patient(handle, got_bytes)
         if size > 0:
             tick = unpack(reader, _U_ID, got, got_bytes, size, u)
             # a controller that leaves says so under the last tick it saw
@@ -134,7 +136,7 @@ def _answer(
                     times[k, 3] = now
                 return FRESH if tick == k else LEAVING, max(gap, now - before)
         looks += 1
-        if looks % r.clock_every == 0:
+        if looks % r.clock_every == 0 or looks > LOOKS:
             now = now_ns()
             gap = max(gap, now - before)
             before = now
@@ -143,4 +145,4 @@ def _answer(
         if size <= 0:
             if not r.realtime and told[STOP] != 0:
                 return LEAVING, gap
-            between_looks(looks, spins, not r.realtime)
+            between_looks(looks, spins)

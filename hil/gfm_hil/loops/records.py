@@ -16,7 +16,7 @@ STOP, RING, TOLD = range(3)
 loop_dtype = np.dtype(
     [
         ("realtime", "i8"),
-        ("clock_every", "i8"),  # looks in vain between two looks at the clock, which takes 25 ns
+        ("clock_every", "i8"),  # at first, looks in vain between two looks at the clock, 25 ns
         ("tick", "i8"),  # plant: the next one; controller: the last one received, -1 before
         ("t0", "i8"),  # of tick 0, ns
         ("T", "i8"),  # sampling time, ns
