@@ -22,6 +22,8 @@ from gfm_runtime import LawError
 MODULES = {
     "run": "run",
     "tell": "tell",
+    "modbus": "modbus",
+    "export": "export",
     "compare": "compare",
     "campaign": "campaign",
     "bench": "bench",

@@ -1,0 +1,40 @@
+"""gfmhil export: a finished run as a file that other tools open."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.errors import UserError
+from gfm_hil.export import FORMATS, export_run
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "export",
+        help="a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",
+        description="; ".join(f"{name}: {form.text}" for name, form in FORMATS.items()),
+    )
+    command.add_argument("folder", type=Path, help="the run folder")
+    command.add_argument(
+        "--format", choices=list(FORMATS), help="by the ending of FILE if not given"
+    )
+    command.add_argument("-o", "--out", type=Path, metavar="FILE", help="the run's name by default")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Write the file; returns the exit code."""
+    name, file = options.format, options.out
+    if name is None:
+        name = file.suffix.removeprefix(".") if file is not None else ""
+        if name not in FORMATS:
+            said = "is not given" if file is None else f"is not told by {file.name}"
+            raise UserError(f"--format {said}: must be one of {', '.join(FORMATS)}")
+    if file is None:
+        file = Path(f"{options.folder.resolve().name}.{name}")
+    for path in export_run(options.folder, name, file):
+        print(path)
+    return 0

@@ -1,0 +1,139 @@
+"""CAN frames of a run as BLF, what Vector's tools log, rebuilt from the recording.
+
+The CAN link's own codec makes the frames again from what each side recorded: measurements from y,
+commands from the u that the plant took, states from the controller's. A run over CAN exchanged
+these frames bit by bit, a run over another link would have. Rebuilt are the frames that were used:
+not the handshake, not what was said again or arrived damaged, not a command that came too late,
+not the words that end a run. All that is on a bus is for a logger on that bus, e.g.
+``python -m can.logger``.
+"""
+
+from __future__ import annotations
+
+import heapq
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.errors import UserError
+from gfm_hil.export.table import RunTable
+from gfm_hil.frames import FrameWriter
+from gfm_hil.links.can.dbc import write_dbc
+from gfm_hil.links.can.options import CanOptions
+from gfm_hil.links.can.plan import load_plan
+from gfm_hil.links.can.vectors import CanFrame, VectorSender
+from gfm_runtime.controller import INIT, REASONS, SAFE
+from gfm_runtime.signals import Group, names
+
+#: a CAN frame and when it was sent, s from tick 0
+Timed = tuple[float, CanFrame]
+
+
+def write_blf(table: RunTable, file: Path) -> None:
+    """Write a run; times are of each sender's clock since tick 0, in lockstep those of the run."""
+    options = can_options(table)
+    with can.BLFWriter(file) as writer:
+        for t, (number, payload) in can_frames(table, options):
+            writer.on_message_received(
+                can.Message(
+                    timestamp=t, arbitration_id=number, data=payload, is_extended_id=False,
+                    is_fd=options.fd, bitrate_switch=options.fd,
+                )
+            )  # fmt: skip
+
+
+def dbc_text(table: RunTable) -> str:
+    """The DBC by which the frames are to be read."""
+    options = can_options(table)
+    if options.dbc is None:
+        return write_dbc(options.fd)
+    return Path(options.dbc).read_text(encoding="utf-8")
+
+
+def can_options(table: RunTable) -> CanOptions:
+    """The run's own if it went over CAN, else the link's defaults."""
+    link = tomllib.loads(table.text("scenario.toml")).get("link", {})
+    return CanOptions(**link.get("options", {})) if link.get("type") == "can" else CanOptions()
+
+
+def can_frames(table: RunTable, options: CanOptions) -> Iterator[Timed]:
+    """The frames of both sides in the order of their times.
+
+    Raises:
+        UserError: a side did not record, or the DBC is not to be had.
+    """
+    if not {"y_p", "state"} <= set(table.values):
+        raise UserError(f"{table.folder}: holds the recording of one side; frames need both")
+    try:
+        plan = load_plan(options)
+    except ValueError as problem:
+        raise UserError(f"link.options.{problem}") from None
+    sides = _measurements(table, options, plan), _commands(table, options, plan)
+    return heapq.merge(*sides, key=lambda timed: timed[0])
+
+
+def _measurements(table: RunTable, options: CanOptions, plan: Any) -> Iterator[Timed]:
+    """The plant's: one vector a tick, or every n-th."""
+    writer, sender = FrameWriter("y"), VectorSender(plan, "y", options.heartbeat)
+    rows, times = _vector(table, "y"), _times(table, "plant")
+    for k, row in enumerate(rows):
+        message = writer.pack(k, INIT, 0, row)
+        if k % options.every == 0 and not np.isnan(row[0]):
+            yield from ((times[k], frame) for frame in sender.frames(message))
+
+
+def _commands(table: RunTable, options: CanOptions, plan: Any) -> Iterator[Timed]:
+    """The controller's: an answer to every vector that it got.
+
+    With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
+    """
+    writer, sender = FrameWriter("u"), VectorSender(plan, "u", options.heartbeat)
+    rows, times, n = _vector(table, "u"), _times(table, "controller"), options.every
+    taken = _taken(table)
+    state = table.values["state"]
+    why = _safe_reason(table)
+    for k in np.flatnonzero(~np.isnan(state)).tolist():
+        at = k + n if n > 1 and k else k
+        known = at < len(rows) and bool(taken[at])
+        now = int(state[k])
+        values = rows[at] if known else np.zeros(rows.shape[1])
+        message = writer.pack(k, now, why if now == SAFE else 0, values)
+        if k % n == 0:
+            frames = sender.frames(message)
+            if known:
+                yield from ((times[k], frame) for frame in frames)
+
+
+def _vector(table: RunTable, group: Group) -> NDArray[np.float64]:
+    """Rows of a vector, shape (ticks, n), p.u."""
+    return np.column_stack([table.values[f"{group}_{name}"] for name in names(group)])
+
+
+def _taken(table: RunTable) -> NDArray[np.bool_]:
+    """Ticks at which the plant took a command in time; in process it always does."""
+    received = table.values.get("plant_received")
+    return np.ones(len(table.values["tick"]), bool) if received is None else received >= 0
+
+
+def _times(table: RunTable, side: str) -> NDArray[np.float64]:
+    """When a side sent its frame of each tick, s from tick 0."""
+    if table.summary["mode"] == "lockstep":
+        return table.values["t"]
+    sent, due = table.values[f"{side}_sent"], table.values[f"{side}_scheduled"]
+    known = np.flatnonzero(due >= 0)[0]
+    begin = due[known] - round(known * table.summary["T_s"] * 1e9)
+    return (sent - begin) * 1e-9
+
+
+def _safe_reason(table: RunTable) -> int:
+    """Code of the reason for which the controller went into SAFE; the log has it in words."""
+    for line in table.events:
+        for code, text in enumerate(REASONS):
+            if text and str(line.get("reason", "")).startswith(text):
+                return code
+    return 0

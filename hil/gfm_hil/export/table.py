@@ -1,0 +1,72 @@
+"""A finished run as one table: every tick a row, every column described."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.errors import UserError
+from gfm_hil.export.columns import Column, describe
+from gfm_hil.timeline import read_log
+
+
+@dataclass(frozen=True)
+class RunTable:
+    """What a run folder holds, for writers of files.
+
+    Attributes:
+        folder: of the run.
+        columns: described, in the order of ``values``.
+        values: by name, each shape (ticks,): float64 in the unit of its column, or int64.
+        laws: labels of the laws, which the column ``law`` refers to.
+        events: lines of events.jsonl.
+        summary: content of summary.json.
+    """
+
+    folder: Path
+    columns: list[Column]
+    values: dict[str, NDArray[Any]]
+    laws: list[str]
+    events: list[dict[str, Any]]
+    summary: dict[str, Any]
+
+    def text(self, name: str) -> str:
+        """A text file of the run folder."""
+        return (self.folder / name).read_text(encoding="utf-8")
+
+
+def load_run(folder: Path) -> RunTable:
+    """The table of a finished run.
+
+    Raises:
+        UserError: it is no run folder, or the run is not over.
+    """
+    try:
+        with np.load(folder / "signals.npz") as file:
+            laws = [str(name) for name in file["laws"]]
+            values = {name: file[name] for name in file.files if name != "laws"}
+        with np.load(folder / "timing.npz") as file:
+            values |= {name: file[name] for name in file.files}
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except FileNotFoundError as problem:
+        going = (folder / "scenario.toml").is_file()
+        what = "the run is not over, see gfmhil stream" if going else "is not a run folder"
+        raise UserError(f"{folder}: {what} ({Path(problem.filename).name} is missing)") from None
+    except (OSError, ValueError) as problem:
+        raise UserError(f"{folder}: {problem}") from None
+    columns = [describe(name, laws) for name in values]
+    log = read_log(folder / "events.jsonl")
+    return RunTable(folder, columns, values, laws, log, summary)
+
+
+def event_text(event: dict[str, Any]) -> str:
+    """What a line of the log says beyond its kind, in a few words."""
+    if "label" in event:
+        return str(event["label"])
+    rest = {k: v for k, v in event.items() if k not in ("tick", "t", "event")}
+    return ", ".join(f"{key} {value}" for key, value in rest.items())
