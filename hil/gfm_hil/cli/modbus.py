@@ -1,0 +1,72 @@
+"""gfmhil modbus: a SunSpec device on Modbus/TCP beside a run that is going on."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.errors import UserError
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "modbus",
+        help="serve a run that is going on as a SunSpec device on Modbus/TCP",
+        description="Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end.",
+    )
+    command.add_argument("folder", nargs="?", type=Path, metavar="RUN", help="the run folder")
+    command.add_argument(
+        "--host", default="127.0.0.1",
+        help="address to listen on; any that others can reach needs --tls (%(default)s)",
+    )  # fmt: skip
+    command.add_argument("--port", type=int, default=5020, help="0: a free one (%(default)s)")
+    command.add_argument(
+        "--tls", nargs=3, type=Path, metavar=("CERT", "KEY", "CLIENT-CA"),
+        help="TLS with a certificate of ours, and one of every client, signed by CLIENT-CA",
+    )  # fmt: skip
+    command.add_argument(
+        "--anyone-may-command", action="store_true",
+        help="listen without TLS where whoever reaches the port can command the bench",
+    )  # fmt: skip
+    command.add_argument(
+        "--heartbeat", type=int, default=5000, metavar="MS",
+        help="how long ControllerHb may stand still, 0: for ever (%(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--control", choices=["local", "remote"],
+        help="say whether clients may command, to the server of this run, and end",
+    )  # fmt: skip
+    command.add_argument(
+        "--vendor-model", action="store_true", help="print the vendor model's file, and end"
+    )
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry it out; returns the exit code."""
+    from gfm_hil.modbus.image import vendor_model
+    from gfm_hil.modbus.serve import LOCAL, Address, serve
+
+    if options.vendor_model:
+        print(vendor_model(), end="")
+        return 0
+    if options.folder is None:
+        raise UserError("RUN: missing; the run folder")
+    if options.control is not None:
+        if not options.folder.is_dir():
+            raise UserError(f"{options.folder}: no such folder")
+        flag = options.folder / LOCAL
+        flag.touch() if options.control == "local" else flag.unlink(missing_ok=True)
+        return 0
+    if options.heartbeat < 0:
+        raise UserError(f"--heartbeat {options.heartbeat}: must be >= 0 ms")
+    tls = None if options.tls is None else tuple(options.tls)
+    address = Address(options.host, options.port, tls, options.anyone_may_command)
+    serve(
+        options.folder, address, options.heartbeat,
+        notice=lambda text: print(text, file=sys.stderr, flush=True),
+    )  # fmt: skip
+    return 0

@@ -1,0 +1,191 @@
+"""Models 705 and 711: the voltage reference and the droops, as SunSpec's stored curves.
+
+Curve (or control) 1 shows what is in force and cannot be written; 2 is for the client to fill.
+``Adpt…Req`` = 2 checks what is there and takes it over, at once if the function is enabled, else
+when it is. Disabling goes back to what was in force before.
+
+A curve that has not been written is as the one in force.
+
+- 705: two points (V_a, Var_a), (V_b, Var_b) in % of V_n and S_n on the line of the law's droop,
+  with V relative to ``VRef`` and Var to the reactive set-point:
+  V - 100 % = -D_q Var, so that D_q = (V_a - V_b)/(Var_b - Var_a). ``ActPt`` = 0: V_ref alone.
+- 711: ``KOf`` = ``KUf`` = D_p, no dead band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gfm_hil.events import check_reference
+from gfm_hil.modbus.image import Value
+from gfm_hil.modbus.plan import Plan
+from gfm_hil.modbus.view import View
+
+COMPLETED, FAILED = 1, 2
+_SPAN = 100.0  # %, of Var on either side, with which the droop in force is shown
+_RESOLUTION = 0.015  # %, to which the points must lie on a line through the reference
+_MINE = 2  # the curve that a client may write
+
+#: what a curve stands for: "V_ref" [p.u.], "D_p", "D_q"
+Meaning = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Adopted:
+    """State of a function with stored curves."""
+
+    enabled: bool = False
+    request: int = 1
+    result: int = COMPLETED
+    meaning: Meaning | None = None  # adopted, and not yet forgotten by disabling
+    before: Meaning | None = None  # what was in force when it was enabled, and of which law
+    law: str = ""
+
+
+class Curves:
+    """What both models share.
+
+    Args:
+        model, curve: ``705, "Crv"`` or ``711, "Ctl"``.
+        stored: paths within the curve of the points that a client may write.
+        read: what stored values mean; ValueError if nothing that can be.
+        write: the stored values of what is in force.
+        events: commands that bring a meaning into force.
+        in_force: the meaning of what is.
+    """
+
+    def __init__(
+        self,
+        model: int,
+        curve: str,
+        stored: Sequence[str],
+        read: Callable[[Mapping[str, Value]], Meaning],
+        write: Callable[[Meaning], dict[str, Value]],
+        events: Callable[[Meaning, View], tuple[dict[str, Any], ...]],
+        in_force: Callable[[View], Meaning],
+    ) -> None:
+        self._head, self._adopt = str(model), f"{model}.Adpt{curve}"
+        self._curve = f"{model}.{curve}"
+        self._stored: dict[str, Value] = {}
+        self._read, self._write, self._events, self._in_force = read, write, events, in_force
+        own = tuple(f"{self._curve}{_MINE}.{name}" for name in stored)
+        self.writable = (f"{self._head}.Ena", f"{self._adopt}Req", *own)
+        self.state = Adopted()
+
+    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+        """See ``Function``."""
+        prefix = f"{self._curve}{_MINE}."
+        stored = {p.removeprefix(prefix): v for p, v in written.items() if p.startswith(prefix)}
+        stored = {**self._stored, **stored}
+        whole = {**self._write(self._in_force(view)), **stored}
+        new = old = self.state
+        events: tuple[dict[str, Any], ...] = ()
+
+        def fail() -> None:
+            if f"{self._adopt}Req" in written:
+                self.state = replace(old, result=FAILED)
+
+        adopts = f"{self._adopt}Req" in written
+        if adopts:
+            if written[f"{self._adopt}Req"] != _MINE:
+                raise ValueError(f"{self._adopt}Req: must be {_MINE}, the one that can be written")
+            try:
+                meaning = self._read(whole)
+                self._events(meaning, view)
+            except ValueError:
+                fail()
+                raise
+            new = replace(new, request=_MINE, result=COMPLETED, meaning=meaning)
+        if f"{self._head}.Ena" in written:
+            new = replace(new, enabled=bool(written[f"{self._head}.Ena"]))
+        if new.enabled and not old.enabled:
+            new = replace(new, before=self._in_force(view), law=view.law)
+        if new.enabled and new.meaning and (adopts or not old.enabled):
+            events = self._events(new.meaning, view)
+        elif old.enabled and not new.enabled:
+            events = self._events(self._back(old, view), view) if old.meaning else ()
+            new = replace(new, meaning=None, before=None)
+
+        def keep() -> None:
+            self.state, self._stored = new, stored
+
+        return Plan(events, keep, fail)
+
+    def forget(self) -> None:
+        """After a reset: the run is back at its start, with nothing commanded."""
+        self.state, self._stored = Adopted(), {}
+
+    def show(self, view: View, now: int) -> dict[str, Value]:
+        """See ``Function``."""
+        s, there = self.state, self._write(self._in_force(view))
+        return {
+            f"{self._head}.Ena": float(s.enabled),
+            f"{self._adopt}Req": float(s.request),
+            f"{self._adopt}Rslt": float(s.result),
+            **{f"{self._curve}1.{n}": v for n, v in there.items()},
+            **{f"{self._curve}{_MINE}.{n}": v for n, v in {**there, **self._stored}.items()},
+        }
+
+    def _back(self, s: Adopted, view: View) -> Meaning:
+        """What was in force before; another law that came meanwhile keeps its own droops."""
+        before = s.before or {}
+        if view.law == s.law:
+            return before
+        return {name: value for name, value in before.items() if name == "V_ref"}
+
+
+def read_volt_var(stored: Mapping[str, Value]) -> Meaning:
+    """V_ref and D_q of a curve of model 705."""
+    v_ref = _number(stored, "VRef") / 100.0
+    check_reference("V_ref", v_ref)
+    count = _number(stored, "ActPt")
+    if count == 0:
+        return {"V_ref": v_ref}
+    if count != 2:
+        raise ValueError(f"705: ActPt = {count:g}: must be 2, or 0 for VRef alone")
+    (v_a, var_a), (v_b, var_b) = (
+        (_number(stored, f"Pt{k}.V") - 100.0, _number(stored, f"Pt{k}.Var")) for k in (1, 2)
+    )
+    if var_a <= var_b or v_a >= v_b:
+        raise ValueError("705: V must rise and Var must fall from point 1 to point 2")
+    D_q = (v_b - v_a) / (var_a - var_b)
+    if abs(v_a + D_q * var_a) > _RESOLUTION:
+        raise ValueError("705: the line must pass through V = 100 %, Var = 0")
+    return {"V_ref": v_ref, "D_q": D_q}
+
+
+def write_volt_var(meaning: Meaning) -> dict[str, Value]:
+    """The curve of model 705 that a law's V_ref and D_q are."""
+    D_q = meaning.get("D_q")
+    points: dict[str, Value] = {}
+    for k, var in ((1, _SPAN), (2, -_SPAN)):
+        points[f"Pt{k}.V"] = None if D_q is None else 100.0 - D_q * var
+        points[f"Pt{k}.Var"] = None if D_q is None else var
+    active = 0.0 if D_q is None else 2.0
+    return {"ActPt": active, "VRef": 100.0 * meaning["V_ref"], **points}
+
+
+def read_droop(stored: Mapping[str, Value]) -> Meaning:
+    """D_p of a control of model 711."""
+    over, under = _number(stored, "KOf"), _number(stored, "KUf")
+    if over != under:
+        raise ValueError(f"711: KOf = {over:g}, KUf = {under:g}: must be equal")
+    for name in ("DbOf", "DbUf", "RspTms"):
+        if _number(stored, name) != 0:
+            raise ValueError(f"711: {name} = {_number(stored, name):g}: must be 0")
+    return {"D_p": over}
+
+
+def write_droop(meaning: Meaning) -> dict[str, Value]:
+    """The control of model 711 that a law's D_p is."""
+    D_p = meaning.get("D_p")
+    return {"DbOf": 0.0, "DbUf": 0.0, "KOf": D_p, "KUf": D_p, "RspTms": 0.0}
+
+
+def _number(stored: Mapping[str, Value], name: str) -> float:
+    value = stored[name]
+    if not isinstance(value, (int, float)):
+        raise ValueError(f"{name}: not given")
+    return float(value)

@@ -1,0 +1,242 @@
+"""The device: one register image, what writes to it come to, and a clock for what expires.
+
+A request is carried out as a whole or not at all: every value is checked, then the commands that it
+comes to are given to the run, which checks them again, and only then is anything remembered. One
+request at a time; reading goes on meanwhile.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from pymodbus.constants import ExcCodes
+
+from gfm_hil.errors import UserError
+from gfm_hil.modbus.curves import (
+    Curves,
+    read_droop,
+    read_volt_var,
+    write_droop,
+    write_volt_var,
+)
+from gfm_hil.modbus.gains import Gains
+from gfm_hil.modbus.image import VENDOR, Image, Point, Value
+from gfm_hil.modbus.measures import Measures
+from gfm_hil.modbus.operation import Direct, Heartbeat, Operation
+from gfm_hil.modbus.plan import Function, Plan, Refused
+from gfm_hil.modbus.setpoints import TICK_S, SetPoint
+from gfm_hil.modbus.view import Slack, View
+from gfm_hil.scenario import Scenario
+from gfm_plant import load_converter
+
+#: carries a command out, or raises UserError
+Tell = Callable[[dict[str, Any]], object]
+
+_READ, _WRITE_ONE, _WRITE_MANY = 3, 6, 16
+_SECOND = round(1 / TICK_S)
+
+
+class Device:
+    """A SunSpec device for one run.
+
+    Args:
+        scenario: of the run.
+        laws: names of those that are ready.
+        look: the newest tick.
+        tell: has the run do something; called in a thread of its own.
+        heartbeat_ms: how long a client's heartbeat may stand still, 0: for ever.
+        elapsed_s: time since the device was started, s; the first tick of its clock is at 0.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        laws: Sequence[str],
+        look: Callable[[], View | None],
+        tell: Tell,
+        heartbeat_ms: int,
+        elapsed_s: Callable[[], float],
+    ) -> None:
+        self._look, self._tell, self._elapsed_s = look, tell, elapsed_s
+        self._gains = Gains(laws)
+        self._measures = Measures(scenario)
+        rating = load_converter(scenario.plant.converter).bases.S_n
+        self._set_points = (
+            SetPoint("WSet", "P_ref", rating, absolute=1, percent=(0,)),
+            SetPoint("VarSet", "Q_ref", rating, absolute=4, percent=(0, 1, 3)),
+        )
+        self._heart = Heartbeat(heartbeat_ms)
+        self._functions: tuple[Function, ...] = (
+            *self._set_points,
+            Curves(705, "Crv", tuple(write_volt_var({"V_ref": 1.0})),
+                   read_volt_var, write_volt_var, self._events, self._volt_var),
+            Curves(711, "Ctl", tuple(write_droop({})), read_droop, write_droop, self._events, self._droop),
+            self._heart,
+            Operation(),
+            Direct(laws, self._gains),
+        )  # fmt: skip
+        self._owner = {path: f for f in self._functions for path in f.writable}
+        self.image = Image(self._measures.models(laws))
+        for path, value in self._measures.plate(laws).items():
+            self.image.set(path, value)
+        self._lock = asyncio.Lock()
+        self._view: View | None = None
+        self._was_safe = False
+        self._beats, self._seen = 0, -1
+        self._fresh = -1  # tick of the clock that the registers are of
+        self.slack = Slack()
+        self.local = False
+        self.refresh()
+
+    def writable(self, point: Point) -> bool:
+        """Whether clients may write a point."""
+        return point.path in self._owner
+
+    def refresh(self) -> None:
+        """Bring every register up to the newest tick."""
+        view = self._look()
+        self._fresh = now = self._now()
+        if view is None:
+            return
+        if self._was_safe and not view.safe:  # somebody has reset the run
+            self._forget()
+        self._view, self._was_safe = view, view.safe
+        values = self._measures.now(view, self.slack, self._beats, self._heart.missing, self.local)
+        for function in self._functions:
+            values.update(function.show(view, now))
+        for path, value in values.items():
+            self.image.set(path, value)
+
+    def take(self, local: bool) -> None:
+        """Who commands: the bench, which then has clients refused, or they again.
+
+        What clients had commanded stays as it is, and is no more taken back.
+        """
+        if local and not self.local:
+            self._forget()
+        self.local = local
+
+    def _now(self) -> int:
+        """The tick of the device's clock that comes next: from it a time is never too short."""
+        return int(self._elapsed_s() / TICK_S) + 1
+
+    async def clock(self, tick: int) -> None:
+        """Carry out what has expired by a tick of the device's clock."""
+        if tick % _SECOND == 0:
+            self._count_beat()
+        expired = [s for s in self._set_points if s.expire(tick)]
+        if self._heart.expire(tick):
+            expired = [s for s in self._set_points if s.settings.enabled]
+        view = self._view
+        for set_point in expired:
+            if view is not None:
+                async with self._lock:
+                    try:
+                        await self._carry_out([set_point.revert(view, tick)], view)
+                    except UserError as problem:  # at the next tick it is tried again
+                        self.image.set(f"{VENDOR}.Refd", str(problem))
+        if expired:
+            self.refresh()
+
+    async def access(
+        self, code: int, address: int, written: Sequence[Any] | None
+    ) -> ExcCodes | None:
+        """A request as pymodbus hands it on; None if it is to be answered from the image.
+
+        Raises nothing: what is refused changes nothing, and its reason is in the vendor model.
+        """
+        if code not in (_READ, _WRITE_ONE, _WRITE_MANY):
+            return ExcCodes.ILLEGAL_FUNCTION
+        if written is None:
+            if self._now() != self._fresh:
+                self.refresh()
+            return None
+        try:
+            await self._write(address, [int(r) for r in written])
+        except Refused as problem:
+            self.image.set(f"{VENDOR}.Refd", str(problem))
+            return problem.code
+        return None
+
+    async def _write(self, address: int, registers: list[int]) -> None:
+        cut = self.image.cut(address, registers)
+        if cut is None:
+            raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{address}: cuts a point in two, or is none")
+        for point, _ in cut:
+            if not self.writable(point):
+                raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{point.path}: is not for writing")
+        if self.local and any(point.path != "715.ControllerHb" for point, _ in cut):
+            raise Refused(ExcCodes.ILLEGAL_FUNCTION, "local control: the bench is commanded there")
+        async with self._lock:
+            view = self._look()
+            if view is None:
+                raise Refused(ExcCodes.DEVICE_FAILURE, "the run has not begun")
+            plans = self._plans(cut, view)
+            try:
+                await self._carry_out(plans, view)
+            except UserError as problem:
+                raise Refused(ExcCodes.DEVICE_FAILURE, str(problem)) from None
+        self.refresh()
+
+    def _plans(self, cut: Sequence[tuple[Point, Sequence[int]]], view: View) -> list[Plan]:
+        by_function: dict[int, tuple[Function, dict[str, Value]]] = {}
+        try:
+            for point, part in cut:
+                value = point.decode(part)
+                if value is None:
+                    raise ValueError(f"{point.path}: no value")
+                point.check(value)
+                function = self._owner[point.path]
+                by_function.setdefault(id(function), (function, {}))[1][point.path] = value
+            return [f.plan(values, view, self._now()) for f, values in by_function.values()]
+        except ValueError as problem:
+            raise Refused(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
+
+    async def _carry_out(self, plans: Sequence[Plan], view: View) -> None:
+        """Give the run every command; then remember.
+
+        Raises:
+            UserError: the run refused one.
+        """
+        try:
+            for plan in plans:
+                for event in plan.events:
+                    await asyncio.to_thread(self._tell, event)
+                    if event["type"] == "reset":
+                        self._forget()
+        except UserError:
+            for plan in plans:
+                plan.fail()
+            raise
+        for plan in plans:
+            plan.keep()
+
+    def _forget(self) -> None:
+        for function in self._functions:
+            function.forget()
+
+    def _count_beat(self) -> None:
+        """DERHb goes on with the run: a device whose run stands still is as good as dead."""
+        view = self._look()
+        if view is not None and view.tick != self._seen:
+            self._beats, self._seen = self._beats + 1, view.tick
+
+    def _volt_var(self, view: View) -> dict[str, float]:
+        D_q = self._gains.droops(view.law, view.gains).D_q
+        return {"V_ref": view.references["V_ref"], **({} if D_q is None else {"D_q": D_q})}
+
+    def _droop(self, view: View) -> dict[str, float]:
+        D_p = self._gains.droops(view.law, view.gains).D_p
+        return {} if D_p is None else {"D_p": D_p}
+
+    def _events(self, meaning: dict[str, float], view: View) -> tuple[dict[str, Any], ...]:
+        """Gains first: they are what may be refused."""
+        events: list[dict[str, Any]] = []
+        droops = {name: value for name, value in meaning.items() if name in ("D_p", "D_q")}
+        if droops:
+            events.append(self._gains.event(view.law, view.gains, droops))
+        if "V_ref" in meaning:
+            events.append({"type": "reference", "V_ref": meaning["V_ref"]})
+        return tuple(events)

@@ -1,0 +1,54 @@
+"""The droops of a law: the gains that SunSpec's models 711 and 705 speak of.
+
+In the steady state of a law that has them (p.u.; Table III)
+
+    omega_u - omega_g = D_p (P_ref - p),        V - V_ref = D_q (Q_ref - q).
+
+A law has D_p if its file names it and phi_22(0) is that number; it has D_q if its file names it and
+phi_34(0)/phi_35(0), or its limit, is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gfm_design.gains import tied
+from gfm_runtime.law import Law
+from gfm_runtime.lawfile import LawFile, build_law
+
+_NEARLY_DC = 1e-7j  # rad/s; integrators have no value at 0
+_RTOL = 1e-3  # printed gains are rounded
+
+
+@dataclass(frozen=True)
+class Droops:
+    """D_p and D_q of a law in p.u.; None where it has none."""
+
+    D_p: float | None
+    D_q: float | None
+
+
+def droops(file: LawFile, changed: Mapping[str, float] | None = None) -> Droops:
+    """The droops of a law, with some of its parameters changed if wanted; what is tied follows.
+
+    Raises:
+        LawError: such a law cannot be.
+    """
+    law = build_law(file, tied(file, dict(changed or {})))
+    numbers = {name: p.value for name, p in law.parameters.items()}
+    return Droops(
+        _own(numbers.get("D_p"), law.element("phi", (1, 1))(_NEARLY_DC)),
+        _own(numbers.get("D_q"), _ratio(law)),
+    )
+
+
+def _own(value: float | None, seen: complex) -> float | None:
+    if value is None or abs(seen - value) > _RTOL * abs(value):
+        return None
+    return value
+
+
+def _ratio(law: Law) -> complex:
+    below = law.element("phi", (2, 4))(_NEARLY_DC)
+    return law.element("phi", (2, 3))(_NEARLY_DC) / below if below else 0.0

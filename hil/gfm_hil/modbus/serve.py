@@ -1,0 +1,188 @@
+"""The server of one run: the register image over Modbus/TCP until the run is over."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import os
+import signal
+import ssl
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pymodbus.constants import ExcCodes
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES
+from gfm_hil.modbus.connection import UNIT, Server
+from gfm_hil.modbus.device import Device
+from gfm_hil.modbus.image import BASE
+from gfm_hil.modbus.setpoints import TICK_S
+from gfm_hil.modbus.view import Watcher
+from gfm_hil.operator import Operator
+from gfm_hil.scenario import load_scenario
+
+LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
+
+_LOOK = round(0.1 / TICK_S)  # ticks of the clock between two looks at what changes seldom
+_SECOND = round(1.0 / TICK_S)
+_NICE = 10  # behind everything that is in a hurry
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where to listen, and to whom.
+
+    Attributes:
+        tls: certificate, key, and the authority of the clients' certificates; None: no TLS.
+        anyone: unprotected on an address that others can reach, on purpose.
+    """
+
+    host: str
+    port: int
+    tls: tuple[Path, Path, Path] | None = None
+    anyone: bool = False
+
+    def check(self) -> None:
+        """Raise UserError for an address that others can reach without being known."""
+        try:
+            address = ipaddress.ip_address(self.host)
+        except ValueError:
+            raise UserError(f"--host {self.host!r}: must be an IP address") from None
+        if not 0 <= self.port <= 65535:
+            raise UserError(f"--port {self.port}: must lie in [0, 65535]")
+        if not (address.is_loopback or self.tls or self.anyone):
+            raise UserError(
+                f"--host {self.host}: others can reach it, and Modbus asks nobody who he is; use "
+                "--tls CERT KEY CLIENT-CA, or --anyone-may-command"
+            )
+
+    def context(self) -> ssl.SSLContext | None:
+        """TLS that demands a certificate of the client as well.
+
+        Raises:
+            UserError: a file that cannot be used.
+        """
+        if self.tls is None:
+            return None
+        certificate, key, clients = self.tls
+        found = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        found.minimum_version = ssl.TLSVersion.TLSv1_2
+        found.verify_mode = ssl.CERT_REQUIRED
+        try:
+            found.load_cert_chain(certificate, key)
+            found.load_verify_locations(clients)
+        except (OSError, ssl.SSLError) as problem:
+            raise UserError(f"--tls {certificate} {key} {clients}: {problem}") from None
+        return found
+
+
+def serve(folder: Path, address: Address, heartbeat_ms: int, notice: Callable[[str], None]) -> None:
+    """Serve the run in ``folder`` until it is over, or SIGINT or SIGTERM comes.
+
+    Raises:
+        UserError: no run is going on there, or the address is not to be had.
+    """
+    address.check()
+    context = address.context()
+    operator = Operator(folder)
+    try:
+        asyncio.run(_serve(folder, operator, address, context, heartbeat_ms, notice))
+    finally:
+        operator.close()
+
+
+async def _serve(
+    folder: Path,
+    operator: Operator,
+    address: Address,
+    context: ssl.SSLContext | None,
+    heartbeat_ms: int,
+    notice: Callable[[str], None],
+) -> None:
+    logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # clients hear what is wrong
+    scenario = load_scenario(str(folder / "scenario.toml"))
+    watcher = Watcher(operator, folder, scenario)
+    over = _until_told()
+    while watcher.look() is None:  # the sides may still be shaking hands
+        if over.is_set() or not _going(folder):
+            raise UserError(f"{folder}: no run is going on there")
+        await asyncio.sleep(TICK_S)
+    began = time.monotonic()
+
+    def tell(event: dict[str, Any]) -> None:
+        if event["type"] == "stop":
+            operator.stop()
+        else:
+            operator.tell(event)
+        watcher.forget()
+
+    device = Device(
+        scenario, watcher.laws(), watcher.look, tell, heartbeat_ms,
+        lambda: time.monotonic() - began,
+    )  # fmt: skip
+    with contextlib.suppress(OSError):
+        os.nice(_NICE)
+    server = _server(device, address, context)
+    try:
+        await server.serve_forever(background=True)
+    except RuntimeError:
+        where = f"--host {address.host} --port {address.port}"
+        raise UserError(f"{where}: cannot listen there") from None
+    try:
+        kind = "Modbus/TCP" if context is None else "Modbus/TCP with TLS"
+        notice(f"{kind} on {address.host}:{server.port}, unit {UNIT}, SunSpec from {BASE}")
+        await _clock(folder, device, watcher, began, over)
+    finally:
+        await server.shutdown()
+
+
+def _server(device: Device, address: Address, context: ssl.SSLContext | None) -> Server:
+    async def action(
+        code: int, first: int, at: int, count: int, registers: list[int], written: Any
+    ) -> ExcCodes | None:
+        refused = await device.access(code, at, written)
+        image = device.image.registers
+        registers[: len(image)] = image
+        if written is not None:  # pymodbus puts these into its registers itself
+            written[:] = image[at - first : at - first + count]
+        return refused
+
+    block = SimData(BASE, values=device.image.registers, datatype=DataType.REGISTERS)
+    sim = SimDevice(id=UNIT, simdata=[block], action=action)
+    return Server(sim, (address.host, address.port), context)
+
+
+async def _clock(
+    folder: Path, device: Device, watcher: Watcher, began: float, over: asyncio.Event
+) -> None:
+    """Tick until the run is over; ticks that were slept through are made up for by the last."""
+    tick = 0
+    while not over.is_set():
+        if tick % _LOOK == 0:
+            if not _going(folder):
+                return
+            device.take((folder / LOCAL).exists())
+        if tick % _SECOND == 0:
+            device.slack = watcher.slack()
+        await device.clock(tick)
+        tick = max(tick + 1, int((time.monotonic() - began) / TICK_S))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(over.wait(), max(began + tick * TICK_S - time.monotonic(), 0))
+
+
+def _going(folder: Path) -> bool:
+    return any((folder / f"desk_{side}.json").exists() for side in SIDES)
+
+
+def _until_told() -> asyncio.Event:
+    over = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, over.set)
+    return over

@@ -1,0 +1,159 @@
+"""Set-points of model 704: a value, its mode, its enable, and the timer that takes them back.
+
+A set-point that has not been written since it was last disabled reads as the reference in force.
+So enabling it alone changes nothing, and of value, mode and enable the last one to be written makes
+the change, in whatever order they come and in however many requests. Disabling goes back to the
+reference that was in force before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gfm_hil.events import check_reference
+from gfm_hil.modbus.image import Value
+from gfm_hil.modbus.plan import Plan
+from gfm_hil.modbus.view import View
+
+TICK_S = 0.01
+"""The device's clock: reversion and heartbeat expire on its ticks."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What clients have written; None: not since the function was last disabled.
+
+    Attributes:
+        value, percent: the set-point in W or var, and in % of S_n.
+        value_back, percent_back: what they become when the timer runs out.
+        timeout: s, 0 for none.
+        until: tick of the device's clock at which it runs out; None: not running.
+        before: the reference in force when it was enabled, p.u.
+    """
+
+    enabled: bool = False
+    mode: int = 0
+    value: float | None = None
+    percent: float | None = None
+    enabled_back: bool = False
+    value_back: float | None = None
+    percent_back: float | None = None
+    timeout: int = 0
+    until: int | None = None
+    before: float = 0.0
+
+
+class SetPoint:
+    """P_ref by ``WSet…`` or Q_ref by ``VarSet…`` of model 704.
+
+    Args:
+        prefix: ``"WSet"`` or ``"VarSet"``.
+        reference: ``"P_ref"`` or ``"Q_ref"``.
+        rating: W or var at 1 p.u.
+        absolute: the value of ``Mod`` with which the set-point is in W or var.
+        percent: those with which it is in % of a maximum, each of which is S_n here.
+    """
+
+    def __init__(
+        self, prefix: str, reference: str, rating: float, absolute: int, percent: tuple[int, ...]
+    ) -> None:
+        self._prefix, self.reference, self._rating = f"704.{prefix}", reference, rating
+        self._absolute, self._modes = absolute, (*percent, absolute)
+        self._keys = {
+            f"{self._prefix}{suffix}": key
+            for suffix, key in (
+                ("Ena", "enabled"), ("Mod", "mode"), ("", "value"), ("Rvrt", "value_back"),
+                ("Pct", "percent"), ("PctRvrt", "percent_back"), ("EnaRvrt", "enabled_back"),
+                ("RvrtTms", "timeout"),
+            )
+        }  # fmt: skip
+        self.writable = tuple(self._keys)
+        self.settings = Settings(mode=absolute)
+
+    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+        """See ``Function``."""
+        changes: dict[str, Any] = {self._keys[path]: value for path, value in written.items()}
+        new = replace(self.settings, **changes)
+        if new.mode not in self._modes:
+            raise ValueError(f"{self._prefix}Mod = {new.mode:g}: must be one of {self._modes}")
+        for name in ("value", "value_back", "percent", "percent_back"):
+            number = getattr(new, name)
+            if number is not None:
+                check_reference(self.reference, number / self._unit(name))
+        new = replace(new, enabled=bool(new.enabled), enabled_back=bool(new.enabled_back))
+        return self._plan(new, view, now, changed=True)
+
+    def expire(self, now: int) -> bool:
+        """Whether the timer has run out."""
+        return self.settings.until is not None and now >= self.settings.until
+
+    def revert(self, view: View, now: int) -> Plan:
+        """What the end of the timer comes to: the set-point and enable of ``…Rvrt``."""
+        s = self.settings
+        name = self._in_force(s)
+        new = replace(_with(s, name, self._back(s, name)), enabled=s.enabled_back)
+        return self._plan(new, view, now, changed=False)
+
+    def forget(self) -> None:
+        """After a reset: the run is back at its start, with nothing commanded."""
+        self.settings = Settings(mode=self._absolute)
+
+    def show(self, view: View, now: int) -> dict[str, Value]:
+        """See ``Function``."""
+        s = self.settings
+        there = view.references[self.reference]
+        back = s.before if s.enabled else there
+        found: dict[str, Value] = {}
+        for path, key in self._keys.items():
+            value = getattr(s, key)
+            if value is None:
+                value = (back if key.endswith("_back") else there) * self._unit(key)
+            found[path] = float(value)
+        left = 0.0 if s.until is None else max(s.until - now, 0) * TICK_S
+        found[f"{self._prefix}RvrtRem"] = -(-left // 1)
+        return found
+
+    def _plan(self, new: Settings, view: View, now: int, changed: bool) -> Plan:
+        old = self.settings
+        target: float | None = None
+        if new.enabled:
+            if not old.enabled:
+                new = replace(new, before=view.references[self.reference])
+            if new.mode != old.mode:  # what was in force before is not kept for another day
+                left = self._in_force(old)
+                if getattr(new, left) == getattr(old, left):
+                    new = _with(new, left, None)
+            name = self._in_force(new)
+            number = getattr(new, name)
+            target = None if number is None else number / self._unit(name)
+        elif old.enabled:
+            target = old.before
+            new = replace(new, value=None, percent=None)
+        running = changed and new.enabled and new.timeout > 0
+        until = now + round(new.timeout / TICK_S) if running else None
+        new = replace(new, until=until)
+
+        def keep() -> None:
+            self.settings = new
+
+        if target is None:
+            return Plan(keep=keep)
+        return Plan(({"type": "reference", self.reference: target},), keep)
+
+    def _in_force(self, s: Settings) -> str:
+        return "value" if s.mode == self._absolute else "percent"
+
+    def _unit(self, name: str) -> float:
+        """What 1 p.u. is in the units of a setting."""
+        return self._rating if name.startswith("value") else 100.0
+
+    def _back(self, s: Settings, name: str) -> float | None:
+        value = getattr(s, f"{name}_back")
+        return s.before * self._unit(name) if value is None else value
+
+
+def _with(s: Settings, name: str, value: float | None) -> Settings:
+    changes: dict[str, Any] = {name: value}
+    return replace(s, **changes)

@@ -1,0 +1,134 @@
+"""What a run does at this moment, as the device needs it: read from its recording, off the loop."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_hil.operator import Operator
+from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.scenario import Scenario
+from gfm_runtime.controller import SAFE
+
+_NAMES_S = 0.1  # how old names and gains may be
+_WINDOW_S = 1.0  # of ticks that the slack is taken over
+_SCHEDULED, _RECEIVED = PLANT_TIMES.index("scheduled"), PLANT_TIMES.index("received")
+
+
+@dataclass(frozen=True)
+class Slack:
+    """Time left when u[k] arrived at the plant before tick k + 1, µs; NaN without deadlines."""
+
+    p50: float = math.nan
+    p1: float = math.nan
+    p01: float = math.nan
+    least: float = math.nan
+
+
+@dataclass(frozen=True)
+class View:
+    """One look at a run.
+
+    Attributes:
+        row: every column of the recording at the newest tick, by name.
+        tick, misses: of the plant, since the start.
+        state: of the controller, index into ``gfm_runtime.controller.STATES``.
+        law: name of the active law.
+        gains: what of it is not as in its file, by parameter.
+        reason: why the controller is in SAFE or the plant tripped, or "".
+    """
+
+    row: dict[str, float]
+    tick: int
+    misses: int
+    state: int
+    law: str
+    gains: dict[str, float]
+    reason: str
+
+    @property
+    def safe(self) -> bool:
+        """The bridge is blocked: a trip, or the controller's safe state."""
+        return self.state == SAFE or self.row["true_trip"] != 0.0
+
+    @property
+    def references(self) -> dict[str, float]:
+        """The references in force by name, p.u."""
+        return {k.removeprefix("ref_"): v for k, v in self.row.items() if k.startswith("ref_")}
+
+
+class Watcher:
+    """Looks at a run that is going on; takes nothing from its loops.
+
+    Args:
+        operator: of the run.
+        folder: the run folder.
+        scenario: as resolved in it.
+    """
+
+    def __init__(self, operator: Operator, folder: Path, scenario: Scenario) -> None:
+        self._operator, self._folder = operator, folder
+        self._T_ns = round(scenario.T_s * 1e9)
+        self._window = max(round(_WINDOW_S / scenario.T_s), 1)
+        self._parts: dict[str, Part] = {}
+        self._said: dict[str, Any] = {}
+        self._code: tuple[float, ...] = ()
+        self._asked = -math.inf
+
+    def look(self) -> View | None:
+        """The newest tick of both sides, or None before there is one."""
+        row: dict[str, float] = {}
+        for side, columns in (("plant", PLANT_COLUMNS), ("controller", CONTROLLER_COLUMNS)):
+            part = self._part(side)
+            done = 0 if part is None else int(part.progress[0])
+            if part is None or not done:
+                return None
+            row.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
+        code = (row["law"], row["state"], row["true_trip"])
+        now = time.monotonic()
+        if code != self._code or now >= self._asked + _NAMES_S:  # takes the reading of files
+            self._said = {**self._said, **self._operator.snapshot()}
+            self._code, self._asked = code, now
+        progress = self._parts["plant"].progress
+        return View(
+            row=row,
+            tick=int(progress[0]) - 1,
+            misses=int(progress[1]),
+            state=int(row["state"]),
+            law=self._said["active"],
+            gains=self._said["gains"],
+            reason=self._said["trip"] or self._said["reason"],
+        )
+
+    def forget(self) -> None:
+        """Have the next look read the names again: there was a command."""
+        self._asked = -math.inf
+
+    def slack(self) -> Slack:
+        """Over the last second of ticks; u[k] is due when tick k + 1 begins."""
+        part = self._parts.get("plant")
+        done = 0 if part is None else int(part.progress[0])
+        if part is None or not done:
+            return Slack()
+        times = part.times[max(done - self._window, 0) : done]
+        times = times[(times[:, _RECEIVED] >= 0) & (times[:, _SCHEDULED] >= 0)]
+        if not len(times):
+            return Slack()
+        left = (times[:, _SCHEDULED] + self._T_ns - times[:, _RECEIVED]) * 1e-3
+        return Slack(*(float(v) for v in np.percentile(left, (50, 1, 0.1, 0))))
+
+    def laws(self) -> list[str]:
+        """Names of the laws that are ready to be changed to, in order."""
+        return [str(name) for name in self._operator.snapshot()["laws"]]
+
+    def _part(self, side: str) -> Part | None:
+        if side not in self._parts:
+            part = Part.open(self._folder, side)
+            if part is not None:
+                self._parts[side] = part
+        return self._parts.get(side)
