@@ -72,6 +72,7 @@ _MORE = {
     "Trip.enabled": "false takes it out",
     "_Event.tick": "in place of `t`",
     "Reference.ramp_s": "spreads the change evenly over so many seconds",
+    "Gains.values": "a table of names and numbers, e.g. `{ D_p = 0.02 }`",
     "LawChange.law": "catalogue name or law file",
     "GridFrequency.f_hz": "Hz",
     "GridFrequency.rate": "Hz/s; a step if none",

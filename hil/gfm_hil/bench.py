@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from gfm_design.operating_point import OperatingPoint, operating_point
 from gfm_hil.errors import UserError
+from gfm_hil.events import Gains, LawChange, Reset
+from gfm_hil.retune import retuned
 from gfm_hil.scenario import Scenario
 from gfm_plant import NoEquilibrium, make_plant, plant_init
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
+from gfm_runtime.controller import READY, SAFE, STATES
 from gfm_runtime.signals import NY
 
 
@@ -39,6 +42,33 @@ class Bench:
     start: OperatingPoint
     y: NDArray[np.float64]
     u: NDArray[np.float64]
+
+    def keep(self) -> None:
+        """Remember this instant as the start, to which a reset goes back."""
+        c = self.controller
+        self._plant = self.par.copy(), self.st.copy()
+        self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
+        self._asked = c.asked
+
+    def restore_plant(self) -> None:
+        """Put the plant back to its start, trip forgotten and grid included; its ticks go on."""
+        tick = int(self.st["tick"][0])
+        self.par[:], self.st[:] = self._plant
+        self.st["tick"], self.u[:] = tick, self.start.u
+
+    def reset_controller(self) -> None:
+        """Take the controller out of SAFE to its start: first law and references, READY.
+
+        Raises:
+            ValueError: it is not in SAFE.
+        """
+        c = self.controller
+        state, changes = int(c.ctl["state"][0]), int(c.ctl["changes"][0])
+        if state != SAFE:
+            raise ValueError(f"reset: the controller is {STATES[state]}, not SAFE")
+        c.ctl[:], c.laws[:], c.states[:], c.est[:] = self._controller
+        c.asked, c.gains = self._asked, {}
+        c.ctl["state"], c.ctl["changes"], self.u[:] = READY, changes, self.start.u
 
 
 def make_bench(scenario: Scenario) -> Bench:
@@ -69,4 +99,27 @@ def make_bench(scenario: Scenario) -> Bench:
         raise UserError(f"references, plant.grid: {problem}") from None
     plant_init(par, st, start.x, start.u)
     controller.start(start.x_law, start.u)
-    return Bench(scenario, par, st, controller, start, np.zeros(NY), start.u.copy())
+    bench = Bench(scenario, par, st, controller, start, np.zeros(NY), start.u.copy())
+    bench.keep()
+    _ready_gains(scenario)
+    return bench
+
+
+def _ready_gains(scenario: Scenario) -> None:
+    """Have every change of gains that the scenario names ready before it runs.
+
+    Raises:
+        UserError: one that cannot be.
+    """
+    name, gains = scenario.law, dict[str, float]()
+    for event in scenario.sorted_events():
+        if isinstance(event, LawChange):
+            name, gains = event.law, {}
+        elif isinstance(event, Reset):
+            name, gains = scenario.law, {}
+        elif isinstance(event, Gains):
+            gains.update(event.values)
+            try:
+                retuned(name, tuple(sorted(gains.items())), scenario.T_s)
+            except ValueError as problem:
+                raise UserError(f"events, {event.label()}: {problem}") from None

@@ -73,7 +73,7 @@ def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
             c.set("P_ref", STEP[1])
         done = run_ticks(
             bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-            signals, references, start, stop,
+            signals, references, start, stop, False,
         )  # fmt: skip
         if bench.st["trip"][0] or c.ctl["state"][0] == SAFE:
             tripped = bool(bench.st["trip"][0])

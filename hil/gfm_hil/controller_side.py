@@ -14,9 +14,9 @@ from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_controller
-from gfm_hil.timeline import PLANT_LEFT, Timeline, safe_reason
+from gfm_hil.timeline import PLANT_LEFT, Timeline
 from gfm_hil.waiting import await_message, part_from
-from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STALE, STOPPED, missed
+from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED, heed, missed
 
 
 def run_controller(
@@ -34,12 +34,18 @@ def run_controller(
     patience_ns = int(scenario.link.peer_timeout_s * 1e9)
     reader, writer = FrameReader("y"), FrameWriter("u")
     signals, times, progress = part.signals, part.times, part.progress
+    waits = scenario.after_trip == "wait"
     done, tick = 0, 0  # ticks processed; the tick of the newest frame
     heard = max(time.monotonic_ns(), t0_ns)
 
     def leave(status: str, reason: str, state: int, code: int) -> None:
         timeline.end(status, reason, tick)  # type: ignore[arg-type]
         part_from(link, writer, reader, tick, state, code, bench.u)
+
+    def look() -> None:
+        timeline.look(tick)
+        if not timeline.running:
+            part_from(link, writer, reader, tick, SAFE, int(c.ctl["reason"][0]), bench.u)
 
     while timeline.running:
         wait_ns = T_ns if realtime else patience_ns
@@ -58,33 +64,32 @@ def run_controller(
             elif realtime and done:  # before tick 0 nothing can be stale
                 while int(c.ctl["stale"][0]) < (now - heard) // T_ns:
                     missed(c.ctl)
-                if int(c.ctl["state"][0]) == SAFE:
-                    leave("safe", REASONS[STALE], SAFE, STALE)
+                look()
             continue
         heard = now
-        if reader.state == SAFE:
+        if reader.state == SAFE and not waits:
             leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
             break
         if reader.state == STOPPED:
             if reader.reason:
                 leave("interrupted", PLANT_LEFT, STOPPED, 0)
             else:
-                leave("completed", "", STOPPED, 0)
+                timeline.finish(tick)
+                part_from(link, writer, reader, tick, STOPPED, 0, bench.u)
             break
         if done and newest <= tick:  # the plant asks again: our answer was lost
             link.send(writer.pack(tick, int(c.ctl["state"][0]), int(c.ctl["reason"][0]), bench.u))
             continue
         tick = newest
         timeline.carry_out(tick)
+        heed(c.ctl, reader.state == SAFE)
         c.step(bench.y, bench.u)
         computed = time.monotonic_ns()
         link.send(writer.pack(tick, int(c.ctl["state"][0]), int(c.ctl["reason"][0]), bench.u))
         row = times[tick]
         row[0], row[1], row[2], row[3] = t0_ns + tick * T_ns, now, computed, time.monotonic_ns()
         record_controller(signals[tick], c.ctl, c.est)
-        timeline.look(tick)
         done += 1
-        progress[0] = tick + 1
-        if int(c.ctl["state"][0]) == SAFE:
-            leave("safe", safe_reason(c.ctl), SAFE, int(c.ctl["reason"][0]))
+        progress[0], progress[1] = tick + 1, int(c.ctl["reason"][0])
+        look()
     return reader

@@ -79,6 +79,25 @@ class LawChange(_Event):
         return f"law {self.law}"
 
 
+class Gains(_Event):
+    """Other gains of the active law, by the names in its file; bumpless. What is tied follows."""
+
+    type: Literal["gains"]
+    values: dict[str, float] = Field(min_length=1)
+
+    def label(self) -> str:
+        return ", ".join(f"{name} = {value:g}" for name, value in self.values.items())
+
+
+class Reset(_Event):
+    """Back to the scenario's start from a trip or the safe state, for runs that wait there."""
+
+    type: Literal["reset"]
+
+    def label(self) -> str:
+        return "reset"
+
+
 class GridFrequency(_Event):
     """Grid frequency: a step, or a ramp at ``rate`` [Hz/s]."""
 
@@ -140,11 +159,19 @@ class Breaker(_Event):
 
 
 Event = Annotated[
-    Reference | LawChange | GridFrequency | GridVoltage | PhaseJump | GridImpedance | Breaker,
+    Reference
+    | LawChange
+    | Gains
+    | Reset
+    | GridFrequency
+    | GridVoltage
+    | PhaseJump
+    | GridImpedance
+    | Breaker,
     Field(discriminator="type"),
 ]
 
-CONTROLLER_EVENTS = (Reference, LawChange)
+CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 
 def apply_grid_event(event: Any, par: Any, st: Any) -> None:

@@ -14,28 +14,39 @@ from gfm_hil.bench import Bench
 from gfm_hil.recording import Part, record_controller, record_plant
 from gfm_hil.timeline import Timeline
 from gfm_plant import plant_advance, plant_sample
-from gfm_runtime.controller import RUNNING, control
+from gfm_plant.protection import CONTROLLER, SAFE_STATE, trip
+from gfm_runtime.controller import READY, SAFE, control, heed
 
 CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
 
 
 @njit(cache=True, nogil=True)
-def run_ticks(par, st, ctl, laws, states, est, y, u, plant_rows, controller_rows, start, stop):
+def run_ticks(
+    par, st, ctl, laws, states, est, y, u, plant_rows, controller_rows, start, stop, waits
+):
     """Run ticks [start, stop); returns the tick after the last one done.
 
-    Ends early, after recording the tick, when the law changed, when the controller left RUNNING
-    or when the protection tripped.
+    Ends early, after recording the tick, when the law changed, when the controller entered or
+    left RUNNING or when the protection tripped; and before advancing, when the plant has to be
+    put back to its start: tripped, with the controller READY.
     """
     changes = ctl[0].changes
     for k in range(start, stop):
+        before, tripped = ctl[0].state, st[0].trip
         plant_sample(par, st, y)
+        heed(ctl, tripped != 0)
         control(ctl, laws, states, est, y, u)
         record_controller(controller_rows[k], ctl, est)
         record_plant(plant_rows[k], y, u, par, st)
-        if ctl[0].state != RUNNING:
+        state = ctl[0].state
+        if state == SAFE:
+            if not waits:
+                return k + 1
+            trip(st[0], CONTROLLER, SAFE_STATE)
+        if state == READY and tripped != 0:
             return k + 1
         plant_advance(par, st, u)
-        if ctl[0].changes != changes or st[0].trip != 0:
+        if ctl[0].changes != changes or state != before or st[0].trip != tripped:
             return k + 1
     return stop
 
@@ -49,19 +60,21 @@ def run_inproc(
 ) -> None:
     """Run a whole scenario; ``go_on`` is told the ticks done and says whether to go on."""
     c, ticks = bench.controller, bench.scenario.ticks
+    waits = bench.scenario.after_trip == "wait"
     k = 0
     while k < ticks and timeline.running:
         timeline.carry_out(k)
         stop = min(k + CHUNK, timeline.next_tick(), ticks)
         k = run_ticks(
             bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-            plant_part.signals, controller_part.signals, k, stop,
+            plant_part.signals, controller_part.signals, k, stop, waits,
         )  # fmt: skip
+        if int(bench.st["trip"][0]) and int(c.ctl["state"][0]) == READY:
+            bench.restore_plant()
         timeline.look(k - 1)
         if not go_on(k):
             timeline.end("interrupted", "stopped by the operator", k)
-    if timeline.running:
-        timeline.end("completed", "", k)
+    timeline.finish(k)
 
 
 def compile_loop(bench: Bench, plant_part: Part, controller_part: Part) -> None:
@@ -69,5 +82,5 @@ def compile_loop(bench: Bench, plant_part: Part, controller_part: Part) -> None:
     c = bench.controller
     run_ticks(
         bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        plant_part.signals, controller_part.signals, 0, 0,
+        plant_part.signals, controller_part.signals, 0, 0, False,
     )  # fmt: skip

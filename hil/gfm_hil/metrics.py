@@ -18,6 +18,7 @@ METRICS = (
     "rocof_hz_s", "v_min", "v_max", "damping_ratio", "oscillation_hz",
 )  # fmt: skip
 _BAND = 0.02  # settling: within 2 % of the step (or 0.02 p.u. where there is no step)
+_GONE = 1e-6
 _NO_STEP = 0.02  # p.u.; a smaller change of p is no step
 _FEW = 20  # samples; a shorter window has no metrics
 
@@ -86,6 +87,7 @@ def dominant_oscillation(p: Vector, T_s: float) -> tuple[float | None, float | N
     rank = min(12, int(np.sum(weight > 1e-3 * weight[0])))
     subspace = modes[:rank].T
     z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
+    z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
     s = np.log(z.astype(complex)) / (stride * T_s)
     powers = np.exp(np.outer(np.arange(len(x)) * stride * T_s, s))
     amplitude = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]

@@ -18,8 +18,9 @@ from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_plant
 from gfm_hil.timeline import CONTROLLER_LEFT, Timeline
 from gfm_hil.waiting import await_message, part_from
-from gfm_plant import plant_advance, plant_sample
-from gfm_runtime.controller import REASONS, SAFE, STOPPED
+from gfm_plant import NO_FRESH_U, plant_advance, plant_sample
+from gfm_plant.protection import CONTROLLER, SAFE_STATE, SILENT, trip
+from gfm_runtime.controller import PLANT_TRIP, READY, REASONS, SAFE, STOPPED
 
 
 @dataclass
@@ -38,6 +39,8 @@ class _Plant:
         self.patience_ns = int(self.bench.scenario.link.peer_timeout_s * 1e9)
         self.repeat_ns = int(self.bench.scenario.link.repeat_s * 1e9)
         self.u_last = self.u_before = self.bench.u.copy()  # the newest two that came in time
+        self.waits = self.bench.scenario.after_trip == "wait"
+        self.tripped = 0
         self.misses = 0
         self.late = 0  # misses in a row
 
@@ -45,8 +48,13 @@ class _Plant:
         b = self.bench
         self.timeline.carry_out(tick)
         plant_sample(b.par, b.st, b.y)
-        self.link.send(self.writer.pack(tick, 0, 0, b.y))
+        self.tripped = int(b.st["trip"][0])
+        self.link.send(self.frame(tick))
         self.part.times[tick, 2] = time.monotonic_ns()
+
+    def frame(self, tick: int) -> bytes:
+        state, reason = (SAFE, PLANT_TRIP) if self.tripped else (0, 0)
+        return self.writer.pack(tick, state, reason, self.bench.y)
 
     def take(self, frame: bytes) -> int:
         """Tick of a good frame, its values now in ``bench.u``; -1 for one that was refused."""
@@ -55,17 +63,25 @@ class _Plant:
         except FrameError:
             return -1
 
-    def advance(self, tick: int) -> None:
+    def advance(self, tick: int, fresh: bool) -> None:
         b = self.bench
         record_plant(self.part.signals[tick], b.y, b.u, b.par, b.st)
         self.part.progress[0] = tick + 1
         if self.reader.state == SAFE:
-            self.timeline.end("safe", REASONS[self.reader.reason], tick)
-            return
+            if not self.waits:
+                self.timeline.end("safe", REASONS[self.reader.reason], tick)
+                return
+            trip(b.st[0], CONTROLLER, SAFE_STATE)
         if self.reader.state == STOPPED:
             self.timeline.end("interrupted", CONTROLLER_LEFT, tick)
             return
+        if self.tripped and fresh and self.reader.state == READY:
+            b.restore_plant()
+            self.u_last = self.u_before = b.u.copy()
+            return
         plant_advance(b.par, b.st, b.u)
+        if self.waits and self.late > self.bench.scenario.late_policy.hold:
+            trip(b.st[0], CONTROLLER, SILENT)
 
     def lockstep(self, tick: int) -> None:
         self.sample(tick)
@@ -77,12 +93,13 @@ class _Plant:
                 if again >= deadline or self.stopped():
                     break
                 again += self.repeat_ns  # y[k] or u[k] was lost: ask again
-                self.link.send(self.writer.pack(tick, 0, 0, self.bench.y))
+                self.link.send(self.frame(tick))
                 continue
             # a controller that leaves says so under the last tick it saw
-            if self.take(frame) == tick or self.reader.state in (SAFE, STOPPED):
+            leaves = (STOPPED,) if self.waits else (SAFE, STOPPED)
+            if self.take(frame) == tick or self.reader.state in leaves:
                 self.part.times[tick, 3] = time.monotonic_ns()
-                self.advance(tick)
+                self.advance(tick, True)
                 return
         if not self.stopped():
             self.timeline.end("safe", "the controller's process is gone", tick)
@@ -110,13 +127,13 @@ class _Plant:
         self.late = 0 if newest == tick else self.late + 1
         self.misses += newest != tick
         self.part.progress[1] = self.misses
-        self.advance(tick)
+        self.advance(tick, newest == tick)
         while time.monotonic_ns() < until:
             os.sched_yield()
         if self.late * self.T_ns >= self.patience_ns:
             self.timeline.end("safe", "the controller's process is gone", tick)
-        elif self.late > self.bench.scenario.late_policy.hold:
-            self.timeline.end("safe", "no fresh u for longer than late_policy.hold allows", tick)
+        elif self.late > self.bench.scenario.late_policy.hold and not self.waits:
+            self.timeline.end("safe", NO_FRESH_U, tick)
 
 
 def run_plant(
@@ -143,9 +160,10 @@ def run_plant(
         tick += 1
     if stopped():
         timeline.end("interrupted", "stopped by the operator", tick)
-    timeline.end("completed", "", tick)
+    timeline.finish(tick)
     assert timeline.outcome is not None
-    state = SAFE if timeline.outcome.status == "tripped" else STOPPED
-    failed = int(timeline.outcome.status != "completed")
+    status = timeline.outcome.status
+    state = SAFE if status == "tripped" and not p.waits else STOPPED
+    failed = int(status != "completed" and tick < ticks)
     part_from(link, p.writer, p.reader, tick, state, failed, bench.y)
     return p.reader

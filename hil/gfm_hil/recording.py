@@ -23,6 +23,7 @@ from gfm_hil import scratch
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES
 from gfm_plant import TRUTH, plant_truth
+from gfm_runtime.assembly import SPARE
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
 
 PLANT_COLUMNS = (
@@ -72,7 +73,7 @@ def record_controller(row, ctl, est):
 class Part:
     """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
     ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress``
-    (ticks done, misses) for whoever watches."""
+    (ticks done; plant: misses, controller: why it is in SAFE) for whoever watches."""
 
     signals: NDArray[np.float64]
     times: NDArray[np.int64]
@@ -200,6 +201,8 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
             for j, name in enumerate(times):
                 timing[f"{side}_{name}"] = np.array(part.times[:done, j])
     signals = {"tick": np.arange(done), "t": np.arange(done) * T_s, **signals}
+    used = int(np.nanmax(signals["law"], initial=0)) + 1 if "law" in signals else 0
+    laws = laws[: max(used, len(laws) - SPARE)]
     np.savez(folder / "signals.npz", laws=np.array(laws), **signals)  # type: ignore[arg-type]
     np.savez(folder / "timing.npz", **timing)  # type: ignore[arg-type]
     remove_parts(folder)

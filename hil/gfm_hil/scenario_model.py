@@ -13,6 +13,7 @@ from gfm_hil.events import (
     Breaker,
     Event,
     LawChange,
+    Reset,
     check_reference,
 )
 from gfm_hil.links import link_kind, link_names
@@ -124,6 +125,15 @@ class Scenario(_Model):
     expect: Literal["completed", "tripped", "safe"] = Field(
         "completed", description="status with which the run counts as passed (exit code 0)"
     )
+    after_trip: Literal["end", "wait"] = Field(
+        "end",
+        description="wait: a trip or a safe state does not end the run; the plant stays blocked "
+        "until an event, or an operator, resets both sides to the scenario's start",
+    )
+    ready_laws: list[str] = Field(
+        default_factory=list,
+        description="laws made ready besides those that events name, for an operator to change to",
+    )
     compare: list[str] = Field(default_factory=list, description="laws that `compare` puts beside")
     references: References = References()
     link: Link = Link()
@@ -139,7 +149,7 @@ class Scenario(_Model):
     def laws(self) -> list[str]:
         """Names of every law that the run uses, the first one first, each once."""
         changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
-        return list(dict.fromkeys([self.law, *changes]))
+        return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
 
     def sorted_events(self) -> list[Event]:
         """Events in order of their tick; those of one tick in the order of the file."""
@@ -149,7 +159,7 @@ class Scenario(_Model):
         """Hash over what both sides must agree on: scenario, signal table, and what is in the
         law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "expect", "compare"}
-        content = self.model_dump(exclude={*about, "law", "events"})
+        content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
         events = [
@@ -173,6 +183,8 @@ class Scenario(_Model):
                     f"events.{k}: at {event.at(self.T_s) * self.T_s:g} s, but the run ends at "
                     f"{self.duration:g} s"
                 )
+            if isinstance(event, Reset) and self.after_trip == "end":
+                problems.append(f"events.{k}: nothing to reset with after_trip = 'end'; use 'wait'")
             if isinstance(event, Breaker) and self.plant.grid.load_R is None:
                 problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
         if self.link.type == INPROC:

@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gfm_hil.bench import Bench
-from gfm_hil.events import CONTROLLER_EVENTS, LawChange, Reference, apply_grid_event
+from gfm_hil.events import CONTROLLER_EVENTS, Gains, LawChange, Reference, Reset, apply_grid_event
 from gfm_hil.links.base import Side
-from gfm_plant import trip_reason
+from gfm_hil.retune import change_gains
+from gfm_plant import CONTROLLER_SAFE, trip_reason
+from gfm_plant.protection import CONTROLLER
 from gfm_runtime.controller import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -25,7 +27,8 @@ Status = Literal["completed", "tripped", "safe", "interrupted"]
 
 PLANT_LEFT = "the plant ended before the scenario did"
 CONTROLLER_LEFT = "the controller was stopped"
-_HEARSAY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT)  # the other side knows why
+#: the other side knows why
+_HEARSAY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
 SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
 
 
@@ -75,6 +78,7 @@ class Timeline:
         self._lines: deque[dict[str, Any]] = deque()
         self.put_off = False  # a disk may keep the writer waiting for longer than a tick
         self.outcome: Outcome | None = None
+        self._fault: tuple[Status, str] | None = None  # what a run that waits is waiting for
 
     @property
     def running(self) -> bool:
@@ -94,7 +98,11 @@ class Timeline:
     def carry_out(self, tick: int) -> None:
         """Carry out every event due at this tick, and what was put in."""
         while self._todo and self._todo[0][0] <= tick:
-            self._carry_out(self._todo.pop(0)[1], tick)
+            event = self._todo.pop(0)[1]
+            try:
+                self._carry_out(event, tick)
+            except ValueError as problem:
+                self.write(tick, event.type, label=event.label(), refused=str(problem))
         while self._inbox:
             event, ticket = self._inbox.popleft()
             if not ticket.claim():
@@ -113,6 +121,10 @@ class Timeline:
                     self._bench.controller.set(name, value, event.ramp_s)
             case LawChange():
                 self._bench.controller.select(event.law)
+            case Gains():
+                change_gains(self._bench.controller, event.values)
+            case Reset():
+                self._bench.reset_controller()
             case _:
                 apply_grid_event(event, self._bench.par, self._bench.st)
         self.write(tick, event.type, label=event.label(), **more)
@@ -128,10 +140,29 @@ class Timeline:
                 law=self._bench.controller.active,
                 bump_pu=float(ctl["bump"][0]),
             )
-        if "plant" in self._sides and int(st["trip"][0]) != 0:
-            self.end("tripped", trip_reason(st, self._bench.par), tick)
-        elif "controller" in self._sides and int(ctl["state"][0]) == SAFE:
-            self.end("safe", safe_reason(ctl), tick)
+        found = self._found(ctl, st)
+        if found is not None and self._fault is None:
+            if self._bench.scenario.after_trip == "end":
+                self.end(*found, tick)
+                return
+            self.write(tick, found[0], reason=found[1], side="+".join(self._sides))
+        elif found is None and self._fault is not None:
+            self.write(tick, "recovered", side="+".join(self._sides))
+        self._fault = found
+
+    def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
+        """What keeps our side from running, if anything does: the cause rather than hearsay."""
+        trip = int(st["trip"][0]) if "plant" in self._sides else 0
+        if trip not in (0, CONTROLLER):
+            return "tripped", trip_reason(st, self._bench.par)
+        if "controller" in self._sides and int(ctl["state"][0]) == SAFE:
+            heard = int(ctl["reason"][0]) == PLANT_TRIP
+            return "tripped" if heard else "safe", safe_reason(ctl)
+        return ("safe", trip_reason(st, self._bench.par)) if trip else None
+
+    def finish(self, tick: int) -> None:
+        """The scenario is over: the run is complete, unless it waits for a reset in vain."""
+        self.end(*(self._fault or ("completed", "")), tick)
 
     def end(self, status: Status, reason: str, tick: int) -> None:
         """The run is over; the first reason stays."""

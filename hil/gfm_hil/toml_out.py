@@ -56,4 +56,6 @@ def _value(value: Any) -> str:
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case list():
             return "[" + ", ".join(_value(v) for v in value) + "]"
+        case dict():
+            return "{" + ", ".join(f"{_value(k)} = {_value(v)}" for k, v in value.items()) + "}"
     raise TypeError(f"{value!r} has no TOML form here")

@@ -10,12 +10,14 @@ from gfm_plant.emulator import TRUTH, plant_advance, plant_init, plant_truth
 from gfm_plant.grid import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
 from gfm_plant.options import Plant
 from gfm_plant.parameters import ConverterParameters, load_converter
-from gfm_plant.protection import TRIP_REASONS, trip_reason
+from gfm_plant.protection import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, trip_reason
 from gfm_plant.records import plant_par_dtype, plant_state_dtype
 from gfm_plant.sensors import plant_sample
 from gfm_plant.steady_state import NoEquilibrium, plant_equilibrium
 
 __all__ = [
+    "CONTROLLER_SAFE",
+    "NO_FRESH_U",
     "TRIP_REASONS",
     "TRUTH",
     "Bases",

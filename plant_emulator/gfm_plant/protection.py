@@ -23,14 +23,21 @@ TRIPS = (
 
 DIVERGED = len(TRIPS) + 1
 BAD_COMMAND = len(TRIPS) + 2
+CONTROLLER = len(TRIPS) + 3
 
 TRIP_REASONS: dict[int, str] = {
     0: "none",
     **{k + 1: name.replace("_", "-") for k, (name, *_) in enumerate(TRIPS)},
     DIVERGED: "diverged",
     BAD_COMMAND: "command not finite",
+    CONTROLLER: "blocked for the controller",
 }
 """What the trip code in a plant's state means."""
+
+#: the value of a trip with the code CONTROLLER, and the words for it
+SAFE_STATE, SILENT = 0.0, 1.0
+CONTROLLER_SAFE = "the controller is in its safe state"
+NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 
 
 @njit(cache=True)
@@ -86,6 +93,8 @@ def trip_reason(st: PlantRecord, par: PlantRecord) -> str:
         return f"diverged: the state left the range of the model {at}"
     if code == BAD_COMMAND:
         return f"command not finite: u held {value} {at}"
+    if code == CONTROLLER:
+        return NO_FRESH_U if value == SILENT else CONTROLLER_SAFE
     _, quantity, sign = TRIPS[code - 1]
     limit = par[0]["trip_limit"][code - 1]
     persistence = int(par[0]["trip_ticks"][code - 1]) * T_s

@@ -26,6 +26,7 @@ from gfm_runtime.impedance import make_impedance
 from gfm_runtime.kernel import pack_law, state_dtype
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
+SPARE = 2  # places for laws with other gains: one may be in force while the other is filled
 X_MAX = 10.0  # p.u.; stands for "no upper end" of a schedule's last stage
 
 
@@ -34,6 +35,9 @@ class Controller:
 
     Everything that a tick needs is in the records ``ctl``, ``laws``, ``states`` and ``est``;
     ``gfm_runtime.controller.control`` takes them as they are.
+
+    ``asked`` is the name of the law last asked for, ``gains`` what of it is not as in its file;
+    ``names`` and ``changed`` say the same of every place in ``laws``, ``labels`` are for people.
 
     Args:
         sets: the laws that may become active, each under its name; the first one starts.
@@ -56,13 +60,20 @@ class Controller:
     ) -> None:
         self.T_s = T_s
         self.sets = {s.name: s for s in sets}
+        self.asked, self.gains = "", dict[str, float]()
         self.discrete: list[DiscreteLaw] = []
         self.labels: list[str] = []
+        self.names: list[str] = []
         self._first: dict[str, int] = {}
         for s in self.sets.values():
             self._first[s.name] = len(self.discrete)
             self.discrete += [discretise(law, T_s) for law in s.laws]
+            self.names += [s.name] * len(s.laws)
             self.labels += [s.name] if len(s.laws) == 1 else _stage_labels(s)
+        self.discrete += [self.discrete[0]] * SPARE
+        self.names += [sets[0].name] * SPARE
+        self.changed: list[dict[str, float]] = [{} for _ in self.discrete]
+        self.labels += [f"other gains {k + 1}" for k in range(SPARE)]
         self.laws = np.concatenate([pack_law(d, real) for d in self.discrete])
         self.states = np.zeros(len(self.laws), state_dtype(real))
         self.ctl = make_controller(hold)
@@ -90,6 +101,7 @@ class Controller:
         """
         if name not in self.sets:
             raise LawError(f"law {name!r}", f"not ready; ready are {list(self.sets)}")
+        self.asked, self.gains = name, {}
         first, schedule = self._first[name], self.sets[name].schedule
         self.ctl["request"], self.ctl["stages"] = first, 0
         if schedule is not None:
@@ -102,6 +114,23 @@ class Controller:
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
             self.est[:] = make_impedance(self.T_s, schedule.X_0, X_f=schedule.X_f)
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
+
+    def retune(self, discrete: DiscreteLaw, packed: NDArray[Any], gains: dict[str, float]) -> int:
+        """Ask for the law last asked for with other gains; bumpless, at the next tick.
+
+        Args:
+            discrete, packed: that law discretised and as ``pack_law`` gives it.
+            gains: what is not as in its file, by name.
+
+        Returns:
+            Its index from now on.
+        """
+        slot = len(self.laws) - SPARE
+        slot += int(self.ctl["active"][0]) == slot
+        self.laws[slot], self.discrete[slot] = packed[0], discrete
+        self.names[slot], self.changed[slot] = self.asked, dict(gains)
+        self.ctl["request"], self.gains = slot, dict(gains)
+        return slot
 
     def set(self, name: str, value: float, ramp_s: float = 0.0) -> None:
         """New reference by name, p.u., reached at once or evenly over ``ramp_s``."""

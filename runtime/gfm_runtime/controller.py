@@ -3,7 +3,9 @@
 Everything that changes lives in one record of ``controller_dtype`` and the laws' own records, so
 that a tick is one njit call and the same call serves every link, in lockstep and in real time.
 States: INIT -> READY -> RUNNING -> SAFE (latched) -> STOPPED. In SAFE the outputs stay at the
-last good u and the state travels in every frame; the plant answers by blocking the bridge.
+last good u and the state travels in every frame; the plant answers by blocking the bridge. Where a
+scenario waits after that, a reset takes the controller to READY, at rest; a plant that hears of
+it goes back to its own start and stops saying SAFE, upon which the controller is RUNNING again.
 """
 
 from __future__ import annotations
@@ -103,6 +105,18 @@ def missed(ctl):
     c.stale += 1
     if c.stale > c.hold:
         _go_safe(c, STALE, -1)
+
+
+@njit(cache=True)
+def heed(ctl, tripped):
+    """Take in what the plant's frame says of it: a trip takes a running controller to SAFE, and a
+    plant that is well again a READY one to RUNNING."""
+    c = ctl[0]
+    if tripped:
+        if c.state == RUNNING:
+            _go_safe(c, PLANT_TRIP, -1)
+    elif c.state == READY:
+        c.state = RUNNING
 
 
 @njit(cache=True)

@@ -196,7 +196,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     c = bench.controller
     run_ticks(
         bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        parts[0].signals, parts[1].signals, 0, ticks,
+        parts[0].signals, parts[1].signals, 0, ticks, False,
     )  # fmt: skip
     p = np.diff(parts[0].signals[:, PLANT_COLUMNS.index("true_p")])
     third = ticks // 3

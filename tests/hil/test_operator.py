@@ -18,6 +18,8 @@ from gfm_hil.timeline import read_log
 SCENARIO = """
 title = "told"
 duration = 600.0
+after_trip = "wait"
+ready_laws = ["vsg-5"]
 [link]
 type = "{link}"
 options = {options}
@@ -84,6 +86,32 @@ def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
     assert not list(folder.glob("desk_*"))
 
 
+def test_a_trip_is_waited_for_and_reset_and_gains_change(going):
+    process, folder = going
+    operator = Operator(folder)
+    wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
+    with pytest.raises(UserError, match="the controller is RUNNING, not SAFE"):
+        operator.tell({"type": "reset"})
+    operator.tell({"type": "law", "law": "vsg-5"})
+    gains = operator.tell({"type": "gains", "values": {"D_p": 0.012}})
+    wait_for(lambda: operator.snapshot()["tick"] > gains["tick"])
+    seen = operator.snapshot()
+    assert (seen["active"], seen["gains"]) == ("vsg-5", {"D_p": 0.012})
+    assert seen["laws"] == ["mimo-gfm", "vsg-2", "vsg-5"]
+    operator.tell({"type": "grid-voltage", "V_g": 0.0})
+    wait_for(lambda: operator.snapshot()["state"] == "SAFE")
+    seen = operator.snapshot()
+    assert (seen["trip"], seen["reason"]) == ("over-current", "the plant's protection tripped")
+    reset = operator.tell({"type": "reset"})
+    wait_for(lambda: operator.snapshot()["tick"] > reset["tick"] + 100)
+    seen = operator.snapshot()
+    assert (seen["state"], seen["active"], seen["trip"]) == ("RUNNING", "mimo-gfm", "")
+    assert seen["true_p"] == pytest.approx(0.5, abs=1e-6)
+    operator.stop()
+    assert process.wait(PATIENCE_S) == 130
+    operator.close()
+
+
 @pytest.mark.parametrize(
     ("event", "words"),
     [
@@ -93,6 +121,9 @@ def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
         ({"type": "grid-impedance", "L_g": 1e-9, "R_g": 1.0}, "too fast"),
         ({"type": "grid-breaker", "closed": False}, "load"),
         ({"type": "nonsense"}, "must be one of"),
+        ({"type": "gains", "values": {"k_99": 1.0}}, "parameter k_99: unknown"),
+        ({"type": "gains", "values": {}}, "at least 1"),
+        ({"type": "reset"}, "RUNNING, not SAFE"),
         ({}, "missing"),
     ],
 )

@@ -88,7 +88,7 @@ def test_start_is_at_rest() -> None:
     u = np.zeros(3)
     c.step(REF, u)
     assert u == pytest.approx([0.1, 1.0, 1.2], abs=1e-12)
-    assert np.abs(c.states["trend"]).max() < 1e-12
+    assert np.abs(c.states["trend"][0]).max() < 1e-12
 
 
 # --- checks of y and u ---

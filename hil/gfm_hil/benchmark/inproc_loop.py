@@ -99,7 +99,7 @@ class Loop:
             nonlocal done
             done = run_ticks(
                 b.par, b.st, c.ctl, c.laws, c.states, c.est, b.y, b.u,
-                self.plant, self.controller, 0, n,
+                self.plant, self.controller, 0, n, False,
             )  # fmt: skip
 
         time = seconds(run) / n * 1e9

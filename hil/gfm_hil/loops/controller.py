@@ -23,7 +23,7 @@ from gfm_hil.loops.records import (
     STOPPED_HERE,
 )
 from gfm_hil.recording import record_controller
-from gfm_runtime.controller import RUNNING, SAFE, STOPPED, control, missed
+from gfm_runtime.controller import SAFE, STOPPED, control, heed, missed
 
 _Y_ID = 1
 _LOOKED_NS = 20_000
@@ -33,8 +33,8 @@ _EARLIER = 0.05  # of a tick
 
 @njit(cache=True, nogil=True)
 def controller_ticks(
-    send, receive, patient, handle, spins, out, into, reader, loop, told, ctl, laws, states, est, y, u,
-    rows, times, progress, event,
+    send, receive, patient, handle, spins, out, into, reader, loop, told, ctl, laws, states, est,
+    y, u, rows, times, progress, event,
 ):  # fmt: skip
     """Answer frames; returns why it came back, one of ``gfm_hil.loops.records``.
 
@@ -42,7 +42,8 @@ def controller_ticks(
     before; if frames were lost on the way there, with that tick's y in hand (``pending``).
 
     Args:
-        send, receive, patient, handle, spins, out, into, reader, loop, told: as for ``plant_ticks``.
+        send, receive, patient, handle, spins, out, into, reader, loop, told: as of
+            ``plant_ticks``.
         ctl, laws, states, est: the controller's records.
         y, u: vectors of ``gfm_hil.bench.Bench``.
         rows, times, progress: of the recording's part.
@@ -68,6 +69,7 @@ def controller_ticks(
         r.pending = 0
         k = r.tick
         changes = ctl[0].changes
+        heed(ctl, reader[0].state == SAFE)
         control(ctl, laws, states, est, y, u)
         times[k, 2] = now_ns()
         pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
@@ -75,8 +77,9 @@ def controller_ticks(
         times[k, 3] = now_ns()
         record_controller(rows[k], ctl, est)
         r.done += 1
-        progress[0] = k + 1
-        if ctl[0].state != RUNNING or ctl[0].changes != changes:
+        progress[0], progress[1] = k + 1, ctl[0].reason
+        if ctl[0].state != r.seen or ctl[0].changes != changes:
+            r.seen = ctl[0].state
             return LOOK
         if k + 1 >= event:
             return EVENT
@@ -123,7 +126,8 @@ def _next_frame(
             if r.realtime and r.done > 0:  # before tick 0 nothing can be stale
                 while ctl[0].stale < (now - r.heard) // r.T and ctl[0].state != SAFE:
                     missed(ctl)
-                if ctl[0].state == SAFE:
+                if ctl[0].state != r.seen:
+                    r.seen = ctl[0].state
                     return LOOK
         if told[STOP] != 0:
             return STOPPED_HERE
@@ -132,7 +136,7 @@ def _next_frame(
             return BELL
         if size <= 0:
             between_looks(looks, spins)
-    if reader[0].state == SAFE:
+    if reader[0].state == SAFE and not r.waits:
         return PEER_SAFE
     if reader[0].state == STOPPED:
         return PEER_STOPPED

@@ -27,6 +27,7 @@ from gfm_hil.loops.records import (
     LOOK,
     PEER_SAFE,
     PEER_STOPPED,
+    RESTORE,
     SILENT,
     STOPPED_HERE,
     TOLD,
@@ -35,6 +36,7 @@ from gfm_hil.loops.records import (
 from gfm_hil.recording import Part
 from gfm_hil.timeline import CONTROLLER_LEFT, PLANT_LEFT, Timeline
 from gfm_hil.waiting import part_from
+from gfm_plant import NO_FRESH_U
 from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 from gfm_runtime.signals import Group
 
@@ -85,13 +87,17 @@ def drive_plant(
     """Run the plant's side of a scenario after the handshake; returns its frame counters."""
     loop, ticks = _Loop("plant", bench, link, part, t0_ns, told), bench.scenario.ticks
     loop.loop["u_last"] = loop.loop["u_before"] = bench.u
+    waits = bench.scenario.after_trip == "wait"
     while timeline.running:
         timeline.carry_out(loop.tick)
         why = loop.go(min(timeline.next_tick(), ticks))
         tick = loop.tick
+        if why == RESTORE:
+            bench.restore_plant()
+            loop.loop["u_last"] = loop.loop["u_before"] = bench.u
         timeline.look(max(tick - 1, 0))
-        if why == DONE and tick >= ticks:
-            timeline.end("completed", "", tick)
+        if tick >= ticks and why in (DONE, LOOK, RESTORE):
+            timeline.finish(tick)
         elif why == STOPPED_HERE:
             timeline.end("interrupted", "stopped by the operator", tick)
         elif why == PEER_SAFE:
@@ -101,11 +107,11 @@ def drive_plant(
         elif why == SILENT:
             timeline.end("safe", "the controller's process is gone", tick)
         elif why == LATE:
-            why_late = "no fresh u for longer than late_policy.hold allows"
-            timeline.end("safe", why_late, tick)
+            timeline.end("safe", NO_FRESH_U, tick)
     assert timeline.outcome is not None
-    state = SAFE if timeline.outcome.status == "tripped" else STOPPED
-    loop.last_words(state, int(timeline.outcome.status != "completed"), bench.y)
+    status = timeline.outcome.status
+    state = SAFE if status == "tripped" and not waits else STOPPED
+    loop.last_words(state, int(status != "completed" and loop.tick < ticks), bench.y)
     return loop.reader
 
 
@@ -138,12 +144,12 @@ def drive_controller(
             if loop.reader.reason:
                 timeline.end("interrupted", PLANT_LEFT, tick)
             else:
-                timeline.end("completed", "", tick)
+                timeline.finish(tick)
             loop.last_words(STOPPED, 0, bench.u)
         elif why == SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
             loop.last_words(SAFE, LOST_PEER, bench.u)
-        elif why == LOOK and int(ctl["state"][0]) == SAFE:  # which the look has written down
+        elif not timeline.running:  # the look has found and written down a safe state
             loop.last_words(SAFE, int(ctl["reason"][0]), bench.u)
     return loop.reader
 

@@ -16,6 +16,7 @@ from gfm_hil.loops.records import (
     LOOK,
     PEER_SAFE,
     PEER_STOPPED,
+    RESTORE,
     RING,
     SILENT,
     STOP,
@@ -23,7 +24,9 @@ from gfm_hil.loops.records import (
 )
 from gfm_hil.recording import record_plant
 from gfm_plant import plant_advance, plant_sample
-from gfm_runtime.controller import SAFE, STOPPED
+from gfm_plant.protection import CONTROLLER, SAFE_STATE, trip
+from gfm_plant.protection import SILENT as NOT_HEARD
+from gfm_runtime.controller import PLANT_TRIP, READY, SAFE, STOPPED
 from gfm_runtime.signals import NU
 
 _U_ID = 2
@@ -33,8 +36,8 @@ _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 @njit(cache=True, nogil=True)
 def plant_ticks(
-    send, receive, patient, handle, spins, out, into, reader, loop, told, par, st, y, u, rows, times,
-    progress, last,
+    send, receive, patient, handle, spins, out, into, reader, loop, told, par, st, y, u, rows,
+    times, progress, last,
 ):  # fmt: skip
     """Run ticks until ``last``; returns why it came back, one of ``gfm_hil.loops.records``.
 
@@ -65,7 +68,9 @@ def plant_ticks(
             gap = wait_until(due, spins)
             times[k, 0], times[k, 1] = due, now_ns()
         plant_sample(par, st, y)
-        pack(sequence, frame, message, k, 0, 0, y)
+        tripped = st[0].trip
+        state, reason = (SAFE, PLANT_TRIP) if tripped != 0 else (0, 0)
+        pack(sequence, frame, message, k, state, reason, y)
         send(handle, message)
         sent = now_ns()
         times[k, 2] = sent
@@ -83,7 +88,7 @@ def plant_ticks(
                 break
             again += r.repeat
             r.repeats += 1
-            pack(sequence, frame, message, k, 0, 0, y)
+            pack(sequence, frame, message, k, state, reason, y)
             send(handle, message)
         if came == FRESH:
             for j in range(NU):
@@ -94,7 +99,9 @@ def plant_ticks(
         record_plant(rows[k], y, u, par, st)
         progress[0] = k + 1
         if reader[0].state == SAFE:
-            return PEER_SAFE
+            if not r.waits:
+                return PEER_SAFE
+            trip(st[0], CONTROLLER, SAFE_STATE)
         if reader[0].state == STOPPED:
             return PEER_STOPPED
         if came != FRESH:
@@ -104,13 +111,17 @@ def plant_ticks(
             progress[1] = r.misses
         r.late = 0 if came == FRESH else r.late + 1
         times[k, 4] = gap
-        plant_advance(par, st, u)
         r.tick = k + 1
-        if st[0].trip != 0:
+        if tripped != 0 and reader[0].state == READY and came == FRESH:
+            return RESTORE
+        plant_advance(par, st, u)
+        if r.waits and r.late > r.hold:
+            trip(st[0], CONTROLLER, NOT_HEARD)
+        if st[0].trip != tripped:
             return LOOK
         if r.late * r.T >= r.patience:
             return SILENT
-        if r.late > r.hold:
+        if r.late > r.hold and not r.waits:
             return LATE
     return DONE
 
@@ -130,7 +141,8 @@ def _answer(
         if size > 0:
             tick = unpack(reader, _U_ID, got, got_bytes, size, u)
             # a controller that leaves says so under the last tick it saw
-            if tick == k or reader[0].state == SAFE or reader[0].state == STOPPED:
+            leaves = reader[0].state == STOPPED or (reader[0].state == SAFE and not r.waits)
+            if tick == k or leaves:
                 now = now_ns()
                 if tick == k:
                     times[k, 3] = now

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gfm_hil.scenario_model import Scenario
+from gfm_runtime.controller import RUNNING
 from gfm_runtime.signals import NU
 
 #: why a loop returned
-DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT, BELL = range(9)
+DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT, BELL, RESTORE = range(10)
 
 #: what other threads tell a loop, int64: to come back for good, and, by counting up, for a moment
 STOP, RING, TOLD = range(3)
@@ -32,6 +33,8 @@ loop_dtype = np.dtype(
         ("pending", "i8"),  # a frame was taken but not yet computed
         ("done", "i8"),  # ticks computed
         ("bell", "i8"),  # as last heard
+        ("waits", "i8"),  # after a trip or in SAFE: for a reset, instead of ending the run
+        ("seen", "i8"),  # controller: the state that was last come back with
         ("u_last", "f8", (NU,)),  # the two newest u that came in time
         ("u_before", "f8", (NU,)),
         ("phase", "f8"),  # controller: earliest arrivals of frames after t0 + k T, ns
@@ -49,6 +52,7 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
     link, policy = scenario.link, scenario.late_policy
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
+    loop["waits"], loop["seen"] = scenario.after_trip == "wait", RUNNING
     loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
     loop["T"] = round(scenario.T_s * 1e9)
     loop["patience"], loop["repeat"] = int(link.peer_timeout_s * 1e9), int(link.repeat_s * 1e9)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import zmq
 
 from gfm_hil.errors import UserError
+from gfm_hil.events import CONTROLLER_EVENTS
 from gfm_hil.links.base import SIDES, Side
 from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
-from gfm_runtime.controller import STATES
+from gfm_plant import TRIP_REASONS
+from gfm_runtime.controller import REASONS, STATES
 
 _ANSWER_MS = 6000
+_CONTROLLERS = {get_args(e.model_fields["type"].annotation)[0] for e in CONTROLLER_EVENTS}
 
 
 class Operator:
@@ -45,7 +48,7 @@ class Operator:
         Raises:
             UserError: it was refused, with the reason; or the side is gone.
         """
-        side: Side = "controller" if event.get("type") in ("reference", "law") else "plant"
+        side: Side = "controller" if event.get("type") in _CONTROLLERS else "plant"
         return self._ask(side, event)
 
     def stop(self) -> None:
@@ -56,13 +59,19 @@ class Operator:
                 return
 
     def snapshot(self) -> dict[str, Any]:
-        """The newest recorded tick: every column of the recording by name, ``tick`` and, of the
-        controller, ``state`` in words. A side that has not recorded anything is left out.
+        """The newest recorded tick: every column of the recording by name, and in words.
+
+        Of the plant: ``tick``, ``misses``, ``trip`` ("" without one). Of the controller:
+        ``state``, ``reason`` (why SAFE), ``active`` (name of the law in force), ``gains`` (what of
+        it is not as in its file), ``laws`` (names of those that are ready), ``T_s`` (s). A side
+        that has not recorded anything is left out.
 
         Rows are only ever appended, so that reading them takes nothing from the loop.
         """
         found: dict[str, Any] = {}
-        for side, columns in (("plant", PLANT_COLUMNS), ("controller", CONTROLLER_COLUMNS)):
+        sides: tuple[tuple[Side, tuple[str, ...]], ...]
+        sides = ("plant", PLANT_COLUMNS), ("controller", CONTROLLER_COLUMNS)
+        for side, columns in sides:
             part = Part.open(self._folder, side)
             done = 0 if part is None else int(part.progress[0])
             if part is None or not done:
@@ -70,24 +79,32 @@ class Operator:
             found.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
             if side == "plant":
                 found["tick"], found["misses"] = done - 1, int(part.progress[1])
+                trip = int(found["true_trip"])
+                found["trip"] = TRIP_REASONS[trip] if trip else ""
             else:
                 found["state"] = STATES[int(found["state"])]
+                found["reason"] = REASONS[int(part.progress[1])]
+                if (desk := self._desk(side)) is not None:
+                    law = desk["laws"][int(found["law"])]
+                    found["active"], found["gains"] = law["name"], law["gains"]
+                    found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found
 
-    def _desk(self, side: Side) -> str:
+    def _desk(self, side: Side) -> dict[str, Any] | None:
+        """What a side's desk announces, or None if there is none."""
         try:
-            text = (self._folder / f"desk_{side}.json").read_text(encoding="utf-8")
-            return str(json.loads(text)["endpoint"])
+            found = json.loads((self._folder / f"desk_{side}.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            return ""
+            return None
+        return dict(found)
 
     def _ask(self, side: Side, content: dict[str, Any]) -> dict[str, Any]:
-        endpoint = self._desk(side)
-        if not endpoint:
+        desk = self._desk(side)
+        if desk is None:
             raise UserError(f"{self._folder}: the {side} is not running")
         with self._context.socket(zmq.REQ) as socket:
             socket.set(zmq.LINGER, 0)
-            socket.connect(endpoint)
+            socket.connect(desk["endpoint"])
             socket.send_json(content)
             if not socket.poll(_ANSWER_MS):
                 raise UserError(f"{self._folder}: the {side} does not answer")

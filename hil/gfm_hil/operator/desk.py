@@ -22,8 +22,16 @@ from pydantic import TypeAdapter, ValidationError
 from gfm_hil import scratch
 from gfm_hil.bench import Bench
 from gfm_hil.errors import UserError, lines
-from gfm_hil.events import CONTROLLER_EVENTS, Event, LawChange, apply_grid_event
+from gfm_hil.events import (
+    CONTROLLER_EVENTS,
+    Event,
+    Gains,
+    LawChange,
+    Reset,
+    apply_grid_event,
+)
 from gfm_hil.links.base import Side
+from gfm_hil.retune import retuned
 from gfm_hil.timeline import Timeline
 
 _LOOK_MS = 100
@@ -74,7 +82,8 @@ class Desk:
             self._resources = stack.pop_all()
         self._thread = threading.Thread(target=self._serve, name=f"{self._side}-desk", daemon=True)
         self._thread.start()
-        self._announcement.write_text(json.dumps({"endpoint": endpoint}), encoding="utf-8")
+        self._endpoint = endpoint
+        self._announce()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -82,6 +91,18 @@ class Desk:
         self._over.set()
         self._thread.join()
         self._resources.close()
+
+    def _announce(self) -> None:
+        """Write down where we are to be found, and which laws the recording's indices mean."""
+        c = self._bench.controller
+        content = {"endpoint": self._endpoint, "T_s": c.T_s, "names": list(c.sets)}
+        content["laws"] = [
+            {"label": label, "name": name, "gains": gains}
+            for label, name, gains in zip(c.labels, c.names, c.changed, strict=True)
+        ]
+        new = self._announcement.with_suffix(".new")
+        new.write_text(json.dumps(content), encoding="utf-8")
+        new.replace(self._announcement)
 
     def _serve(self) -> None:
         while not self._over.is_set():
@@ -121,6 +142,12 @@ class Desk:
         if isinstance(event, LawChange) and event.law not in self._bench.controller.sets:
             ready = sorted(self._bench.controller.sets)
             raise ValueError(f"law = {event.law!r}: not made ready for this run; ready are {ready}")
+        c = self._bench.controller
+        if isinstance(event, Gains):
+            gains = {**c.gains, **event.values}
+            retuned(c.asked, tuple(sorted(gains.items())), c.T_s)
+        if isinstance(event, Reset) and self._bench.scenario.after_trip == "end":
+            raise ValueError("reset: this run ends at a trip; after_trip = 'wait' in its scenario")
         if ours == "plant":
             par, st = self._bench.par.copy(), self._bench.st.copy()
             apply_grid_event(event, par, st)
@@ -137,4 +164,6 @@ class Desk:
                 return {"ok": False, "error": "the run is over" if over else late}
         if ticket.error:
             return {"ok": False, "error": ticket.error}
+        if isinstance(event, Gains):
+            self._announce()
         return {"ok": True, "tick": ticket.tick, "label": event.label()}
