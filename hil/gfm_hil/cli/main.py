@@ -22,8 +22,10 @@ from gfm_runtime import LawError
 MODULES = {
     "run": "run",
     "tell": "tell",
+    "scope": "scope",
     "modbus": "modbus",
     "export": "export",
+    "stream": "stream",
     "compare": "compare",
     "campaign": "campaign",
     "bench": "bench",

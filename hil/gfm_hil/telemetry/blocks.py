@@ -1,0 +1,95 @@
+"""Every tick as blocks, for tools of our own: on the wire a block is a ``.npy`` file.
+
+Two parts a message: the topic ``gfmhil/plant`` or ``gfmhil/controller``, and a record array with
+the field ``tick``, the signals (float64) and the times (int64, ns, under their names with ``_ns``).
+They travel by a port of their own: who subscribes to everything, as PlotJuggler does by default,
+gets samples only.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from gfm_hil.telemetry.follow import COLUMNS, TIMES, Rows
+
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
+_TOPIC = "gfmhil/"
+_MOST = 5000  # rows a message: about 1 MB
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows of one side.
+
+    Attributes:
+        side: ``"plant"`` or ``"controller"``.
+        rows: record array, shape (n,); ``rows["tick"]`` tells of gaps.
+    """
+
+    side: str
+    rows: NDArray[np.void]
+
+
+def block_dtype(side: str) -> np.dtype:
+    """One row of a side."""
+    signals, times = COLUMNS[side], TIMES[side]
+    return np.dtype(
+        [("tick", "<i8"), *((n, "<f8") for n in signals), *((f"{n}_ns", "<i8") for n in times)]
+    )
+
+
+def messages(rows: Rows) -> list[list[bytes]]:
+    """The messages that carry some rows."""
+    whole = np.empty(len(rows.signals), block_dtype(rows.side))
+    whole["tick"] = np.arange(rows.first, rows.first + len(whole))
+    for j, name in enumerate(COLUMNS[rows.side]):
+        whole[name] = rows.signals[:, j]
+    for j, name in enumerate(TIMES[rows.side]):
+        whole[f"{name}_ns"] = rows.times[:, j]
+    out = []
+    for first in range(0, len(whole), _MOST):
+        file = io.BytesIO()
+        np.save(file, whole[first : first + _MOST], allow_pickle=False)
+        out.append([f"{_TOPIC}{rows.side}".encode(), file.getvalue()])
+    return out
+
+
+class BlockReader:
+    """Receives blocks; use as a context manager.
+
+    Args:
+        endpoint: where ``gfmhil stream`` says that blocks are.
+        side: ``"plant"`` or ``"controller"`` alone; both if empty.
+    """
+
+    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, side: str = "") -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.set(zmq.RCVHWM, 0)  # what waits here is ours to lose, not libzmq's
+        self._socket.subscribe(f"{_TOPIC}{side}")
+        self._socket.connect(endpoint)
+
+    def __enter__(self) -> BlockReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._context.destroy(linger=0)
+
+    def receive(self, timeout_s: float) -> Block | None:
+        """The next block, or None if none came in time."""
+        if not self._socket.poll(round(timeout_s * 1e3)):
+            return None
+        topic, payload = self._socket.recv_multipart()
+        rows = np.load(io.BytesIO(payload), allow_pickle=False)
+        return Block(topic.decode().removeprefix(_TOPIC), rows)

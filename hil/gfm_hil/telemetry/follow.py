@@ -1,0 +1,112 @@
+"""Following the recording of a run that is going on, row by row, from now on."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.recording import CONTROLLER_COLUMNS, CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
+
+COLUMNS = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
+TIMES = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
+
+_LAST = 1  # rows not looked at yet: a tick's last time is written after it counts as done
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of one side, as they are in ``recording.Part``.
+
+    Attributes:
+        side: whose.
+        first: tick of the first one.
+        signals: shape (n, columns), the units of the recording; NaN in ticks never recorded.
+        times: shape (n, columns), int64, ns.
+    """
+
+    side: Side
+    first: int
+    signals: NDArray[np.float64]
+    times: NDArray[np.int64]
+
+    def time(self, name: str) -> NDArray[np.int64]:
+        """A column of ``times`` by its name."""
+        return self.times[:, TIMES[self.side].index(name)]
+
+
+class Follower:
+    """The parts of a run as they grow.
+
+    Args:
+        folder: of a run that has begun.
+
+    Raises:
+        UserError: it is no run folder, or the run is over.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if (folder / "summary.json").is_file():
+            raise UserError(f"{folder}: the run is over, see gfmhil export")
+        if not begun(folder):
+            raise UserError(f"{folder}: no run is going on there; --wait waits for one")
+        scenario = tomllib.loads((folder / "scenario.toml").read_text(encoding="utf-8"))
+        self.folder, self.T_s = folder, float(scenario["T_s"])
+        self.parts: dict[Side, Part] = {}
+        self._next: dict[Side, int] = {}
+        self.over = False
+        self._find(from_now=True)
+
+    def _find(self, from_now: bool) -> None:
+        for side in SIDES:
+            if side not in self.parts and (part := Part.open(self.folder, side)) is not None:
+                self.parts[side] = part
+                self._next[side] = int(part.progress[0]) if from_now else 0
+
+    def news(self) -> list[Rows]:
+        """What has been recorded since the last call; ``over`` tells that there will be no more."""
+        self.over = not (self.folder / "parts").is_dir()  # put together, and gone
+        self._find(from_now=False)
+        found = []
+        for side, part in self.parts.items():
+            first, done = self._next[side], int(part.progress[0]) - (0 if self.over else _LAST)
+            if done > first:
+                self._next[side] = done
+                rows = slice(first, done)
+                signals, times = np.asarray(part.signals[rows]), np.asarray(part.times[rows])
+                found.append(Rows(side, first, signals, times))
+        return found
+
+    def misses_before(self) -> int:
+        """Misses in the ticks before those that the next call of ``news`` will find."""
+        part = self.parts.get("plant")
+        if part is None:
+            return 0
+        times = np.asarray(part.times[: self._next["plant"]])
+        return int(missed(Rows("plant", 0, part.signals[:0], times)).sum())
+
+
+def missed(rows: Rows) -> NDArray[np.bool_]:
+    """Ticks of the plant, in real time, whose u did not come in time."""
+    return (rows.time("scheduled") >= 0) & (rows.time("received") < 0)
+
+
+def slack_us(rows: Rows, T_s: float) -> NDArray[np.float64]:
+    """Time left between the arrival of u[k] at the plant and the next deadline, µs.
+
+    NaN where there is no deadline or u was not in time.
+    """
+    due, received = rows.time("scheduled"), rows.time("received")
+    left = (due + round(T_s * 1e9) - received) * 1e-3
+    return np.where((due >= 0) & (received >= 0), left, np.nan)
+
+
+def begun(folder: Path) -> bool:
+    """A run that has begun to record, and of which it is known what."""
+    recorded = any((folder / f"parts/{side}_progress.npy").is_file() for side in SIDES)
+    return recorded and (folder / "scenario.toml").is_file()

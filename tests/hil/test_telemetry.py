@@ -1,0 +1,237 @@
+"""What a run sends on: to a subscriber made from PlotJuggler's documented format and to ours."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections import defaultdict
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from gfm_hil.cli import main
+from gfm_hil.operator import Operator
+from gfm_hil.recording import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
+from gfm_hil.telemetry import BlockReader
+from gfm_hil.telemetry.blocks import block_dtype, messages
+from gfm_hil.telemetry.follow import Rows
+from gfm_hil.telemetry.samples import Sampler
+
+SCENARIO = """
+title = "sent on"
+duration = 600.0
+mode = "{mode}"
+late_policy = {{ hold = 100000 }}
+[link]
+type = "shm"
+peer_timeout_s = 30.0
+"""
+PATIENCE_S = 100.0
+
+
+class PlotJuggler:
+    """The ZeroMQ subscriber of PlotJuggler 3 as its page and its source say: a SUB that connects
+    and takes all topics; one part is a payload, of two the first is the topic, a third would be
+    the time; JSON whose numbers become series by their path below the topic."""
+
+    def __init__(self, port: str) -> None:
+        self.context = zmq.Context()
+        self.socket = self.context.socket(zmq.SUB)
+        self.socket.subscribe(b"")
+        self.socket.connect(f"tcp://localhost:{port}")
+        self.series: dict[str, list[tuple[float, float]]] = defaultdict(list)
+
+    def receive(self, timeout_s: float) -> bool:
+        if not self.socket.poll(timeout_s * 1e3):
+            return False
+        parts = self.socket.recv_multipart()
+        assert len(parts) in (1, 2)  # its versions to date spoil the payload before a third
+        topic = parts[0].decode() if len(parts) == 2 else ""
+        sample = json.loads(parts[-1], parse_constant=pytest.fail)  # NaN is not JSON
+        self._flatten(topic, sample, sample["timestamp"])
+        return True
+
+    def _flatten(self, path: str, value: object, t: float) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                self._flatten(f"{path}/{key}", inner, t)
+        elif isinstance(value, (int, float)):
+            self.series[path].append((t, float(value)))
+
+
+def run_and_stream(start, folder: Path, mode: str, *options: str):
+    """A run and its stream; returns both processes and the ports of samples and blocks."""
+    file = folder.parent / "sent.toml"
+    file.write_text(SCENARIO.format(mode=mode), encoding="utf-8")
+    stream = start("stream", str(folder), "--wait", "--port", "0", *options)
+    run = start("run", str(file), "--out", str(folder), "--quiet", "--no-figures")
+    ports = [stream.stdout.readline().split()[1].rpartition(":")[2] for _ in range(2)]
+    return run, stream, ports
+
+
+def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[str, np.ndarray]:
+    """End the run; returns what it recorded."""
+    operator = Operator(folder)
+    operator.stop()
+    operator.close()
+    run.communicate(timeout=PATIENCE_S)
+    _, said = stream.communicate(timeout=PATIENCE_S)
+    assert (run.returncode, stream.returncode) == (130, 0)
+    assert said.endswith(" ticks sent on\n")
+    with np.load(folder / "signals.npz") as signals, np.load(folder / "timing.npz") as times:
+        return {**signals, **times}
+
+
+def test_plotjuggler_reads_what_was_recorded(start, tmp_path):
+    folder = tmp_path / "run"
+    run, stream, (port, _) = run_and_stream(start, folder, "lockstep", "--rate", "500")
+    juggler = PlotJuggler(port)
+    until = time.monotonic() + PATIENCE_S
+    while any(len(juggler.series[f"gfmhil/{s}/tick"]) < 200 for s in ("plant", "controller")):
+        assert time.monotonic() < until
+        juggler.receive(1.0)
+    recorded = stop(folder, run, stream)
+    ticks = {side: [int(k) for _, k in juggler.series[f"gfmhil/{side}/tick"]]
+             for side in ("plant", "controller")}  # fmt: skip
+    for path, points in juggler.series.items():
+        _, side, *rest = path.split("/")
+        name = "_".join(rest)
+        if name in recorded and name != "tick":
+            seen = np.array(points)
+            np.testing.assert_array_equal(seen[:, 1], recorded[name][ticks[side]])
+            np.testing.assert_allclose(seen[:, 0], recorded["t"][ticks[side]], atol=1e-9)
+    for path in ("plant/y/p", "plant/u/E_u", "plant/true/omega_g", "controller/ref/P_ref",
+                 "controller/state"):  # fmt: skip
+        assert len(juggler.series[f"gfmhil/{path}"]) >= 200
+    assert {k % 20 for side in ticks.values() for k in side} == {0}  # 500 Hz of 10 kHz
+    assert {misses for _, misses in juggler.series["gfmhil/plant/misses"]} == {0.0}
+    assert "gfmhil/plant/slack_us" not in juggler.series  # lockstep has no deadlines
+
+
+def test_blocks_have_every_tick(start, tmp_path):
+    folder = tmp_path / "run"
+    run, stream, (_, port) = run_and_stream(start, folder, "lockstep")
+    found = defaultdict(list)
+    with BlockReader(f"tcp://127.0.0.1:{port}") as reader:
+        until = time.monotonic() + PATIENCE_S
+        while min(len(found["plant"]), len(found["controller"])) < 10:
+            assert time.monotonic() < until
+            if block := reader.receive(1.0):
+                found[block.side].append(block.rows)
+    recorded = stop(folder, run, stream)
+    for side, times in (("plant", PLANT_TIMES), ("controller", CONTROLLER_TIMES)):
+        rows = np.concatenate(found[side])
+        ticks = rows["tick"]
+        assert (np.diff(ticks) == 1).all()
+        for name in rows.dtype.names[1:]:
+            plain = name.removesuffix("_ns")
+            whole = recorded[f"{side}_{plain}" if name != plain and plain in times else name]
+            np.testing.assert_array_equal(rows[name], whole[ticks], err_msg=name)
+
+
+def test_samples_of_a_run_in_real_time_tell_misses_and_slack(start, tmp_path):
+    folder = tmp_path / "run"
+    run, stream, (port, _) = run_and_stream(start, folder, "realtime")
+    juggler = PlotJuggler(port)
+    until = time.monotonic() + PATIENCE_S
+    while len(juggler.series["gfmhil/plant/slack_us"]) < 100:
+        assert time.monotonic() < until
+        juggler.receive(1.0)
+    recorded = stop(folder, run, stream)
+    due, received = recorded["plant_scheduled"], recorded["plant_received"]
+    misses = np.cumsum((due >= 0) & (received < 0))
+    slack = np.where(received >= 0, (due + 100_000 - received) * 1e-3, np.inf)
+    for (_, tick), (_, count) in zip(
+        juggler.series["gfmhil/plant/tick"], juggler.series["gfmhil/plant/misses"], strict=True
+    ):
+        assert misses[int(tick)] == count
+    ticks = [int(k) for _, k in juggler.series["gfmhil/plant/tick"]]
+    told = dict(juggler.series["gfmhil/plant/slack_us"])
+    for before, tick in pairwise(ticks):
+        least = slack[before + 1 : tick + 1].min()
+        assert told.get(round(tick * 1e-4, 9), np.inf) == pytest.approx(least, abs=1e-3)
+
+
+def rows(first: int, count: int, **columns: np.ndarray) -> Rows:
+    """Rows of a plant in real time in which all is well but what is given."""
+    times = np.zeros((count, len(PLANT_TIMES)), np.int64)
+    times[:, 0] = 1_000_000_000 + (first + np.arange(count)) * 100_000
+    times[:, 3] = times[:, 0] + 40_000
+    for name, values in columns.items():
+        times[:, PLANT_TIMES.index(name)] = values
+    return Rows("plant", first, np.ones((count, len(PLANT_COLUMNS))), times)
+
+
+def parsed(found: list[list[bytes]]) -> list[dict]:
+    return [json.loads(payload) for _, payload in found]
+
+
+def test_samples_count_misses_on_and_keep_the_least_slack():
+    sampler = Sampler(1e-4, 1000.0, misses=5)
+    received = rows(3, 25).time("received").copy()
+    received[[4, 20]] = -1  # ticks 7 and 23
+    received[9] += 30_000  # tick 12
+    found = parsed(sampler.messages(rows(3, 25, received=received), 25e-4))
+    assert [s["tick"] for s in found] == [10, 20]
+    assert [s["misses"] for s in found] == [6, 6]
+    assert [s["slack_us"] for s in found] == [60.0, 30.0]
+    assert parsed(sampler.messages(rows(28, 10), 1e-3))[0]["misses"] == 7
+
+
+def test_a_run_faster_than_real_time_is_thinned_out():
+    sampler = Sampler(1e-4, 1000.0, misses=0)
+    assert len(sampler.messages(rows(0, 2000), 0.2)) == 200
+    assert len(sampler.messages(rows(2000, 2000), 0.02)) == 20
+    assert len(sampler.messages(rows(4000, 2000), 0.19)) == 200  # not for a moment's haste
+
+
+def test_ticks_never_recorded_and_numbers_that_json_has_not_are_left_out():
+    some = rows(0, 3)
+    some.signals[0] = np.nan
+    some.signals[1, 2] = np.inf
+    found = parsed(Sampler(1e-4, 10_000.0, misses=0).messages(some, 3e-4))
+    assert [s["tick"] for s in found] == [1, 2]
+    assert set(found[1]["y"]) - set(found[0]["y"]) == {"omega_u"}
+
+
+def test_large_blocks_are_cut():
+    found = messages(rows(7, 12_000))
+    assert [topic for topic, _ in found] == [b"gfmhil/plant"] * 3
+    assert max(len(payload) for _, payload in found) < 5010 * block_dtype("plant").itemsize
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere"], "nowhere: no run is going on there; --wait waits for one"),
+        (["over"], "over: the run is over, see gfmhil export"),
+        (["x", "--port", "70000"], "--port 70000: must be 0 (any) to 65535"),
+        (["x", "--port", "65535"], "--port 65535: has no next one, give --blocks"),
+        (["x", "--blocks", "-1"], "--blocks -1: must be 0"),
+        (["x", "--rate", "0"], "--rate 0: must lie in [0.1, 1e6] Hz"),
+        (["x", "--rate", "nan"], "--rate nan: must lie in"),
+        (["x", "--host", "0.0.0.0"], "--host 0.0.0.0: goes beyond this machine, unencrypted"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    Path("over").mkdir()
+    Path("over/summary.json").touch()
+    assert main(["stream", *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_named(start, tmp_path):
+    folder = tmp_path / "run"
+    run, stream, (port, _) = run_and_stream(start, folder, "lockstep")
+    again = start("stream", str(folder), "--port", port)
+    _, error = again.communicate(timeout=PATIENCE_S)
+    assert again.returncode == 2
+    assert f"--port {port}: tcp://127.0.0.1:{port}: Address already in use" in error
+    stop(folder, run, stream)
