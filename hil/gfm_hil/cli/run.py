@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import sys
 from typing import Any
 
 from gfm_hil.cli.common import (
@@ -16,6 +18,7 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.runner import run_scenario
 from gfm_hil.scenario import find_scenario
+from gfm_hil.scope.beside import scope_beside
 
 
 def add(commands: Any) -> None:
@@ -27,6 +30,10 @@ def add(commands: Any) -> None:
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.add_argument("--no-figures", action="store_true", help="neither figures nor report")
+    command.add_argument(
+        "--scope", nargs="?", type=int, const=-1, metavar="PORT",
+        help="serve a scope of it to the browser; it stays when the run is over, until Ctrl-C",
+    )  # fmt: skip
     command.set_defaults(call=call)
 
 
@@ -34,10 +41,19 @@ def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
     scenario = resolve(options, law=options.law)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
-    with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-        run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
-    if options.json:
-        print(json.dumps(run.summary, indent=2))
-    else:
-        print_summary(run.summary, folder)
+    with contextlib.ExitStack() as stack:
+        scope = None
+        if options.scope is not None:
+            port = None if options.scope < 0 else options.scope
+            scope = stack.enter_context(scope_beside(folder, port))
+        with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+            run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
+        if options.json:
+            print(json.dumps(run.summary, indent=2), flush=True)
+        else:
+            print_summary(run.summary, folder)
+        if scope is not None and scope.poll() is None and run.summary["status"] != "interrupted":
+            print("the scope stays open until Ctrl-C", file=sys.stderr, flush=True)
+            with contextlib.suppress(KeyboardInterrupt):
+                scope.wait()
     return exit_code(run.summary)

@@ -1,0 +1,65 @@
+"""Who may see a scope, and who may touch: hosts, origins, the token, and the page's policy."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+import socket
+from collections.abc import Iterable
+from urllib.parse import urlsplit
+
+from websockets.datastructures import Headers
+
+#: sent with every answer: nothing from elsewhere, nothing inline, in nobody's frame
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class Access:
+    """The rules of one server.
+
+    Args:
+        names: hosts, beside addresses, localhost and this machine's name, by which it is reached.
+    """
+
+    def __init__(self, names: Iterable[str] = ()) -> None:
+        self._names = {"localhost", socket.gethostname().lower(), *(n.lower() for n in names)}
+        self.token = secrets.token_urlsafe(16)
+
+    def refusal(self, headers: Headers) -> str:
+        """Why a request is refused; empty if it is not.
+
+        A page of somebody else's must not reach the scope through the browser of whoever looks at
+        it: not by its own address (the origin differs) and not by a name of its own that it lets
+        point here (a name that is not ours). Addresses cannot be made to point elsewhere.
+        """
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(hosts) != 1 or not self._ours(hosts[0]):
+            return f"Host = {hosts}: not a name of this scope (--name adds one)"
+        if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+            return f"Origin = {origins}: not this scope's own page"
+        return ""
+
+    def _ours(self, authority: str) -> bool:
+        try:
+            host = urlsplit(f"//{authority}").hostname or ""
+        except ValueError:
+            return False
+        try:
+            ipaddress.ip_address(host)
+        except ValueError:
+            return host in self._names
+        return True
+
+    def may_control(self, token: str) -> bool:
+        """The token is the one that was printed."""
+        return hmac.compare_digest(token.encode(), self.token.encode())

@@ -1,0 +1,203 @@
+"""The recording behind a scope: of a run that is going on, or of one that is over."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.errors import UserError
+from gfm_hil.recording import (
+    CONTROLLER_COLUMNS,
+    CONTROLLER_TIMES,
+    PLANT_COLUMNS,
+    PLANT_TIMES,
+    Part,
+)
+from gfm_hil.scope.channels import Columns
+from gfm_hil.timeline import read_log
+from gfm_plant import load_converter
+from gfm_runtime import LawError, load_law
+
+Law = dict[str, str]  #: label and name of a law, and in words what of it is not as in its file
+
+_BEHIND = 2000  # ticks that the controller's rows may be behind before they are not waited for
+_COLUMNS = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
+_TIMES = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
+
+
+@dataclass
+class Record:
+    """Rows of a run as columns by name, and what is known about the run.
+
+    Attributes:
+        folder: of the run.
+        scenario: as resolved; plain data, so that a run can be looked at without its law files.
+        columns: of what has been recorded so far.
+        laws: what the indices in column ``law`` mean, see ``_law``.
+        live: the run may still go on.
+    """
+
+    folder: Path
+    scenario: dict[str, Any]
+    columns: Columns = field(default_factory=dict)
+    laws: list[Law] = field(default_factory=list)
+    live: bool = True
+
+    def __post_init__(self) -> None:
+        self.T_s = float(self.scenario["T_s"])
+        self.capacity = round(self.scenario["duration"] / self.T_s)
+        self._parts: dict[str, Part] = {}
+        self._done = 0
+
+    @property
+    def f_b(self) -> float:
+        """Frequency that 1 p.u. stands for, Hz.
+
+        Raises:
+            UserError: the scenario's converter is not to be had.
+        """
+        name = self.scenario["plant"]["converter"]
+        try:
+            return load_converter(name).bases.omega_b / (2 * math.pi)
+        except (OSError, ValueError) as problem:
+            raise UserError(f"plant.converter = {name!r}: {problem}") from None
+
+    def done(self) -> int:
+        """Ticks that can be read; also finds the parts of a run that has just begun."""
+        if not self.live:
+            return self._done
+        for side in ("plant", "controller"):
+            if side not in self._parts and (part := Part.open(self.folder, side)) is not None:
+                self._parts[side] = part
+                self.columns = {**self.columns, **_columns(side, part)}
+        counts = [int(part.progress[0]) for part in self._parts.values()]
+        if counts:  # rows of both, unless one side is not there or has stopped recording
+            least, most = min(counts), max(counts)
+            self._done = max(self._done, least if most - least < _BEHIND else most - _BEHIND)
+        return self._done
+
+    def finish(self) -> None:
+        """The run is over: nothing is appended any more."""
+        counts = [int(part.progress[0]) for part in self._parts.values()]
+        self._done, self.live = max([self._done, *counts]), False
+
+    def look_up_laws(self) -> None:
+        """See what indices in column ``law`` mean now: gains may have been changed."""
+        try:
+            desk = json.loads((self.folder / "desk_controller.json").read_text("utf-8"))
+        except (OSError, ValueError):  # no controller of ours, or it is over
+            return
+        self.laws = [_law(law["label"], law["name"], law["gains"]) for law in desk["laws"]]
+
+    def events(self) -> list[dict[str, Any]]:
+        """What has happened so far, in order of time."""
+        whole = self.folder / "events.jsonl"
+        return read_log(whole) if whole.is_file() else read_log(*self.folder.glob("events_*.jsonl"))
+
+    def summary(self) -> dict[str, Any] | None:
+        """How the run ended, once it has."""
+        try:
+            content: Any = json.loads((self.folder / "summary.json").read_text("utf-8"))
+        except (OSError, ValueError):
+            return None
+        return dict(content)
+
+
+def begun(folder: Path) -> bool:
+    """There is something to look at: a run that has begun to record, or one that is over."""
+    return (folder / "signals.npz").is_file() or any(
+        (folder / "parts" / f"{side}_progress.npy").is_file() for side in _COLUMNS
+    )
+
+
+def open_record(folder: Path) -> Record:
+    """The recording in a run folder.
+
+    Raises:
+        UserError: it is no run folder, or one without a recording.
+    """
+    file = folder / "scenario.toml"
+    try:
+        scenario = tomllib.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or problem
+        raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}") from None
+    if (folder / "summary.json").is_file():
+        return _finished(folder, scenario)
+    if not begun(folder):
+        raise UserError(f"{folder}: nothing has been recorded there")
+    return Record(folder, scenario, laws=_laws(scenario))
+
+
+def _finished(folder: Path, scenario: dict[str, Any]) -> Record:
+    try:
+        columns = {**_mapped(folder / "signals.npz"), **_mapped(folder / "timing.npz")}
+        laws = [_law(str(label)) for label in columns.pop("laws")]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as problem:
+        raise UserError(f"{folder}: signals.npz or timing.npz cannot be read: {problem}") from None
+    record = Record(folder, scenario, columns, laws, live=False)
+    record._done = record.capacity = len(columns["tick"])
+    return record
+
+
+def _columns(side: str, part: Part) -> dict[str, NDArray[Any]]:
+    """Columns of a side under the names that they have in signals.npz and timing.npz."""
+    signals, times = np.asarray(part.signals), np.asarray(part.times)
+    found = {name: signals[:, j] for j, name in enumerate(_COLUMNS[side])}
+    return found | {f"{side}_{name}": times[:, j] for j, name in enumerate(_TIMES[side])}
+
+
+def _mapped(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of an .npz without reading them: what ``np.savez`` writes is stored as it is."""
+    found: dict[str, NDArray[Any]] = {}
+    with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+        for info in archive.infolist():
+            if info.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{info.filename} is compressed")
+            file.seek(info.header_offset + 26)  # lengths of name and extra field, PKWARE APPNOTE
+            lengths = np.frombuffer(file.read(4), "<u2")
+            file.seek(info.header_offset + 30 + int(lengths.sum()))
+            version = np.lib.format.read_magic(file)
+            header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            shape, _, dtype = header(file)
+            if 0 in shape:
+                array = np.empty(shape, dtype)
+            else:
+                array = np.asarray(np.memmap(path, dtype, "r", file.tell(), shape))
+            found[info.filename.removesuffix(".npy")] = array
+    return found
+
+
+def ready(scenario: dict[str, Any]) -> list[str]:
+    """Names of the laws that a run can change to, the first one first."""
+    changes = [e["law"] for e in scenario.get("events", []) if e["type"] == "law"]
+    return list(dict.fromkeys([scenario["law"], *changes, *scenario.get("ready_laws", [])]))
+
+
+def _laws(scenario: dict[str, Any]) -> list[Law]:
+    """The laws as the controller numbers them: a scheduled one has several stages."""
+    laws: list[Law] = []
+    for name in ready(scenario):
+        try:
+            stages = len(load_law(name).laws)
+        except LawError as problem:
+            raise UserError(str(problem)) from None
+        laws += [_law(name)] if stages == 1 else [_law(f"{name}[{k}]") for k in range(stages)]
+    return laws
+
+
+def _law(label: str, name: str = "", gains: dict[str, float] | None = None) -> Law:
+    changed = ", ".join(f"{key} = {value:g}" for key, value in (gains or {}).items())
+    name = name or label.partition("[")[0]
+    return {"label": name if changed else label, "name": name, "gains": changed}

@@ -1,0 +1,222 @@
+"""The scope's server: one port for page and WebSocket, one look at the run 30 times a second."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+import os
+import ssl
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from gfm_hil.errors import UserError
+from gfm_hil.operator import Operator
+from gfm_hil.scenario_model import INPROC
+from gfm_hil.scope.access import HEADERS, Access
+from gfm_hil.scope.channels import make_channels
+from gfm_hil.scope.pyramid import Pyramid
+from gfm_hil.scope.record import Record
+from gfm_hil.scope.record import ready as ready_laws
+from gfm_hil.scope.session import Session
+from gfm_runtime.controller import STATES
+from gfm_runtime.signals import group
+
+FRAMES_PER_S = 30
+_LOG_S = 0.25  # between two looks at what has happened
+_LARGEST = 16384  # bytes of a message from a page
+_PAGES = 16  # at a time
+_EVENTS = 500  # of the newest, told to pages
+
+_STATIC = Path(__file__).resolve().parent / "static"
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+_SOCKET = "/socket"
+
+
+def static_files() -> dict[str, tuple[str, bytes]]:
+    """Everything that is served, by its path: content type and content."""
+    found = {
+        f"/{path.relative_to(_STATIC).as_posix()}": (_TYPES[path.suffix], path.read_bytes())
+        for path in _STATIC.rglob("*")
+        if path.suffix in _TYPES
+    }
+    return {**found, "/": found["/index.html"]}
+
+
+class Scope:
+    """A server for one run.
+
+    Args:
+        record: of the run.
+        access: who may do what.
+    """
+
+    def __init__(self, record: Record, access: Access) -> None:
+        self.record, self.access = record, access
+        channels = make_channels(record.T_s, record.f_b)
+        self._pyramid = Pyramid(record, channels)
+        self._sessions: set[Session] = set()
+        self._events: list[dict[str, Any]] = []
+        self._static = static_files()
+        self._operator: Operator | None = None
+        self._commands = asyncio.Lock()
+
+    async def serve(
+        self,
+        host: str,
+        ports: list[int],
+        encryption: ssl.SSLContext | None,
+        ready: Callable[[int], None],
+    ) -> None:
+        """Serve until cancelled.
+
+        Args:
+            host: address to listen at.
+            ports: to try, in this order; 0 is any that is free.
+            encryption: for https, if it is to be.
+            ready: told the port.
+
+        Raises:
+            UserError: none of the ports is to be had.
+        """
+        async with await self._listen(host, ports, encryption) as server:
+            ready(next(iter(server.sockets)).getsockname()[1])
+            log = asyncio.create_task(self._follow_log())
+            try:
+                await self._frames()
+            finally:
+                log.cancel()
+
+    async def _listen(
+        self, host: str, ports: list[int], encryption: ssl.SSLContext | None
+    ) -> Server:
+        for port in ports:
+            try:
+                return await serve(
+                    self._page, host, port, ssl=encryption, process_request=self._answer,
+                    compression=None, max_size=_LARGEST, max_queue=8, server_header=None,
+                )  # fmt: skip
+            except OSError as problem:
+                reason = os.strerror(problem.errno) if problem.errno else str(problem)
+        raise UserError(f"--host {host} --port {ports[0]}: {reason}")
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The files; None for the WebSocket."""
+        refusal = self.access.refusal(request.headers)
+        if refusal:
+            return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", refusal)
+        path = request.path.partition("?")[0]
+        if path == _SOCKET:
+            if len(self._sessions) < _PAGES:
+                return None
+            text = f"{_PAGES} pages look already"
+            return _response(http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", text)
+        if path not in self._static:
+            return _response(http.HTTPStatus.NOT_FOUND, "text/plain", "not found")
+        kind, content = self._static[path]
+        return _response(http.HTTPStatus.OK, kind, content)
+
+    async def _page(self, socket: ServerConnection) -> None:
+        session = Session(socket, self._pyramid, self.access, self._tell)
+        self._sessions.add(session)
+        try:
+            await session.say("about", **self._about())
+            await session.say("events", **self._happened())
+            await session.listen()
+        finally:
+            self._sessions.discard(session)
+
+    async def _frames(self) -> None:
+        """Take in what is new and show it, at a steady pace."""
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while True:
+            while not self._pyramid.update():
+                await asyncio.sleep(0)
+            for session in list(self._sessions):
+                session.picture()
+            due = max(due + 1 / FRAMES_PER_S, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    async def _follow_log(self) -> None:
+        """Tell pages what has happened, and see when the run is over."""
+        while True:
+            events = await asyncio.to_thread(self.record.events)
+            over = self.record.live and self.record.summary() is not None
+            if over:
+                self.record.finish()
+            laws = self.record.laws
+            self.record.look_up_laws()
+            if over or len(events) != len(self._events) or laws != self.record.laws:
+                self._events = events
+                for session in list(self._sessions):
+                    await session.say("events", **self._happened())
+            await asyncio.sleep(_LOG_S)
+
+    def _happened(self) -> dict[str, Any]:
+        return {
+            "events": self._events[-_EVENTS:],
+            "summary": self._ended(),
+            "labels": self.record.laws,
+        }
+
+    def _ended(self) -> dict[str, Any] | None:
+        summary = self.record.summary()
+        return summary and {key: summary[key] for key in ("status", "reason", "expected")}
+
+    def _about(self) -> dict[str, Any]:
+        """What a page needs to know about the run; no names of files but the scenario's title."""
+        s = self.record.scenario
+        return {
+            "title": s["title"],
+            "live": self.record.live,
+            "commands": self.record.live and s["link"]["type"] != INPROC,
+            "mode": s["mode"],
+            "link": s["link"]["type"],
+            "T_s": self.record.T_s,
+            "capacity": self.record.capacity,
+            "f_b": self.record.f_b,
+            "channels": [channel.about() for channel in self._pyramid.channels],
+            "states": STATES,
+            "labels": self.record.laws,
+            "laws": ready_laws(s),
+            "limits": {r.name: [r.low, r.high] for r in group("ref")},
+            "grid_hz": s["plant"]["grid"].get("omega_g", 1.0) * self.record.f_b,
+        }
+
+    async def _tell(self, event: dict[str, Any]) -> dict[str, Any]:
+        async with self._commands:
+            return await asyncio.to_thread(self._tell_now, event)
+
+    def _tell_now(self, event: dict[str, Any]) -> dict[str, Any]:
+        if not self.record.live:
+            raise UserError("the run is over")
+        if self._operator is None:
+            if self.record.scenario["link"]["type"] == INPROC:
+                raise UserError("a run in one process (link inproc) takes no commands")
+            self._operator = Operator(self.record.folder)
+        return self._operator.tell(event)
+
+
+def _response(status: http.HTTPStatus, kind: str, content: str | bytes) -> Response:
+    body = content.encode() if isinstance(content, str) else content
+    headers = Headers(HEADERS)
+    headers["Content-Type"], headers["Content-Length"] = kind, str(len(body))
+    headers["Connection"] = "close"
+    return Response(status.value, status.phrase, headers, body)
+
+
+def run_scope(scope: Scope, *where: Any) -> None:
+    """Serve until Ctrl-C."""
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(scope.serve(*where))

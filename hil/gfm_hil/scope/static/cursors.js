@@ -1,0 +1,124 @@
+// Two cursors: lines over all strips that can be dragged, and what lies at and between them.
+
+import { colour } from "./palette.js";
+import { make, span, symbol, value } from "./text.js";
+
+export class Cursors {
+  // strips(): those to be seen; about: of the channels; redraw(): draws the strips again
+  constructor(table, strips, about, redraw) {
+    this.table = table;
+    this.strips = strips;
+    this.about = about;
+    this.redraw = redraw;
+    this.on = false;
+    this.at = [0.35, 0.65]; // parts of the window; times [s] on its axis while it is held
+    this.held = false;
+  }
+
+  toggle(on, window) {
+    this.on = on;
+    this.at = this.held ? [0.35, 0.65].map((part) => window[0] + part * (window[1] - window[0]))
+      : [0.35, 0.65];
+    this.table.hidden = !on;
+    this.redraw();
+  }
+
+  // While pictures roll by, cursors stay where they are on the screen; in one that is held they
+  // stay where they are in time.
+  follow(held, window) {
+    if (held === this.held) return;
+    const wide = window[1] - window[0];
+    this.at = this.at.map((at) => held ? window[0] + at * wide
+      : Math.min(1, Math.max(0, (at - window[0]) / wide)));
+    this.held = held;
+  }
+
+  times(window) {
+    return this.held ? this.at : this.at.map((part) => window[0] + part * (window[1] - window[0]));
+  }
+
+  // Makes the plot of a strip take hold of a cursor that is near the pointer.
+  attach(strip) {
+    const over = strip.plot.over;
+    const near = (event) => {
+      if (!this.on || !strip.window) return -1;
+      const x = event.clientX - over.getBoundingClientRect().left;
+      const away = this.times(strip.window).map((t) => Math.abs(strip.plot.valToPos(t, "x") - x));
+      const k = away[0] <= away[1] ? 0 : 1;
+      return away[k] <= (event.pointerType === "touch" ? 24 : 7) ? k : -1;
+    };
+    over.addEventListener("pointermove", (event) => {
+      over.style.cursor = near(event) >= 0 ? "col-resize" : "";
+    });
+    // before the plot's own mousedown, which would begin to select
+    over.addEventListener("mousedown", (event) => {
+      if (near(event) >= 0) event.stopImmediatePropagation();
+    }, { capture: true });
+    over.addEventListener("pointerdown", (event) => {
+      const k = near(event);
+      if (k < 0) return;
+      over.setPointerCapture(event.pointerId);
+      const move = (e) => {
+        const x = e.clientX - over.getBoundingClientRect().left;
+        const t = strip.plot.posToVal(Math.min(over.clientWidth, Math.max(0, x)), "x");
+        const [from, to] = strip.window;
+        this.at[k] = this.held ? t : (t - from) / (to - from);
+        this.redraw();
+      };
+      over.addEventListener("pointermove", move);
+      over.addEventListener("pointerup", () => over.removeEventListener("pointermove", move),
+        { once: true });
+      event.preventDefault();
+    });
+  }
+
+  draw(u, strip, first) {
+    if (!this.on) return;
+    const { ctx, bbox } = u;
+    ctx.save();
+    ctx.strokeStyle = ctx.fillStyle = colour("cursor");
+    ctx.lineWidth = devicePixelRatio;
+    ctx.textAlign = "left";
+    ctx.textBaseline = "alphabetic";
+    ctx.font = `600 ${10 * devicePixelRatio}px system-ui, sans-serif`;
+    this.times(strip.window).forEach((t, k) => {
+      const left = Math.round(u.valToPos(t, "x", true)) + 0.5;
+      if (left < bbox.left || left > bbox.left + bbox.width) return;
+      ctx.beginPath();
+      ctx.moveTo(left, bbox.top);
+      ctx.lineTo(left, bbox.top + bbox.height);
+      ctx.stroke();
+      if (first) {
+        ctx.fillText("AB"[k], left + 3 * devicePixelRatio, bbox.top + 10 * devicePixelRatio);
+      }
+    });
+    ctx.restore();
+  }
+
+  // Values at the bins that the cursors stand on: where a bin holds more than one, its middle.
+  tell(frame, x, window, T_s) {
+    if (!this.on || !frame.bins) return;
+    const [a, b] = this.times(window);
+    const each = frame.width > 1 ? 2 : 1;
+    const bin = (t) => Math.round((t - x[0]) / (frame.width * T_s));
+    const at = (name, t) => {
+      const k = bin(t);
+      if (k < 0 || k >= x.length / each) return NaN;
+      return (frame.low[name][k] + frame.high[name][k]) / 2;
+    };
+    const dt = b - a;
+    const head = make("tr", {}, make("th", {}, ""), make("th", {}, "A"), make("th", {}, "B"),
+      make("th", {}, "Δ"));
+    const time = make("tr", {}, make("th", {}, make("i", {}, "t")), ...[a, b].map((t) =>
+      make("td", {}, `${value(t, "p.u.")} s`)),
+      make("td", { "data-delta": "t" }, `${span(Math.abs(dt))} · ${(1 / Math.abs(dt)).toPrecision(3)} Hz`));
+    const rows = this.strips().flatMap((strip) => strip.spec.traces).map((name) => {
+      const { symbol: text, unit } = this.about[name];
+      const values = [at(name, a), at(name, b)];
+      return make("tr", { class: `c-${name}` }, make("th", {}, symbol(text)),
+        ...values.map((v) => make("td", {}, value(v, unit))),
+        make("td", { "data-delta": name }, `${value(values[1] - values[0], unit)} ${unit}`));
+    });
+    this.table.replaceChildren(make("tbody", {}, head, time, ...rows));
+  }
+}

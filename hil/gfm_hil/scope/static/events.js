@@ -1,0 +1,141 @@
+// What happened in the run: a list, lines across the strips, and how it ended.
+
+import { colour } from "./palette.js";
+import { make, span } from "./text.js";
+
+const LINES = 60;
+const ENDS = new Set(["end", "tripped", "safe"]);
+const SHOWN = new Set([...ENDS, "law-active", "recovered"]);
+const UNMARKED = new Set(["law-active", "recovered"]);
+const ECHO_S = 0.05;
+
+export class Events {
+  constructor(list) {
+    this.list = list;
+    this.events = [];
+    this.said = []; // by this page: {t, text, kind}
+  }
+
+  set(events) {
+    this.events = events.filter((e) => e.label || SHOWN.has(e.event)).filter(firstToSay);
+    this.write();
+  }
+
+  // What was asked from this page and refused, at the time of the run.
+  refuse(t, what, why) {
+    this.said.push({ t, text: `${what}: ${why}`, kind: "refused" });
+    this.write();
+  }
+
+  write() {
+    const lines = [...this.events.map((e) => ({ t: e.t, ...describe(e) })), ...this.said]
+      .filter((line) => line.text).sort((a, b) => a.t - b.t).slice(-LINES).reverse();
+    this.list.replaceChildren(...lines.map(({ t, text, kind }) =>
+      make("li", { class: kind }, make("time", {}, `${t.toFixed(3)} s`), make("span", {}, text))));
+  }
+
+  // Lines at events within the plot; words only in the first strip, where there is room.
+  draw(u, strip, origin, first) {
+    const { ctx, bbox } = u;
+    const ratio = devicePixelRatio;
+    ctx.save();
+    ctx.textAlign = "left";
+    ctx.textBaseline = "alphabetic";
+    ctx.font = `${10.5 * ratio}px system-ui, sans-serif`;
+    let free = -Infinity;
+    for (const e of this.events) {
+      if (UNMARKED.has(e.event)) continue;
+      const left = Math.round(u.valToPos(e.t - origin, "x", true)) + 0.5;
+      if (left < bbox.left || left > bbox.left + bbox.width) continue;
+      const bad = describe(e).kind === "bad";
+      ctx.strokeStyle = ctx.fillStyle = colour(bad ? "bad" : "event");
+      ctx.lineWidth = ratio;
+      ctx.setLineDash([2 * ratio, 3 * ratio]);
+      ctx.beginPath();
+      ctx.moveTo(left, bbox.top);
+      ctx.lineTo(left, bbox.top + bbox.height);
+      ctx.stroke();
+      const text = e.label ?? e.status ?? e.event;
+      const wide = ctx.measureText(text).width;
+      const room = left + wide + 8 * ratio < bbox.left + bbox.width;
+      const from = room ? left + 4 * ratio : left - 4 * ratio - wide;
+      if (first && from > free) {
+        ctx.fillText(text, from, bbox.top + bbox.height - 5 * ratio);
+        free = from + wide + 6 * ratio;
+      }
+    }
+    ctx.restore();
+  }
+}
+
+// Of both sides' words on one trip, or one end, the first are those of the side that it happened to.
+function firstToSay(e, k, all) {
+  const same = (other) => other.event === e.event && e.t - other.t <= ECHO_S;
+  return e.label || !all.slice(0, k).some(same);
+}
+
+// Words and kind of an event of the log.
+function describe(e) {
+  if (e.event === "end") {
+    return { text: e.reason ? `${e.status}: ${e.reason}` : e.status,
+      kind: ENDS.has(e.status) ? "bad" : "end" };
+  }
+  if (ENDS.has(e.event)) return { text: `${e.event}: ${e.reason}`, kind: "bad" };
+  if (e.event === "recovered") return { text: "running again", kind: "done" };
+  if (e.event === "law-active") {
+    return { text: `${e.law} active, bump ${e.bump_pu.toPrecision(2)} p.u.`, kind: "done" };
+  }
+  if (e.refused) return { text: `${e.label}: ${e.refused}`, kind: "refused" };
+  return { text: e.label, kind: e.by ? "operator" : "planned" };
+}
+
+// The slim bar under the strips: the whole run, what happened, and the window on it.
+export class OverviewMap {
+  constructor(element, look) {
+    this.element = element;
+    this.look = look;
+    this.box = make("div", { class: "box" });
+    this.filled = make("div", { class: "filled" });
+    this.marks = make("div", { class: "marks" });
+    this.text = make("span", { class: "text" });
+    element.append(this.filled, this.marks, this.box, this.text);
+    element.addEventListener("pointerdown", (event) => {
+      element.setPointerCapture(event.pointerId);
+      const move = (e) => {
+        const { left, width } = element.getBoundingClientRect();
+        const at = ((e.clientX - left) / width) * this.length;
+        const wide = look.window[1] - look.window[0];
+        const start = Math.min(Math.max(at - wide / 2, 0), Math.max(0, look.done - wide));
+        look.hold(start, start + wide);
+      };
+      move(event);
+      element.addEventListener("pointermove", move);
+      element.addEventListener("pointerup", () =>
+        element.removeEventListener("pointermove", move), { once: true });
+    });
+  }
+
+  // A run that is going on may be long: its whole length would leave nothing to be seen.
+  get length() {
+    return Math.max(this.look.done, this.look.window[1], 1e-6);
+  }
+
+  show(events) {
+    const { length } = this;
+    const [from, to] = this.look.window;
+    const per = (t) => `${Math.min(100, Math.max(0, (100 * t) / length))}%`;
+    this.box.style.left = per(from);
+    this.box.style.width = `max(3px, ${per(Math.min(to, length) - Math.max(from, 0))})`;
+    this.filled.style.width = per(this.look.done);
+    const wanted = events.filter((e) => !UNMARKED.has(e.event) && e.t <= length);
+    if (this.marks.childElementCount !== wanted.length) {
+      this.marks.replaceChildren(...wanted.map(() => make("i")));
+    }
+    wanted.forEach((e, k) => {
+      this.marks.children[k].style.left = per(e.t);
+      this.marks.children[k].className = describe(e).kind;
+    });
+    const text = span(length);
+    if (this.text.textContent !== text) this.text.textContent = text;
+  }
+}

@@ -1,0 +1,159 @@
+// The knobs: set-points, grid, law, reset. They only ask; what happens is up to the run.
+
+import { make, symbol, value } from "./text.js";
+
+const SETPOINTS = [["P_ref", 0.1], ["Q_ref", 0.1], ["V_ref", 0.01]];
+export const WATCHED = ["P_ref", "Q_ref", "V_ref", "d_omega_g"];
+
+export class Knobs {
+  // about: of the run; tell(event, name): sends an event, says whether it was accepted
+  constructor(place, about, tell) {
+    this.tell = tell;
+    this.about = about;
+    this.now = {};
+    this.inputs = {};
+    place.replaceChildren(this.state(), this.setpoints(), this.grid(), this.laws());
+    this.all = place.querySelectorAll("button, input");
+    this.allow(false);
+  }
+
+  // why: in words, if nothing may be touched
+  allow(may) {
+    this.may = may;
+    for (const knob of this.all) knob.disabled = !may;
+    this.condition(this.running ?? true, this.active);
+  }
+
+  section(title, ...content) {
+    const said = make("p", { class: "said", role: "status" });
+    const section = make("section", {}, make("h2", {}, title), ...content, said);
+    section.said = said;
+    return section;
+  }
+
+  async send(section, event) {
+    section.said.className = "said";
+    section.said.textContent = "…";
+    const answer = await this.tell(event);
+    section.said.className = answer.ok ? "said good" : "said bad";
+    section.said.textContent = answer.ok ? `${answer.label} at tick ${answer.tick}` : answer.text;
+    return answer.ok;
+  }
+
+  field(name, { step, unit, initial, min, max }) {
+    const input = make("input", { type: "number", step: "any", inputmode: "decimal", id: `set-${name}`,
+      ...(min === undefined ? {} : { min, max }) });
+    if (initial !== undefined) input.value = initial;
+    const by = (sign) => () => {
+      const from = input.value === "" ? this.now[name] ?? 0 : +input.value;
+      input.value = +(Math.round(from / step + sign) * step).toFixed(6);
+      input.dispatchEvent(new Event("input", { bubbles: true }));
+    };
+    this.inputs[name] = input;
+    return make("span", { class: "field" },
+      make("button", { type: "button", class: "icon", "aria-label": `${name} less`, tabindex: -1,
+        onclick: by(-1) }, "−"), input,
+      make("button", { type: "button", class: "icon", "aria-label": `${name} more`, tabindex: -1,
+        onclick: by(1) }, "+"), make("small", {}, unit));
+  }
+
+  // label, what it is now, and the field to set it
+  row(label, name, now, options) {
+    return make("div", { class: "row" }, make("label", { for: `set-${name}` }, label),
+      make("output", now ? { id: now, title: "now" } : {}, now ? "–" : ""),
+      this.field(name, options));
+  }
+
+  // rows over a button; send(): what it asks for
+  form(button, id, rows, send) {
+    const form = make("form", { novalidate: true }, ...rows,
+      make("div", { class: "row end" }, make("button", { class: "strong", id }, button)));
+    form.addEventListener("submit", (submit) => {
+      submit.preventDefault();
+      send();
+    });
+    return form;
+  }
+
+  setpoints() {
+    const rows = SETPOINTS.map(([name, step]) => {
+      const [min, max] = this.about.limits[name];
+      return this.row(symbol(name), name, `now-${name}`, { step, unit: "p.u.", min, max });
+    });
+    rows.push(this.row("over", "ramp", "", { step: 0.1, unit: "s", initial: 0, min: 0 }));
+    const section = this.section("Set-points", this.form("Apply", "apply", rows, async () => {
+      const given = SETPOINTS.map(([name]) => name).filter((name) => this.inputs[name].value !== "");
+      const event = { type: "reference", ramp_s: +this.inputs.ramp.value };
+      for (const name of given) event[name] = +this.inputs[name].value;
+      if (await this.send(section, event)) for (const name of given) this.inputs[name].value = "";
+    }));
+    return section;
+  }
+
+  grid() {
+    const frequency = [
+      this.row(symbol("f_g"), "f_hz", "now-f_g",
+        { step: 0.05, unit: "Hz", initial: +this.about.grid_hz.toFixed(6) }),
+      this.row("at", "rate", "", { step: 0.5, unit: "Hz/s", initial: 0, min: 0 }),
+    ];
+    const section = this.section("Grid",
+      this.form("Set frequency", "set-frequency", frequency, () => {
+        const rate = +this.inputs.rate.value;
+        const event = { type: "grid-frequency", f_hz: +this.inputs.f_hz.value };
+        this.send(section, rate ? { ...event, rate } : event);
+      }),
+      this.form("Jump the phase", "jump",
+        [this.row("phase", "degrees", "", { step: 5, unit: "°", initial: 10 })],
+        () => this.send(section, { type: "grid-phase-jump", degrees: +this.inputs.degrees.value })));
+    return section;
+  }
+
+  laws() {
+    this.lawButtons = this.about.laws.map((law) => {
+      const button = make("button", { type: "button", class: "law", "data-law": law,
+        "aria-pressed": "false" }, law);
+      button.addEventListener("click", () => this.send(section, { type: "law", law }));
+      return button;
+    });
+    const more = this.about.laws.length > 1 ? [] : [make("p", { class: "hint" },
+      "No other law is ready. A scenario names more in ready_laws.")];
+    const section = this.section("Law", make("div", { class: "laws" }, ...this.lawButtons), ...more);
+    return section;
+  }
+
+  state() {
+    this.reset = make("button", { type: "button", class: "strong", id: "reset" }, "Reset from SAFE");
+    const section = this.section("Safe state", make("div", { class: "row end" }, this.reset));
+    section.classList.add("safe");
+    section.hidden = true;
+    this.reset.addEventListener("click", () => this.send(section, { type: "reset" }));
+    this.safe = section;
+    return section;
+  }
+
+  // What the run is doing: there is something to reset only in SAFE.
+  condition(running, active) {
+    this.running = running;
+    this.active = active;
+    this.safe.hidden = running;
+    for (const button of this.lawButtons) {
+      const is = button.dataset.law === active;
+      button.setAttribute("aria-pressed", String(is));
+      button.disabled = !this.may || is;
+    }
+  }
+
+  show(now) {
+    for (const [name] of SETPOINTS) {
+      this.now[name] = now[name];
+      this.write(`now-${name}`, value(now[name], "p.u."));
+    }
+    this.now.f_hz = now.d_omega_g;
+    this.write("now-f_g", value(now.d_omega_g, "Hz"));
+  }
+
+  write(id, text) {
+    const element = document.getElementById(id);
+    if (element.textContent !== text) element.textContent = text;
+  }
+}

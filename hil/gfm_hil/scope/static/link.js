@@ -1,0 +1,71 @@
+// The connection to the server: says hello, comes back after a loss, hands on what arrives.
+
+const KEY = "gfmhil-scope-token";
+
+// The token comes behind the # of the address, which is never sent; it leaves the address bar, so
+// that nobody reads it over a shoulder, and stays with this tab.
+function token() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (given) {
+    sessionStorage.setItem(KEY, given);
+    history.replaceState(null, "", location.pathname);
+  }
+  return sessionStorage.getItem(KEY) ?? "";
+}
+
+export class Link {
+  // heard: {message(object), frame(ArrayBuffer), open(), lost()}
+  constructor(heard) {
+    this.heard = heard;
+    this.token = token();
+    this.waiting = new Map();
+    this.next = 1;
+    this.open();
+  }
+
+  open() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    this.socket = new WebSocket(`${scheme}://${location.host}/socket`);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => {
+      if (this.token) this.say({ kind: "hello", token: this.token });
+      this.heard.open();
+    };
+    this.socket.onmessage = ({ data }) => {
+      if (typeof data !== "string") this.heard.frame(data);
+      else this.take(JSON.parse(data));
+    };
+    this.socket.onclose = () => {
+      for (const done of this.waiting.values()) done({ ok: false, text: "the scope is gone" });
+      this.waiting.clear();
+      this.heard.lost();
+      setTimeout(() => this.open(), 1000);
+    };
+  }
+
+  take(message) {
+    if (message.kind === "answer") {
+      this.waiting.get(message.id)?.(message);
+      this.waiting.delete(message.id);
+    } else {
+      this.heard.message(message);
+    }
+  }
+
+  say(message) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  // Have an event carried out; what the run says to it: {ok, text} or {ok, tick, label}.
+  tell(event) {
+    const id = this.next++;
+    return new Promise((done) => {
+      if (this.socket.readyState !== WebSocket.OPEN) {
+        done({ ok: false, text: "not connected" });
+        return;
+      }
+      this.waiting.set(id, done);
+      this.say({ kind: "tell", id, event });
+    });
+  }
+}

@@ -1,0 +1,265 @@
+// The page: puts its parts together.
+
+import { Cursors } from "./cursors.js";
+import { Events, OverviewMap } from "./events.js";
+import { decode, times } from "./frame.js";
+import { Knobs, WATCHED } from "./knobs.js";
+import { Link } from "./link.js";
+import { Look } from "./look.js";
+import { THEMES, colour, watch } from "./palette.js";
+import { STRIPS, Strip, channelsOf } from "./strips.js";
+import { Tools } from "./tools.js";
+
+const get = (id) => document.getElementById(id);
+const WORDS_MS = 200; // numbers that change faster cannot be read
+
+const events = new Events(document.querySelector("#log ol"));
+let about = null, strips = [], knobs = null, tools = null, cursors = null, x = new Float64Array(0);
+let summary = null, reason = "", control = false, pictures = 0, told = 0;
+
+const link = new Link({ open: opened, lost, message: heard, frame: seen });
+const look = new Look((message) => link.say(message), () => tools?.show());
+const map = new OverviewMap(get("map"), look);
+
+function opened() {
+  control = false;
+}
+
+function lost() {
+  control = false;
+  state("not connected", "lost");
+  permit();
+}
+
+function heard(message) {
+  if (message.kind === "about") begin(message);
+  else if (message.kind === "control") {
+    control = message.granted;
+    permit();
+  } else if (message.kind === "events") {
+    events.set(message.events);
+    summary = message.summary;
+    if (about) about.labels = message.labels;
+    why();
+    redraw();
+  } else if (message.kind === "error") {
+    console.error(message.text);
+  }
+}
+
+function begin(message) {
+  about = { ...message, byName: Object.fromEntries(message.channels.map((c) => [c.name, c])) };
+  document.title = `${about.title} · gfmhil scope`;
+  get("title").textContent = about.title;
+  get("where").textContent = `${about.link}, ${about.mode}, T\u209B = ${+(about.T_s * 1e6).toPrecision(4)} µs`;
+  look.T_s = about.T_s;
+  look.live = about.live;
+  look.watched = WATCHED;
+  knobs = new Knobs(get("knobs"), about, tell);
+  tools ??= new Tools(look, about, { signals: layout, cursors: toggleCursors });
+  cursors ??= new Cursors(get("readout"), () => strips, about.byName, redraw);
+  if (!strips.length && !look.live) look.mode = "held", look.span = about.capacity * about.T_s;
+  layout();
+  permit();
+}
+
+async function tell(event) {
+  const answer = await link.tell(event);
+  if (!answer.ok) events.refuse(look.done, event.type, answer.text);
+  return answer;
+}
+
+// The strips that are wanted, one below the other; all share one axis of time.
+function layout() {
+  for (const strip of strips) strip.plot?.destroy();
+  strips = STRIPS.filter((spec) => spec.shown).map((spec) => new Strip(spec, about.byName, {
+    zoom: (from, to) => look.hold(from + origin(), to + origin()),
+    draw: (u, strip) => drawOver(u, strip),
+  }));
+  get("strips").replaceChildren(...strips.map((strip) => strip.element));
+  strips.forEach((strip, k) => {
+    strip.last = k === strips.length - 1;
+    strip.element.classList.toggle("last", strip.last);
+    strip.build();
+    cursors.attach(strip);
+    hold(strip.plot.over);
+  });
+  const wanted = strips.flatMap((strip) => channelsOf(strip.spec));
+  look.channels = [...new Set(wanted)];
+  look.bins = bins();
+  look.ask();
+}
+
+function bins() {
+  const wide = strips[0]?.plot.over.clientWidth ?? 800;
+  return Math.max(100, Math.min(2000, Math.round(wide)));
+}
+
+// Wheel, two fingers and double click on a plot.
+function hold(over) {
+  over.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const { left, width } = over.getBoundingClientRect();
+    const [from, to] = look.window;
+    if (Math.abs(event.deltaX) > Math.abs(event.deltaY)) look.pan(event.deltaX / width);
+    else look.zoom(Math.exp(event.deltaY * 2e-3), from + ((event.clientX - left) / width) * (to - from));
+  }, { passive: false });
+  over.addEventListener("dblclick", () => {
+    for (const strip of strips) strip.hold(null);
+    if (look.live) look.run();
+    else look.whole();
+  });
+}
+
+// Time that the axis calls 0: the edge of a trigger, else the start of the run.
+function origin() {
+  const { frame } = look;
+  return frame && frame.edge >= 0 ? frame.edge * about.T_s : 0;
+}
+
+function seen(buffer) {
+  const id = new Float64Array(buffer, 0, 1)[0];
+  const asked = look.asked.get(id);
+  if (!asked) return; // of a look that is no longer wanted
+  const frame = decode(buffer, asked.channels, asked.watched);
+  const before = look.frame;
+  if (frame.same && before) frame.bins = before.bins, frame.low = before.low, frame.high = before.high;
+  look.frame = frame;
+  pictures += 1;
+  if (look.live && !frame.live) over();
+  if (!frame.same) {
+    x = times(frame, about.T_s, origin());
+    redraw();
+  }
+  words(frame);
+}
+
+function over() {
+  const [from, to] = look.window;
+  look.live = false;
+  if (look.mode !== "held") look.hold(from, to);
+  permit();
+}
+
+function window_() {
+  return look.window.map((t) => t - origin());
+}
+
+function redraw() {
+  if (!look.frame || !about) return;
+  const window = window_();
+  cursors.follow(look.mode === "held", window);
+  for (const strip of strips) strip.show(look.frame, x, window);
+  cursors.tell(look.frame, x, window, about.T_s);
+}
+
+function drawOver(u, strip) {
+  if (!strip.window) return;
+  const first = strip === strips[0];
+  events.draw(u, strip, origin(), first);
+  if (look.trigger && strip.spec.traces.includes(look.trigger.channel)) drawLevel(u);
+  cursors.draw(u, strip, first);
+}
+
+function drawLevel(u) {
+  const { ctx, bbox } = u;
+  const top = Math.round(u.valToPos(look.trigger.level, "y", true)) + 0.5;
+  if (top < bbox.top || top > bbox.top + bbox.height) return;
+  const r = devicePixelRatio;
+  ctx.save();
+  ctx.strokeStyle = ctx.fillStyle = colour("trigger");
+  ctx.lineWidth = r;
+  ctx.setLineDash([6 * r, 4 * r]);
+  ctx.beginPath();
+  ctx.moveTo(bbox.left, top);
+  ctx.lineTo(bbox.left + bbox.width, top);
+  ctx.stroke();
+  ctx.beginPath();
+  ctx.moveTo(bbox.left, top - 5 * r);
+  ctx.lineTo(bbox.left + 8 * r, top);
+  ctx.lineTo(bbox.left, top + 5 * r);
+  ctx.fill();
+  ctx.restore();
+}
+
+function toggleCursors() {
+  const on = !cursors.on;
+  get("cursors").setAttribute("aria-pressed", String(on));
+  cursors.held = look.mode === "held";
+  cursors.toggle(on, window_());
+}
+
+// What people read, a few times a second.
+function words(frame) {
+  const now = performance.now();
+  if (now - told < WORDS_MS && !frame.same) return;
+  told = now;
+  const law = about.labels[frame.law];
+  get("law").textContent = law ? [law.label, law.gains].filter(Boolean).join(", ") : "–";
+  get("time").textContent = `${(frame.head * about.T_s).toFixed(2)} s`;
+  get("misses").textContent = String(frame.misses);
+  get("misses").parentElement.classList.toggle("some", frame.misses > 0);
+  for (const strip of strips) strip.tell(frame);
+  const running = about.states[frame.state] ?? "";
+  if (frame.live) state(running || "running", running);
+  else state(summary ? `over: ${summary.status}` : "over", summary?.status ?? "over");
+  knobs.show(frame.now);
+  knobs.condition(running !== "SAFE", law?.gains ? "" : law?.name);
+  why();
+  map.show(events.events);
+  tools.show();
+}
+
+function state(text, kind) {
+  if (get("state").textContent !== text) get("state").textContent = text;
+  get("state").dataset.state = kind;
+}
+
+// Why the run is in SAFE, or how it ended if not as it should.
+function why() {
+  const frame = look.frame;
+  const safe = frame && about.states[frame.state] === "SAFE";
+  const last = events.events.findLast((e) => e.reason);
+  reason = summary?.reason || (safe && last?.reason) || "";
+  if (get("reason").textContent !== reason) get("reason").textContent = reason;
+  get("reason").hidden = !reason;
+}
+
+function permit() {
+  if (!knobs) return;
+  let text = "";
+  if (!look.live) text = "The run is over: look back, play it, measure in it.";
+  else if (!about.commands) text = "A run in one process (link inproc) takes no commands.";
+  else if (!control) text = "Looking only. Open the address with the token to control the run.";
+  get("permission").textContent = text;
+  get("permission").hidden = !text;
+  get("panel").classList.toggle("barred", Boolean(text));
+  knobs.allow(!text);
+}
+
+setInterval(() => {
+  get("rate").textContent = pictures ? `${pictures} fps` : "";
+  pictures = 0;
+}, 1000);
+
+const setTheme = watch(() => {
+  for (const strip of strips) strip.plot?.redraw(false, true);
+});
+let theme = localStorage.getItem("gfmhil-scope-theme") ?? "auto";
+get("theme").onclick = () => applyTheme(THEMES[(THEMES.indexOf(theme) + 1) % THEMES.length]);
+
+function applyTheme(name) {
+  theme = name;
+  localStorage.setItem("gfmhil-scope-theme", name);
+  get("theme").textContent = { auto: "◐ auto", light: "○ light", dark: "● dark" }[name];
+  setTheme(name);
+}
+applyTheme(theme);
+
+new ResizeObserver(() => {
+  for (const strip of strips) strip.resize();
+  if (strips.length && look.bins !== bins()) {
+    look.bins = bins();
+    look.ask();
+  }
+}).observe(get("strips"));

@@ -1,0 +1,29 @@
+// Colours as the style sheet has them now, light or dark, for what is drawn on a canvas.
+
+const probe = document.createElement("span");
+probe.hidden = true;
+document.body.append(probe);
+let cache = new Map();
+
+export function colour(name) {
+  if (!cache.has(name)) {
+    probe.style.color = `var(--${name})`;
+    cache.set(name, getComputedStyle(probe).color);
+  }
+  return cache.get(name);
+}
+
+export const THEMES = ["auto", "light", "dark"];
+
+// Calls `changed` whenever colours are others; returns a function that sets the theme.
+export function watch(changed) {
+  const again = () => {
+    cache = new Map();
+    changed();
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
+  return (theme) => {
+    document.documentElement.dataset.theme = theme;
+    again();
+  };
+}

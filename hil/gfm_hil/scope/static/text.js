@@ -1,0 +1,39 @@
+// Numbers and elements.
+
+const DIGITS = { "p.u.": 3, Hz: 3, "µs": 1, "°": 2, "": 0 };
+
+export function value(number, unit) {
+  if (number === undefined || Number.isNaN(number)) return "–";
+  return number.toFixed(DIGITS[unit] ?? 3).replace("-", "−");
+}
+
+// A time with as many digits as `step` [s] needs.
+export function seconds(t, step) {
+  const milli = step < 2e-3;
+  const digits = Math.max(0, -Math.floor(Math.log10(milli ? step * 1e3 : step) + 1e-6));
+  return (milli ? t * 1e3 : t).toFixed(digits).replace("-", "−") + (milli ? " ms" : " s");
+}
+
+export function span(s) {
+  return s < 0.9995 ? `${+(s * 1e3).toPrecision(3)} ms` : `${+s.toPrecision(4)} s`;
+}
+
+// make("div", {class: "x", onclick: f}, child, "text", …)
+export function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, content] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), content);
+    else if (content === true) element.setAttribute(name, "");
+    else if (content !== false) element.setAttribute(name, content);
+  }
+  element.append(...children);
+  return element;
+}
+
+// A symbol such as V_dcref as V with a subscript.
+export function symbol(text) {
+  const [base, ...below] = text.split("_");
+  const part = make("span", { class: "symbol" }, make("i", {}, base));
+  if (below.length) part.append(make("sub", {}, below.join(" ")));
+  return part;
+}
