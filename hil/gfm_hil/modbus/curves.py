@@ -28,6 +28,10 @@ _SPAN = 100.0  # %, of Var on either side, with which the droop in force is show
 _RESOLUTION = 0.015  # %, to which the points must lie on a line through the reference
 _MINE = 2  # the curve that a client may write
 
+#: what a client may write of a curve of model 705, and of a control of model 711
+VOLT_VAR = ("ActPt", "VRef", "Pt1.V", "Pt1.Var", "Pt2.V", "Pt2.Var")
+DROOP = ("DbOf", "DbUf", "KOf", "KUf", "RspTms")
+
 #: what a curve stands for: "V_ref" [p.u.], "D_p", "D_q"
 Meaning = dict[str, float]
 
@@ -74,7 +78,7 @@ class Curves:
         self.writable = (f"{self._head}.Ena", f"{self._adopt}Req", *own)
         self.state = Adopted()
 
-    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
         """See ``Function``."""
         prefix = f"{self._curve}{_MINE}."
         stored = {p.removeprefix(prefix): v for p, v in written.items() if p.startswith(prefix)}
@@ -117,7 +121,7 @@ class Curves:
         """After a reset: the run is back at its start, with nothing commanded."""
         self.state, self._stored = Adopted(), {}
 
-    def show(self, view: View, now: int) -> dict[str, Value]:
+    def show(self, view: View, now: float) -> dict[str, Value]:
         """See ``Function``."""
         s, there = self.state, self._write(self._in_force(view))
         return {

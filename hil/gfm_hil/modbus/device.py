@@ -15,6 +15,8 @@ from pymodbus.constants import ExcCodes
 
 from gfm_hil.errors import UserError
 from gfm_hil.modbus.curves import (
+    DROOP,
+    VOLT_VAR,
     Curves,
     read_droop,
     read_volt_var,
@@ -26,7 +28,7 @@ from gfm_hil.modbus.image import VENDOR, Image, Point, Value
 from gfm_hil.modbus.measures import Measures
 from gfm_hil.modbus.operation import Direct, Heartbeat, Operation
 from gfm_hil.modbus.plan import Function, Plan, Refused
-from gfm_hil.modbus.setpoints import TICK_S, SetPoint
+from gfm_hil.modbus.setpoints import SetPoint
 from gfm_hil.modbus.view import Slack, View
 from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
@@ -35,7 +37,9 @@ from gfm_plant import load_converter
 Tell = Callable[[dict[str, Any]], object]
 
 _READ, _WRITE_ONE, _WRITE_MANY = 3, 6, 16
-_SECOND = round(1 / TICK_S)
+
+TICK_S = 0.01
+"""Of the device's clock: timers and heartbeats expire on its ticks."""
 
 
 class Device:
@@ -47,7 +51,7 @@ class Device:
         look: the newest tick.
         tell: has the run do something; called in a thread of its own.
         heartbeat_ms: how long a client's heartbeat may stand still, 0: for ever.
-        elapsed_s: time since the device was started, s; the first tick of its clock is at 0.
+        elapsed_s: time since the device was started, s.
     """
 
     def __init__(
@@ -70,9 +74,9 @@ class Device:
         self._heart = Heartbeat(heartbeat_ms)
         self._functions: tuple[Function, ...] = (
             *self._set_points,
-            Curves(705, "Crv", tuple(write_volt_var({"V_ref": 1.0})),
-                   read_volt_var, write_volt_var, self._events, self._volt_var),
-            Curves(711, "Ctl", tuple(write_droop({})), read_droop, write_droop, self._events, self._droop),
+            Curves(705, "Crv", VOLT_VAR, read_volt_var, write_volt_var, self._events,
+                   self._volt_var),
+            Curves(711, "Ctl", DROOP, read_droop, write_droop, self._events, self._droop),
             self._heart,
             Operation(),
             Direct(laws, self._gains),
@@ -84,8 +88,8 @@ class Device:
         self._lock = asyncio.Lock()
         self._view: View | None = None
         self._was_safe = False
-        self._beats, self._seen = 0, -1
-        self._fresh = -1  # tick of the clock that the registers are of
+        self._beats, self._seen, self._second = 0, -1, 0
+        self._fresh = -1  # the tick that the registers are of
         self.slack = Slack()
         self.local = False
         self.refresh()
@@ -97,7 +101,8 @@ class Device:
     def refresh(self) -> None:
         """Bring every register up to the newest tick."""
         view = self._look()
-        self._fresh = now = self._now()
+        now = self._elapsed_s()
+        self._fresh = int(now / TICK_S)
         if view is None:
             return
         if self._was_safe and not view.safe:  # somebody has reset the run
@@ -118,27 +123,26 @@ class Device:
             self._forget()
         self.local = local
 
-    def _now(self) -> int:
-        """The tick of the device's clock that comes next: from it a time is never too short."""
-        return int(self._elapsed_s() / TICK_S) + 1
-
-    async def clock(self, tick: int) -> None:
-        """Carry out what has expired by a tick of the device's clock."""
-        if tick % _SECOND == 0:
+    async def clock(self) -> None:
+        """A tick of the device's clock: carry out what has expired by now."""
+        now = self._elapsed_s()
+        if int(now) != self._second:
+            self._second = int(now)
             self._count_beat()
-        expired = [s for s in self._set_points if s.expire(tick)]
-        if self._heart.expire(tick):
-            expired = [s for s in self._set_points if s.settings.enabled]
-        view = self._view
-        for set_point in expired:
-            if view is not None:
-                async with self._lock:
-                    try:
-                        await self._carry_out([set_point.revert(view, tick)], view)
-                    except UserError as problem:  # at the next tick it is tried again
-                        self.image.set(f"{VENDOR}.Refd", str(problem))
-        if expired:
-            self.refresh()
+        if self._heart.expire(now):
+            for set_point in self._set_points:
+                set_point.end(now)
+        for set_point in [s for s in self._set_points if s.expire(now)]:
+            async with self._lock:
+                view = self._look()
+                if view is None or not set_point.expire(now):  # a client has just written it
+                    continue
+                try:
+                    await self._carry_out([set_point.revert(view, now)], view)
+                except UserError as problem:  # at the next tick it is tried again
+                    self.image.set(f"{VENDOR}.Refd", str(problem))
+                else:
+                    self.refresh()
 
     async def access(
         self, code: int, address: int, written: Sequence[Any] | None
@@ -150,7 +154,7 @@ class Device:
         if code not in (_READ, _WRITE_ONE, _WRITE_MANY):
             return ExcCodes.ILLEGAL_FUNCTION
         if written is None:
-            if self._now() != self._fresh:
+            if int(self._elapsed_s() / TICK_S) != self._fresh:
                 self.refresh()
             return None
         try:
@@ -190,7 +194,8 @@ class Device:
                 point.check(value)
                 function = self._owner[point.path]
                 by_function.setdefault(id(function), (function, {}))[1][point.path] = value
-            return [f.plan(values, view, self._now()) for f, values in by_function.values()]
+            now = self._elapsed_s()
+            return [f.plan(values, view, now) for f, values in by_function.values()]
         except ValueError as problem:
             raise Refused(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
 

@@ -81,13 +81,13 @@ class Point:
     def decode(self, registers: Sequence[int]) -> Value:
         """A value in its units from registers; None for "not implemented"."""
         data = struct.pack(f">{self.length}H", *registers)
-        if self.type == "string":
-            return data.rstrip(b"\0").decode("ascii", "replace")
         if self.type.startswith("float"):
             number = float(struct.unpack(">f", data)[0])
             return None if math.isnan(number) else number
-        if data == mb.create_unimpl_value(self.type):
+        if data == mb.create_unimpl_value(self.type, 2 * self.length):
             return None
+        if self.type == "string":
+            return data.rstrip(b"\0").decode("ascii", "replace")
         whole = mb.point_type_info[self.type].data_to(data)
         return whole / 10**-self.exponent if self.exponent < 0 else whole * 10**self.exponent
 

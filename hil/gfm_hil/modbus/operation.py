@@ -9,7 +9,6 @@ from gfm_hil.events import check_reference
 from gfm_hil.modbus.gains import Gains
 from gfm_hil.modbus.image import VENDOR, Value
 from gfm_hil.modbus.plan import Plan
-from gfm_hil.modbus.setpoints import TICK_S
 from gfm_hil.modbus.view import View
 from gfm_runtime.controller import RUNNING
 
@@ -28,12 +27,12 @@ class Heartbeat:
         self.writable = ("715.ControllerHb", f"{VENDOR}.HbTms")
         self._value: float | None = None
         self._timeout_ms = timeout_ms
-        self._last: int | None = None  # tick of the device's clock of the last beat; None: lost
+        self._last: float | None = None  # the device's time of the last beat, s; None: lost
         self._lost = 0
-        self._late: int | None = None
+        self._late: float | None = None  # ms
         self.missing = False
 
-    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
         """See ``Function``."""
         timeout, value = written.get(f"{VENDOR}.HbTms"), written.get("715.ControllerHb")
         if timeout and not _SHORTEST_MS <= float(timeout) <= _LONGEST_MS:
@@ -49,11 +48,11 @@ class Heartbeat:
 
         return Plan(keep=keep)
 
-    def expire(self, now: int) -> bool:
-        """Whether it has just been lost; true once for each time."""
+    def expire(self, now: float) -> bool:
+        """Whether it has just been lost; true once each time."""
         if self._last is None or not self._timeout_ms:
             return False
-        waited_ms = round((now - self._last) * TICK_S * 1e3)
+        waited_ms = (now - self._last) * 1e3
         if waited_ms < self._timeout_ms:
             return False
         self._last, self._lost, self._late, self.missing = None, self._lost + 1, waited_ms, True
@@ -63,13 +62,13 @@ class Heartbeat:
         """Nobody needs to beat until somebody has begun to."""
         self._last, self.missing = None, False
 
-    def show(self, view: View, now: int) -> dict[str, Value]:
+    def show(self, view: View, now: float) -> dict[str, Value]:
         """See ``Function``."""
         return {
             "715.ControllerHb": self._value or 0.0,
             f"{VENDOR}.HbTms": float(self._timeout_ms),
             f"{VENDOR}.HbLost": float(self._lost),
-            f"{VENDOR}.HbLate": None if self._late is None else float(self._late),
+            f"{VENDOR}.HbLate": self._late,
         }
 
 
@@ -78,7 +77,7 @@ class Operation:
 
     writable = ("715.AlarmReset", "715.OpCtl")
 
-    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
         """See ``Function``; what is so already needs no command."""
         reset, control = written.get("715.AlarmReset", 0), written.get("715.OpCtl")
         if reset not in (0, 1):
@@ -96,7 +95,7 @@ class Operation:
     def forget(self) -> None:
         """It remembers nothing."""
 
-    def show(self, view: View, now: int) -> dict[str, Value]:
+    def show(self, view: View, now: float) -> dict[str, Value]:
         """See ``Function``."""
         running = view.state == RUNNING and not view.safe
         return {"715.AlarmReset": 0.0, "715.OpCtl": float(START if running else STOP)}
@@ -115,7 +114,7 @@ class Direct:
     def __init__(self, laws: Sequence[str], gains: Gains) -> None:
         self._laws, self._gains = laws, gains
 
-    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
         """See ``Function``."""
         given = {
             path.partition(".")[2]: float(value)
@@ -138,7 +137,7 @@ class Direct:
     def forget(self) -> None:
         """It remembers nothing."""
 
-    def show(self, view: View, now: int) -> dict[str, Value]:
+    def show(self, view: View, now: float) -> dict[str, Value]:
         """See ``Function``."""
         droops = self._gains.droops(view.law, view.gains)
         return {

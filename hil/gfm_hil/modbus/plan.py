@@ -42,14 +42,14 @@ class Function(Protocol):
         """Paths of the points that clients may write."""
         ...
 
-    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
-        """What writing these values at tick ``now`` of the device's clock comes to."""
+    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+        """What writing these values at the time ``now`` of the device, s, comes to."""
         ...
 
     def forget(self) -> None:
         """The run was reset, or is commanded from elsewhere: nothing of ours is in force."""
         ...
 
-    def show(self, view: View, now: int) -> dict[str, Value]:
+    def show(self, view: View, now: float) -> dict[str, Value]:
         """What its points read."""
         ...

@@ -21,9 +21,8 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES
 from gfm_hil.modbus.connection import UNIT, Server
-from gfm_hil.modbus.device import Device
+from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE
-from gfm_hil.modbus.setpoints import TICK_S
 from gfm_hil.modbus.view import Watcher
 from gfm_hil.operator import Operator
 from gfm_hil.scenario import load_scenario
@@ -171,7 +170,7 @@ async def _clock(
             device.take((folder / LOCAL).exists())
         if tick % _SECOND == 0:
             device.slack = watcher.slack()
-        await device.clock(tick)
+        await device.clock()
         tick = max(tick + 1, int((time.monotonic() - began) / TICK_S))
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), max(began + tick * TICK_S - time.monotonic(), 0))

@@ -17,9 +17,6 @@ from gfm_hil.modbus.image import Value
 from gfm_hil.modbus.plan import Plan
 from gfm_hil.modbus.view import View
 
-TICK_S = 0.01
-"""The device's clock: reversion and heartbeat expire on its ticks."""
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -29,7 +26,7 @@ class Settings:
         value, percent: the set-point in W or var, and in % of S_n.
         value_back, percent_back: what they become when the timer runs out.
         timeout: s, 0 for none.
-        until: tick of the device's clock at which it runs out; None: not running.
+        until: the device's time at which it runs out, s; None: not running.
         before: the reference in force when it was enabled, p.u.
     """
 
@@ -41,7 +38,7 @@ class Settings:
     value_back: float | None = None
     percent_back: float | None = None
     timeout: int = 0
-    until: int | None = None
+    until: float | None = None
     before: float = 0.0
 
 
@@ -72,7 +69,7 @@ class SetPoint:
         self.writable = tuple(self._keys)
         self.settings = Settings(mode=absolute)
 
-    def plan(self, written: Mapping[str, Value], view: View, now: int) -> Plan:
+    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
         """See ``Function``."""
         changes: dict[str, Any] = {self._keys[path]: value for path, value in written.items()}
         new = replace(self.settings, **changes)
@@ -85,11 +82,16 @@ class SetPoint:
         new = replace(new, enabled=bool(new.enabled), enabled_back=bool(new.enabled_back))
         return self._plan(new, view, now, changed=True)
 
-    def expire(self, now: int) -> bool:
+    def end(self, now: float) -> None:
+        """Have the timer run out, whether there is one or not."""
+        if self.settings.enabled:
+            self.settings = replace(self.settings, until=now)
+
+    def expire(self, now: float) -> bool:
         """Whether the timer has run out."""
         return self.settings.until is not None and now >= self.settings.until
 
-    def revert(self, view: View, now: int) -> Plan:
+    def revert(self, view: View, now: float) -> Plan:
         """What the end of the timer comes to: the set-point and enable of ``…Rvrt``."""
         s = self.settings
         name = self._in_force(s)
@@ -100,7 +102,7 @@ class SetPoint:
         """After a reset: the run is back at its start, with nothing commanded."""
         self.settings = Settings(mode=self._absolute)
 
-    def show(self, view: View, now: int) -> dict[str, Value]:
+    def show(self, view: View, now: float) -> dict[str, Value]:
         """See ``Function``."""
         s = self.settings
         there = view.references[self.reference]
@@ -111,11 +113,11 @@ class SetPoint:
             if value is None:
                 value = (back if key.endswith("_back") else there) * self._unit(key)
             found[path] = float(value)
-        left = 0.0 if s.until is None else max(s.until - now, 0) * TICK_S
+        left = 0.0 if s.until is None else max(s.until - now, 0.0)
         found[f"{self._prefix}RvrtRem"] = -(-left // 1)
         return found
 
-    def _plan(self, new: Settings, view: View, now: int, changed: bool) -> Plan:
+    def _plan(self, new: Settings, view: View, now: float, changed: bool) -> Plan:
         old = self.settings
         target: float | None = None
         if new.enabled:
@@ -132,8 +134,7 @@ class SetPoint:
             target = old.before
             new = replace(new, value=None, percent=None)
         running = changed and new.enabled and new.timeout > 0
-        until = now + round(new.timeout / TICK_S) if running else None
-        new = replace(new, until=until)
+        new = replace(new, until=now + new.timeout if running else None)
 
         def keep() -> None:
             self.settings = new
