@@ -50,9 +50,8 @@ class Bench:
         self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
         self._asked = c.asked
 
-    def restore_plant(self) -> None:
-        """Put the plant back to its start, trip forgotten and grid included; its ticks go on."""
-        tick = int(self.st["tick"][0])
+    def restore_plant(self, tick: int) -> None:
+        """Put the plant back to its start at a tick, trip forgotten and grid included."""
         self.par[:], self.st[:] = self._plant
         self.st["tick"], self.u[:] = tick, self.start.u
 

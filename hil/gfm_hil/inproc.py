@@ -11,9 +11,9 @@ from collections.abc import Callable
 from numba import njit
 
 from gfm_hil.bench import Bench
-from gfm_hil.recording import Part, record_controller, record_plant
+from gfm_hil.recording import Part, record_command, record_controller, record_sample
 from gfm_hil.timeline import Timeline
-from gfm_plant import plant_advance, plant_sample
+from gfm_plant import plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.protection import CONTROLLER, SAFE_STATE, trip
 from gfm_runtime.controller import READY, SAFE, control, heed
 
@@ -27,17 +27,20 @@ def run_ticks(
     """Run ticks [start, stop); returns the tick after the last one done.
 
     Ends early, after recording the tick, when the law changed, when the controller entered or
-    left RUNNING or when the protection tripped; and before advancing, when the plant has to be
-    put back to its start: tripped, with the controller READY.
+    left RUNNING or when the protection tripped; and before u[k] is taken, when the plant has to
+    be put back to its start: tripped, with the controller READY.
     """
-    changes = ctl[0].changes
+    changes, ahead = ctl[0].changes, plant_ahead(par)
     for k in range(start, stop):
         before, tripped = ctl[0].state, st[0].trip
         plant_sample(par, st, y)
         heed(ctl, tripped != 0)
         control(ctl, laws, states, est, y, u)
         record_controller(controller_rows[k], ctl, est)
-        record_plant(plant_rows[k], y, u, par, st)
+        record_sample(plant_rows[k], y, par, st)
+        record_command(plant_rows[k], u)
+        if ahead:  # as a plant does that need not wait for u[k]
+            plant_go_on(par, st)
         state = ctl[0].state
         if state == SAFE:
             if not waits:
@@ -45,7 +48,9 @@ def run_ticks(
             trip(st[0], CONTROLLER, SAFE_STATE)
         if state == READY and tripped != 0:
             return k + 1
-        plant_advance(par, st, u)
+        plant_take(par, st, u)
+        if not ahead:
+            plant_go_on(par, st)
         if ctl[0].changes != changes or state != before or st[0].trip != tripped:
             return k + 1
     return stop
@@ -70,7 +75,7 @@ def run_inproc(
             plant_part.signals, controller_part.signals, k, stop, waits,
         )  # fmt: skip
         if int(bench.st["trip"][0]) and int(c.ctl["state"][0]) == READY:
-            bench.restore_plant()
+            bench.restore_plant(k)
         timeline.look(k - 1)
         if not go_on(k):
             timeline.end("interrupted", "stopped by the operator", k)

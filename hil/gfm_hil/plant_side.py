@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from gfm_hil.bench import Bench
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
-from gfm_hil.recording import Part, record_plant
+from gfm_hil.recording import Part, record_command, record_sample
 from gfm_hil.timeline import CONTROLLER_LEFT, Timeline
 from gfm_hil.waiting import await_message, part_from
-from gfm_plant import NO_FRESH_U, plant_advance, plant_sample
+from gfm_plant import NO_FRESH_U, plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.protection import CONTROLLER, SAFE_STATE, SILENT, trip
 from gfm_runtime.controller import PLANT_TRIP, READY, REASONS, SAFE, STOPPED
 
@@ -40,7 +40,7 @@ class _Plant:
         self.repeat_ns = int(self.bench.scenario.link.repeat_s * 1e9)
         self.u_last = self.u_before = self.bench.u.copy()  # the newest two that came in time
         self.waits = self.bench.scenario.after_trip == "wait"
-        self.tripped = 0
+        self.tripped, self.ahead = 0, plant_ahead(self.bench.par)
         self.misses = 0
         self.late = 0  # misses in a row
 
@@ -51,6 +51,9 @@ class _Plant:
         self.tripped = int(b.st["trip"][0])
         self.link.send(self.frame(tick))
         self.part.times[tick, 2] = time.monotonic_ns()
+        record_sample(self.part.signals[tick], b.y, b.par, b.st)
+        if self.ahead:  # u[k] does not act in this period: it can come meanwhile
+            plant_go_on(b.par, b.st)
 
     def frame(self, tick: int) -> bytes:
         state, reason = (SAFE, PLANT_TRIP) if self.tripped else (0, 0)
@@ -65,7 +68,7 @@ class _Plant:
 
     def advance(self, tick: int, fresh: bool) -> None:
         b = self.bench
-        record_plant(self.part.signals[tick], b.y, b.u, b.par, b.st)
+        record_command(self.part.signals[tick], b.u)
         self.part.progress[0] = tick + 1
         if self.reader.state == SAFE:
             if not self.waits:
@@ -76,10 +79,12 @@ class _Plant:
             self.timeline.end("interrupted", CONTROLLER_LEFT, tick)
             return
         if self.tripped and fresh and self.reader.state == READY:
-            b.restore_plant()
+            b.restore_plant(tick + 1)
             self.u_last = self.u_before = b.u.copy()
             return
-        plant_advance(b.par, b.st, b.u)
+        plant_take(b.par, b.st, b.u)
+        if not self.ahead:
+            plant_go_on(b.par, b.st)
         if self.waits and self.late > self.bench.scenario.late_policy.hold:
             trip(b.st[0], CONTROLLER, SILENT)
 

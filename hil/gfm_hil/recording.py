@@ -49,13 +49,18 @@ _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that link
 
 
 @njit(cache=True)
-def record_plant(row, y, u, par, st):
-    """One row of PLANT_COLUMNS."""
+def record_sample(row, y, par, st):
+    """What a row of PLANT_COLUMNS knows when the plant is sampled."""
     for j in range(NY):
         row[j] = y[j]
+    plant_truth(par, st, row[_TRUE:])
+
+
+@njit(cache=True)
+def record_command(row, u):
+    """The rest of the row, once u is in hand."""
     for j in range(NU):
         row[NY + j] = u[j]
-    plant_truth(par, st, row[_TRUE:])
 
 
 @njit(cache=True)
@@ -174,7 +179,7 @@ def remove_parts(folder: Path) -> None:
 
 def _recorded(part: Part) -> int:
     """Ticks up to the last one that was recorded."""
-    rows = np.flatnonzero(~np.isnan(part.signals[:, 0]))
+    rows = np.flatnonzero(~np.isnan(part.signals[:, NY]))  # a plant writes that column last
     return int(rows[-1]) + 1 if len(rows) else 0
 
 

@@ -23,12 +23,12 @@ from gfm_hil.loops.thread import run_compiled
 from gfm_hil.operator.desk import Desk
 from gfm_hil.plant_side import run_plant
 from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, ordinary_priority
-from gfm_hil.recording import Part, keep_in_memory, record_controller, record_plant
+from gfm_hil.recording import Part, keep_in_memory, record_command, record_controller, record_sample
 from gfm_hil.scenario import Scenario
 from gfm_hil.sd_notify import Watched, notify
 from gfm_hil.stopping import Interrupt
 from gfm_hil.timeline import Outcome, Timeline
-from gfm_plant import plant_advance, plant_sample
+from gfm_plant import plant_go_on, plant_sample, plant_take
 from gfm_runtime.assembly import warm_up
 
 
@@ -135,10 +135,12 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
     par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
     plant_sample(par, st, y)
-    plant_advance(par, st, u)
+    plant_go_on(par, st)
+    plant_take(par, st, u)
     warm_up(bench.controller)
     compile_loops(side, bench, part)
     if side == "plant":
-        record_plant(part.signals[0].copy(), y, u, par, st)
+        record_sample(part.signals[0].copy(), y, par, st)
+        record_command(part.signals[0].copy(), u)
     else:
         record_controller(part.signals[0].copy(), bench.controller.ctl, bench.controller.est)

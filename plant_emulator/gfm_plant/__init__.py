@@ -6,7 +6,15 @@ Describe one with `options.Plant`, build its records with `make_plant`, put it a
 
 from gfm_plant.bases import Bases
 from gfm_plant.build import make_plant
-from gfm_plant.emulator import TRUTH, plant_advance, plant_init, plant_truth
+from gfm_plant.emulator import (
+    TRUTH,
+    plant_advance,
+    plant_ahead,
+    plant_go_on,
+    plant_init,
+    plant_take,
+    plant_truth,
+)
 from gfm_plant.grid import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
 from gfm_plant.options import Plant
 from gfm_plant.parameters import ConverterParameters, load_converter
@@ -32,11 +40,14 @@ __all__ = [
     "make_plant",
     "phase_jump",
     "plant_advance",
+    "plant_ahead",
     "plant_equilibrium",
+    "plant_go_on",
     "plant_init",
     "plant_par_dtype",
     "plant_sample",
     "plant_state_dtype",
+    "plant_take",
     "plant_truth",
     "trip_reason",
 ]

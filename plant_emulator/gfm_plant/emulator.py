@@ -57,10 +57,44 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
     """Take the command u[k] (3,) of this tick and go on to the next.
 
     With a delay of n samples and a fraction of one, u[k-n-1] acts for that fraction of the
-    period and u[k-n] for the rest; without delay u[k] acts at once.
+    period and u[k-n] for the rest; without delay u[k] acts at once. With at least one sample of
+    it u[k] need not be known before the plant goes on, see ``plant_ahead``.
     """
+    if plant_ahead(par):
+        plant_go_on(par, st)
+        plant_take(par, st, u)
+    else:
+        plant_take(par, st, u)
+        plant_go_on(par, st)
+
+
+@njit(cache=True)
+def plant_ahead(par: PlantRecord) -> bool:
+    """Whether a plant goes on first and takes the command then: nothing of u[k] acts in period k.
+
+    Whoever waits for u[k] can let the plant go on meanwhile.
+    """
+    return bool(par[0].delay > 0)
+
+
+@njit(cache=True)
+def plant_take(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
+    """Put u (3,) through the D/A into the delay line."""
     r, s = par[0], st[0]
-    _take_command(r, s, u)
+    for j in range(3):
+        for k in range(r.delay + 1, 0, -1):
+            s.u[k, j] = s.u[k - 1, j]
+        if math.isfinite(u[j]):
+            s.u[0, j] = quantise(u[j], r.dac_lo[j], r.dac_hi[j], r.dac_lsb[j])
+        else:
+            trip(s, BAD_COMMAND, u[j])
+
+
+@njit(cache=True)
+def plant_go_on(par: PlantRecord, st: PlantRecord) -> None:
+    """Go on by one sampling period under the commands in the delay line."""
+    r, s = par[0], st[0]
+    newest = max(r.delay - 1, 0)  # place in the line: u[k] itself is not in it yet, if delayed
     x = s.x
     v = (
         x[0], x[1], x[2], x[3], x[4], x[5], x[V_DC], s.i_reg, s.i_load[0], s.i_load[1],
@@ -68,8 +102,8 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
     )  # fmt: skip
     delta = x[DELTA]
     if r.steps_old > 0:
-        v, delta = _stretch(r, s, v, delta, r.delay + 1, r.steps_old, r.h_old)
-    v, delta = _stretch(r, s, v, delta, r.delay, r.steps_new, r.h_new)
+        v, delta = _stretch(r, s, v, delta, newest + 1, r.steps_old, r.h_old)
+    v, delta = _stretch(r, s, v, delta, newest, r.steps_new, r.h_new)
     s.tick += 1
 
     size = abs(delta) / _FAR  # an islanded angle may grow, if it stays a number
@@ -102,22 +136,10 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
 
 
 @njit(cache=True)
-def _take_command(r: Any, s: Any, u: NDArray[np.float64]) -> None:
-    """Put u through the D/A into the delay line."""
-    for j in range(3):
-        for k in range(r.delay + 1, 0, -1):
-            s.u[k, j] = s.u[k - 1, j]
-        if math.isfinite(u[j]):
-            s.u[0, j] = quantise(u[j], r.dac_lo[j], r.dac_hi[j], r.dac_lsb[j])
-        else:
-            trip(s, BAD_COMMAND, u[j])
-
-
-@njit(cache=True)
 def _stretch(
     r: Any, s: Any, v: Vector, delta: float, age: int, steps: int, h: float
 ) -> tuple[Vector, float]:
-    """Go on by `steps` of `h` seconds under the command of `age` ticks ago."""
+    """Go on by `steps` of `h` seconds under the command at place `age` of the delay line."""
     running = s.trip == 0
     if running:
         for j in range(3):

@@ -9,7 +9,7 @@ import numpy as np
 from gfm_hil.bench import make_bench
 from gfm_hil.links.base import SIDES
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
-from gfm_hil.recording import PLANT_COLUMNS, record_plant
+from gfm_hil.recording import PLANT_COLUMNS, record_command, record_sample
 from gfm_hil.scenario import Scenario
 from gfm_hil.timeline import Timeline
 from gfm_plant import plant_advance, plant_sample
@@ -48,7 +48,8 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
             sent.append(command.copy())
             through_cantools("u", sent[-1])
         applied = sent[max(0, tick // every - (every > 1))]
-        record_plant(rows[tick], b.y, applied, b.par, b.st)
+        record_sample(rows[tick], b.y, b.par, b.st)
+        record_command(rows[tick], applied)
         plant_advance(b.par, b.st, applied)
     timeline.close()
     return {name: rows[:, j] for j, name in enumerate(PLANT_COLUMNS)}

@@ -21,7 +21,7 @@ from gfm_hil.bench import Bench, make_bench
 from gfm_hil.benchmark.turns import Spread, quickest, seconds, take_turns
 from gfm_hil.errors import UserError
 from gfm_hil.inproc import run_ticks
-from gfm_hil.recording import Part, record_controller, record_plant
+from gfm_hil.recording import Part, record_command, record_controller, record_sample
 from gfm_hil.scenario import load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.controller import control
@@ -60,7 +60,8 @@ def recording_alone(par, st, ctl, est, y, u, plant_rows, controller_rows):
     """The recording of one and the same tick into every row."""
     for k in range(len(plant_rows)):
         record_controller(controller_rows[k], ctl, est)
-        record_plant(plant_rows[k], y, u, par, st)
+        record_sample(plant_rows[k], y, par, st)
+        record_command(plant_rows[k], u)
 
 
 class Loop:

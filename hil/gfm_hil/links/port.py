@@ -26,14 +26,16 @@ class Port:
         handle: whatever the functions need (addresses, counters), int64; its owner keeps alive
             what it points to, and a closed link must no longer be called through it.
         send: hands the whole of ``message`` over: 1, or 0 if it had to be dropped.
-        receive: writes the next message to ``message``; returns its bytes, 0 if none has arrived.
-            One that is too long returns its length and is gone.
+        receive: writes the next message to ``message``; returns its bytes, 0 if none has arrived,
+            or -1 if the link is gone: its own ``receive`` then raises and says why. One that is
+            too long returns its length and is gone.
         spins: looks in vain before a waiting loop begins to yield its processor: many where
             the peer itself delivers, 0 where a thread of the link needs the processor for it.
         patient: as ``receive``, but may sleep for up to a millisecond until there is something:
             for loops without deadlines, once they have looked in vain for a while. On a crowded
             machine a thread that yields for ever keeps the very peer from running that it waits
             for. None: the loop takes naps.
+        looks: that while: some hundred microseconds, so that naps are for a crowded machine.
     """
 
     handle: NDArray[np.int64]
@@ -41,6 +43,7 @@ class Port:
     receive: Any
     spins: int
     patient: Any = None
+    looks: int = 5000
 
 
 def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> Any:

@@ -96,10 +96,6 @@ def end_this_process(typingctx):
     return types.int32(), make
 
 
-#: looks in vain, a fraction of a millisecond, after which a loop without deadlines may sleep
-LOOKS = 500
-
-
 @njit(cache=True, nogil=True)
 def wait_until(deadline_ns, spins):
     """Sleep until shortly before a deadline, then spin; returns the longest gap in the spin, ns.

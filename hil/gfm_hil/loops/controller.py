@@ -10,10 +10,11 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.codec import OUT_OF_SEQUENCE, pack, unpack
-from gfm_hil.loops.clock import AHEAD_NS, LOOKS, between_looks, now_ns, sleep_until
+from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until
 from gfm_hil.loops.records import (
     BELL,
     EVENT,
+    GONE,
     LOOK,
     PEER_SAFE,
     PEER_STOPPED,
@@ -108,9 +109,11 @@ def _next_frame(
     while True:
         size = receive(handle, got_bytes)
         looks += 1
-        if size <= 0 and looks > LOOKS and not r.realtime:
+        if size <= 0 and looks > r.looks and not r.realtime:
             size = patient(handle, got_bytes)
-        if size > 0 or looks % r.clock_every == 0 or looks > LOOKS:
+        if size < 0:
+            return GONE
+        if size > 0 or looks % r.clock_every == 0 or looks > r.looks:
             now = now_ns()
             gap = max(gap, now - before)
             before = now

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.bench import Bench
+from gfm_hil.errors import PeerLost
 from gfm_hil.frames import FrameReader, FrameWriter
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.base import Side
@@ -23,6 +24,7 @@ from gfm_hil.loops.records import (
     BELL,
     DONE,
     EVENT,
+    GONE,
     LATE,
     LOOK,
     PEER_SAFE,
@@ -57,6 +59,7 @@ class _Loop:
         own: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
         self.writer, self.reader = FrameWriter(own[0]), FrameReader(own[1])
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
+        self.loop["looks"] = port.looks
         w, r, c = self.writer, self.reader, bench.controller
         records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
         self._arguments: tuple[Any, ...] = (
@@ -67,8 +70,16 @@ class _Loop:
         self._call = plant_ticks if plant else controller_ticks
 
     def go(self, until: int) -> int:
-        """Run until that tick or until there is something to say."""
-        return int(self._call(*self._arguments, until))  # type: ignore[call-arg]
+        """Run until that tick or until there is something to say.
+
+        Raises:
+            PeerLost: the link is gone.
+        """
+        why = int(self._call(*self._arguments, until))  # type: ignore[call-arg]
+        if why == GONE:
+            self.link.receive()  # which knows more
+            raise PeerLost("the link is gone")
+        return why
 
     @property
     def tick(self) -> int:
@@ -93,7 +104,7 @@ def drive_plant(
         why = loop.go(min(timeline.next_tick(), ticks))
         tick = loop.tick
         if why == RESTORE:
-            bench.restore_plant()
+            bench.restore_plant(tick)
             loop.loop["u_last"] = loop.loop["u_before"] = bench.u
         timeline.look(max(tick - 1, 0))
         if tick >= ticks and why in (DONE, LOOK, RESTORE):

@@ -8,10 +8,11 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.codec import pack, unpack
-from gfm_hil.loops.clock import AHEAD_NS, LOOKS, between_looks, now_ns, sleep_until, wait_until
+from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until, wait_until
 from gfm_hil.loops.records import (
     BELL,
     DONE,
+    GONE,
     LATE,
     LOOK,
     PEER_SAFE,
@@ -22,15 +23,15 @@ from gfm_hil.loops.records import (
     STOP,
     STOPPED_HERE,
 )
-from gfm_hil.recording import record_plant
-from gfm_plant import plant_advance, plant_sample
+from gfm_hil.recording import record_command, record_sample
+from gfm_plant import plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.protection import CONTROLLER, SAFE_STATE, trip
 from gfm_plant.protection import SILENT as NOT_HEARD
 from gfm_runtime.controller import PLANT_TRIP, READY, SAFE, STOPPED
 from gfm_runtime.signals import NU
 
 _U_ID = 2
-FRESH, OVERDUE, LEAVING = range(3)
+FRESH, OVERDUE, LEAVING, CUT_OFF = range(4)
 _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 
@@ -54,6 +55,7 @@ def plant_ticks(
     r = loop[0]
     sequence, frame, message = out
     got, got_bytes = into
+    ahead = plant_ahead(par)
     while r.tick < last:
         if told[STOP] != 0:
             return STOPPED_HERE
@@ -74,6 +76,9 @@ def plant_ticks(
         send(handle, message)
         sent = now_ns()
         times[k, 2] = sent
+        record_sample(rows[k], y, par, st)
+        if ahead:  # u[k] does not act in this period: it can come meanwhile
+            plant_go_on(par, st)
         if r.unrested > _UNRESTED:  # or the kernel would have the whole loop rest, for 50 ms
             sleep_until(sent + _REST_NS)
             r.unrested = 0
@@ -90,13 +95,15 @@ def plant_ticks(
             r.repeats += 1
             pack(sequence, frame, message, k, state, reason, y)
             send(handle, message)
+        if came == CUT_OFF:
+            return GONE
         if came == FRESH:
             for j in range(NU):
                 r.u_before[j], r.u_last[j] = r.u_last[j], u[j]
         elif r.realtime and r.late < r.extrapolate:
             for j in range(NU):
                 u[j] = r.u_last[j] + (r.late + 1) * (r.u_last[j] - r.u_before[j])
-        record_plant(rows[k], y, u, par, st)
+        record_command(rows[k], u)
         progress[0] = k + 1
         if reader[0].state == SAFE:
             if not r.waits:
@@ -114,7 +121,9 @@ def plant_ticks(
         r.tick = k + 1
         if tripped != 0 and reader[0].state == READY and came == FRESH:
             return RESTORE
-        plant_advance(par, st, u)
+        plant_take(par, st, u)
+        if not ahead:
+            plant_go_on(par, st)
         if r.waits and r.late > r.hold:
             trip(st[0], CONTROLLER, NOT_HEARD)
         if st[0].trip != tripped:
@@ -136,7 +145,7 @@ def _answer(
     looks = 0
     while True:
         size = receive(handle, got_bytes)
-        if size <= 0 and looks > LOOKS and not r.realtime:
+        if size <= 0 and looks > r.looks and not r.realtime:
             size = patient(handle, got_bytes)
         if size > 0:
             tick = unpack(reader, _U_ID, got, got_bytes, size, u)
@@ -147,8 +156,10 @@ def _answer(
                 if tick == k:
                     times[k, 3] = now
                 return FRESH if tick == k else LEAVING, max(gap, now - before)
+        elif size < 0:
+            return CUT_OFF, gap
         looks += 1
-        if looks % r.clock_every == 0 or looks > LOOKS:
+        if looks % r.clock_every == 0 or looks > r.looks:
             now = now_ns()
             gap = max(gap, now - before)
             before = now

@@ -9,7 +9,9 @@ from gfm_runtime.controller import RUNNING
 from gfm_runtime.signals import NU
 
 #: why a loop returned
-DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT, BELL, RESTORE = range(10)
+(
+    DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT, BELL, RESTORE, GONE,
+) = range(11)  # fmt: skip
 
 #: what other threads tell a loop, int64: to come back for good, and, by counting up, for a moment
 STOP, RING, TOLD = range(3)
@@ -18,6 +20,7 @@ loop_dtype = np.dtype(
     [
         ("realtime", "i8"),
         ("clock_every", "i8"),  # at first, looks in vain between two looks at the clock, 25 ns
+        ("looks", "i8"),  # lockstep: looks in vain after which it may sleep
         ("tick", "i8"),  # plant: the next one; controller: the last one received, -1 before
         ("t0", "i8"),  # of tick 0, ns
         ("T", "i8"),  # sampling time, ns

@@ -88,7 +88,7 @@ _as_pointer: Any = _pointer
 def _port(inner: Port, stage: np.ndarray) -> Port:
     """The port of an impaired link: the stage as its handle, with the one underneath in it."""
     stage[INNER], stage[INNER_WORDS] = inner.handle.ctypes.data, len(inner.handle)
-    return Port(stage, *_functions(inner.send, inner.receive), inner.spins)
+    return Port(stage, *_functions(inner.send, inner.receive), inner.spins, None, inner.looks)
 
 
 @cache
@@ -110,7 +110,7 @@ def _functions(inner_send: Any, inner_receive: Any) -> tuple[Any, Any]:
         while size == 0:
             came = inner_receive(under, message)
             if came <= 0:
-                return 0
+                return came
             if came <= len(message):
                 admit(handle, message, came)
             size = release(handle, message)

@@ -22,6 +22,7 @@ _SEND, _RECEIVE, _SOCKET = range(3)
 
 _DONTWAIT = int(zmq.DONTWAIT)
 _PATIENCE = 1  # ms
+_LOOKS = 500  # a look is a call of libzmq and a yield, a microsecond
 
 
 def native_port(socket: zmq.Socket[bytes]) -> Port | None:
@@ -31,7 +32,7 @@ def native_port(socket: zmq.Socket[bytes]) -> Port | None:
         return None
     handle = np.array([*found, socket.underlying], dtype=np.int64)
     socket.set(zmq.RCVTIMEO, _PATIENCE)
-    return Port(handle, _send, _receive, 0, _await)  # its own thread needs the processor
+    return Port(handle, _send, _receive, 0, _await, _LOOKS)  # its own thread needs the processor
 
 
 def _functions() -> tuple[int, int] | None:
