@@ -62,7 +62,7 @@ def content() -> dict[str, Any]:
                  **times(2.0, 3)},
             ],
             "lockstep": [
-                {"link": "shm", "ticks_per_s": ns, "times_real_time": ns,
+                {"link": "shm", "delay_samples": 1, "ticks_per_s": ns, "times_real_time": ns,
                  "share_of_plant_alone": Spread.of([0.8]).plain()},
             ],
             "laws": [

@@ -35,6 +35,7 @@ from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import SIDES
 from gfm_hil.runner import Progress, run_scenario
 from gfm_hil.scenario import Scenario, check_scenario
+from gfm_hil.scenario_model import INPROC
 
 LAW = "mimo-gfm"
 T_S = 1e-4  # s
@@ -100,24 +101,30 @@ def usable(links: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def measure_lockstep(plan: Plan, tell: Tell) -> Found:
-    """Ticks a second over every link and in process; simulated, so as fast as it goes."""
+    """Ticks a second over every link and in process; simulated, so as fast as it goes.
+
+    Over a link with and without a sample of loop delay: with one, as a real loop has it, the plant
+    goes on while u[k] comes.
+    """
     remarks: list[str] = []
-    rates: dict[str, list[float]] = {"inproc": [], **{link: [] for link in plan.links}}
-    shares: dict[str, list[float]] = {name: [] for name in rates}
+    names = [(INPROC, 0), *((link, delay) for link in plan.links for delay in (0, 1))]
+    rates: dict[tuple[str, int], list[float]] = {name: [] for name in names}
+    shares: dict[tuple[str, int], list[float]] = {name: [] for name in names}
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
         for number in rounds(plan.rounds, plan.until):
             plant_ns = quickest(alone.plant_part)
-            for k, name in enumerate(list(rates)[:: -1 if number % 2 else 1]):
-                tell(f"lockstep, {name}", (number + k / len(rates)) / plan.rounds)
-                if name == "inproc":
+            for k, name in enumerate(names[:: -1 if number % 2 else 1]):
+                link, delay = name
+                tell(f"lockstep, {link}", (number + k / len(names)) / plan.rounds)
+                if link == INPROC:
                     tick_ns = quickest(alone.whole)
                 else:
-                    scenario = _scenario(name, "lockstep", plan.lockstep_s)
+                    scenario = _scenario(link, "lockstep", plan.lockstep_s, delay)
                     timing, _, ended = _run(scenario, place)
                     if ended != COMPLETED:
-                        remarks.append(f"{name}, lockstep: a run ended early: {ended}")
+                        remarks.append(f"{link}, lockstep: a run ended early: {ended}")
                         continue
                     sent = timing["plant_sent"]
                     tick_ns = float(sent[-1] - sent[0]) / (len(sent) - 1)
@@ -125,13 +132,14 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
                 shares[name].append(plant_ns / tick_ns)
     rows = [
         {
-            "link": name,
+            "link": name[0],
+            "delay_samples": name[1],
             "mode": "lockstep",
             "ticks_per_s": Spread.of(rates[name]).plain(),
             "times_real_time": Spread.of([rate * T_S for rate in rates[name]]).plain(),
             "share_of_plant_alone": Spread.of(shares[name]).plain(),
         }
-        for name in rates
+        for name in names
         if rates[name]
     ]
     return rows, remarks
@@ -222,13 +230,14 @@ def _row(cell: _Cell) -> dict[str, Any]:
     }
 
 
-def _scenario(link: str, mode: str, duration: float) -> Scenario:
+def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario:
     content = {
         "title": f"bench, {link}",
         "duration": duration,
         "T_s": T_S,
         "mode": mode,
         "law": LAW,
+        "plant": {"delay": {"samples": delay}},
         "link": {"type": link, "peer_timeout_s": _PATIENCE_S},
         "late_policy": {"hold": 10**9},  # misses are counted, none ends the run
     }

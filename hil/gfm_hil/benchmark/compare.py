@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.benchmark.tables import Table, times
+from gfm_hil.benchmark.tables import Table, lockstep_name, times
 from gfm_hil.errors import UserError
 
 BELIEVED = 0.05  # of a corrected p value
@@ -120,7 +120,7 @@ def _samples(
         yield f"jitter: {r['wait']}, {r['load']}, {r['policy']}", ("µs", r["rounds_p50_us"])
     loop = content.get("loop", {})
     for r in loop.get("lockstep", ()):
-        yield f"lockstep: {r['link']}", ("ticks/s", r["ticks_per_s"]["turns"])
+        yield f"lockstep: {lockstep_name(r)}", ("ticks/s", r["ticks_per_s"]["turns"])
     for r in loop.get("laws", ()):
         yield f"loop in process: {r['law']}", ("ns", r["whole_ns"]["turns"])
     for r in loop.get("realtime", ()):

@@ -148,7 +148,10 @@ def _cards(content: dict[str, Any]) -> str:
         for r in loop.get("realtime", ())
     ]
     rates = [
-        (f"{r['times_real_time']['median']:.3g} ×", f"{r['link']}: times real time, in lockstep")
+        (
+            f"{r['times_real_time']['median']:.3g} ×",
+            f"{tables.lockstep_name(r)}: times real time, lockstep",
+        )
         for r in loop.get("lockstep", ())
     ]
     lines = []

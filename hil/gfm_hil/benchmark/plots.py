@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import CAUSES
 from gfm_hil.benchmark.histogram import dense, lower_ends
+from gfm_hil.benchmark.tables import lockstep_name
 from gfm_hil.figures import COLOURS
 
 _GREY, _TEXT = "#888888", "#222222"
@@ -194,7 +195,7 @@ def _lockstep(rows: list[dict[str, Any]]) -> Figure:
         for r, rate in zip(rows, rates, strict=True)
     ]
     _plain(axes, "closed loop in lockstep, times real time at 10 kHz")
-    _bars(axes, [r["link"] for r in rows], rates, texts)
+    _bars(axes, [lockstep_name(r) for r in rows], rates, texts)
     axes.axvline(1.0, color=_BLACK, lw=0.9, ls=(0, (4, 3)))
     axes.set_xscale("log")
     axes.set_xlim(min(0.5, min(rates) / 2), max(rates) * 12)

@@ -123,6 +123,11 @@ def causes_table(rows: list[dict[str, Any]]) -> Table:
     )  # fmt: skip
 
 
+def lockstep_name(row: dict[str, Any]) -> str:
+    """What ran in lockstep: the link, and with how much loop delay."""
+    return f"{row['link']}, a sample late" if row["delay_samples"] else str(row["link"])
+
+
 def lockstep_table(rows: list[dict[str, Any]]) -> Table:
     """The closed loop as fast as it goes."""
     return Table(
@@ -130,7 +135,7 @@ def lockstep_table(rows: list[dict[str, Any]]) -> Table:
         ("", "ticks a second", "× real time", "of what the plant alone allows"),
         [
             (
-                r["link"], f"{r['ticks_per_s']['median']:,.0f}",
+                lockstep_name(r), f"{r['ticks_per_s']['median']:,.0f}",
                 f"{r['times_real_time']['median']:.1f}",
                 f"{r['share_of_plant_alone']['median']:.0%}",
             )
