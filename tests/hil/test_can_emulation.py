@@ -2,48 +2,61 @@
 
 from __future__ import annotations
 
-import can
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from gfm_hil.links.can.emulation import EmulatedBus
+from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.can.emulation import (
+    PLACES,
+    arrive,
+    bus_dtype,
+    deliver,
+    has_room,
+    is_through,
+    place_dtype,
+    set_bus,
+)
 from gfm_hil.links.can.frame_time import classic_time, fd_time
+from gfm_hil.links.can.wire import ERROR, frame_dtype
+
+from .can_parts import frame_of
 
 BITRATE = 1_000_000
 FRAME = classic_time(8, BITRATE)
 
 
 class World:
-    """A node of a bus that takes no time, and a clock that is set by hand."""
+    """A node's account of the bus, and a clock that is set by hand."""
 
     def __init__(self, fd: bool = False) -> None:
         self.now = 100.0
-        self.arriving: list[can.Message] = []
-        self.node = EmulatedBus(self, fd, BITRATE, 8 * BITRATE, clock=lambda: self.now)
+        self.bus = np.zeros(1, bus_dtype)
+        self.places = np.zeros(2 * PLACES, place_dtype)
+        set_bus(self.bus, fd, BITRATE, 8 * BITRATE)
 
-    def send(self, message: can.Message) -> None:
-        pass
+    def _ns(self) -> int:
+        return round(self.now * 1e9)
 
-    def recv(self, timeout: float) -> can.Message | None:
-        return self.arriving.pop(0) if self.arriving else None
+    def send(self, number: int) -> None:
+        """A frame of our own."""
+        arrive(self.bus, self.places, frame_of(number, bytes(8)), 0, self._ns())
 
     def arrive(self, *numbers: int, length: int = 8) -> None:
         """Frames of other nodes."""
-        self.arriving += [message(number, length) for number in numbers]
-        assert self.node.recv(0) is None
+        for number in numbers:
+            arrive(self.bus, self.places, frame_of(number, bytes(length)), 1, self._ns())
+        assert not is_through(self.bus, self.places, self._ns())
 
     def heard_at(self, after: float) -> list[int]:
         """What has come through that long after the start."""
         self.now = 100.0 + after
-        out = []
-        while (found := self.node.recv(0)) is not None:
-            out.append(found.arbitration_id)
+        out, frame = [], np.zeros(1, frame_dtype)
+        while is_through(self.bus, self.places, self._ns()):
+            deliver(self.bus, self.places, frame)
+            out.append(int(frame["id"][0]))
         return out
-
-
-def message(number: int, length: int = 8) -> can.Message:
-    return can.Message(
-        arbitration_id=number, is_extended_id=False, data=bytes(length), is_fd=length > 8
-    )
 
 
 def test_a_frame_takes_its_time():
@@ -63,7 +76,7 @@ def test_a_frame_of_can_fd_takes_its_own():
 
 def test_ours_keeps_others_waiting():
     world = World()
-    world.node.send(message(900))
+    world.send(900)
     world.now += 0.5 * FRAME
     world.arrive(5)
     assert world.heard_at(1.999 * FRAME) == []
@@ -77,7 +90,7 @@ def test_the_lowest_of_those_that_wait_goes_next():
     world.arrive(300)
     world.now += 0.1 * FRAME
     world.arrive(400, 100)
-    world.node.send(message(200))
+    world.send(200)
     assert world.heard_at(1.001 * FRAME) == [700]
     assert world.heard_at(2.001 * FRAME) == [100]
     assert world.heard_at(3.999 * FRAME) == []  # ours
@@ -96,20 +109,39 @@ def test_a_bus_that_was_idle_starts_at_once():
 
 def test_an_error_of_the_node_itself_is_heard_at_once():
     world = World()
-    world.arriving += [message(5), can.Message(is_error_frame=True, arbitration_id=0x40)]
-    heard = world.node.recv(0)
-    assert heard is not None and heard.is_error_frame
+    world.arrive(5, 6)
+    assert not world.heard_at(0.5 * FRAME)
+    arrive(world.bus, world.places, frame_of(ERROR | 0x40, bytes(8)), 1, 0)
+    assert world.heard_at(0.5 * FRAME) == [ERROR | 0x40]
+    assert world.heard_at(2.001 * FRAME) == [5, 6]
 
 
-def test_it_waits_for_what_is_on_the_bus():
-    with can.Bus(interface="virtual", channel="slow") as one:
-        node = EmulatedBus(can.Bus(interface="virtual", channel="slow"), False, 10_000, 0)
-        one.send(message(5))
-        assert node.recv(0.001) is None  # 13 ms
-        found = node.recv(5.0)
-        assert found is not None and found.arbitration_id == 5
-        assert node.recv(0.001) is None
-        node.shutdown()
+def test_it_keeps_no_more_than_it_has_places_for():
+    world = World()
+    for k in range(PLACES + 1):  # the first is on the bus
+        assert has_room(world.bus)
+        world.arrive(k)
+    assert not has_room(world.bus)
+    assert world.heard_at((PLACES + 1.1) * FRAME) == list(range(PLACES + 1))
+    assert has_room(world.bus)
+
+
+@pytest.mark.parametrize("portable", [True, False])
+def test_a_link_waits_for_what_is_on_the_bus(tmp_path: Path, portable):
+    """A segment of the handshake, 13 ms at 10 kbit/s."""
+    slow = {"fd": False, "bitrate": 10_000, "every": 50, "emulate": True, "portable": portable}
+    endpoint = link_kind("can").fresh(tmp_path)
+    one, other = (open_link("can", side, endpoint, slow) for side in ("plant", "controller"))
+    try:
+        one.send(b"")
+        assert not other.wait(0.001)
+        assert other.wait(5.0)
+        while other.receive() is None:
+            assert other.wait(5.0)
+        assert not other.wait(0.001)
+    finally:
+        one.close()
+        other.close()
 
 
 @pytest.mark.parametrize("length", [0, 3, 8])

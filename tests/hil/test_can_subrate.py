@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
-from gfm_hil.links.can.subrate import Subrate
 from gfm_runtime.controller import RUNNING, SAFE, STOPPED
 from gfm_runtime.signals import Group, names
+
+from .can_parts import Subrate
 
 EVERY = 4
 

@@ -1,107 +1,132 @@
-"""A bus as slow as a real one, over a virtual one that takes no time.
+"""Frames that have arrived and wait to be read, on a virtual bus as late as on a real one.
 
 Every node keeps the same account: it knows when it sent and sees what others send within
 microseconds. While a frame is on the bus, others wait; of those that wait, the lowest identifier
 goes next; each takes its longest time (``frame_time``), and is delivered no earlier than at its
 end. It is the time of the wall clock, so that it matters in real time: a run in lockstep takes
-longer and gives the same.
+longer and gives the same. Where nothing is emulated a frame is delivered as it comes.
 """
 
 from __future__ import annotations
 
-import time
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+import numpy as np
+from numba import njit
 
-import can
-
+from gfm_hil.atomics import copy
 from gfm_hil.links.can.frame_time import PAYLOADS, classic_time, fd_time
+from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
 
-_LOOK_S = 20e-6  # while something is on the bus, how long to wait for more
+PLACES = 128  # for frames that wait for the bus, and again for those that have had it
+_LONGEST = PAYLOADS[-1]
+
+bus_dtype = np.dtype(
+    [
+        ("emulate", "i8"),
+        ("free", "i8"),  # when the frame on the bus ends, ns
+        ("waiting", "i8"),  # frames
+        ("first", "i8"),  # place of the frame to be delivered next
+        ("through", "i8"),  # frames to be delivered
+        ("time", "i8", (_LONGEST + 1,)),  # of a frame on the bus by its bytes, ns
+    ]
+)
+
+#: a frame in one of 2 PLACES: since when it waits or when it is through (ns), and whether it is
+#: of another node and so to be delivered
+place_dtype = np.dtype([("at", "i8"), ("deliver", "i8"), *frame_dtype.descr])
+_FRAME_AT = 16
 
 
-@dataclass(frozen=True)
-class _Waiting:
-    """A frame that has not had the bus yet: since when (s), and what is to be delivered."""
+def set_bus(bus: np.ndarray, fd: bool, bitrate: int, data_bitrate: int) -> None:
+    """Have one record of ``bus_dtype`` emulate a bus of these bit rates, bit/s."""
+    bus["emulate"] = 1
+    for length in range(_LONGEST + 1 if fd else 9):
+        sent = next(n for n in PAYLOADS if n >= length)
+        time = fd_time(sent, bitrate, data_bitrate) if fd else classic_time(sent, bitrate)
+        bus["time"][0, length] = round(time * 1e9)
 
-    since: float
-    number: int
-    length: int
-    message: can.Message | None
+
+@njit(cache=True, nogil=True)
+def has_room(bus):
+    """Whether another frame may ``arrive``."""
+    return bus[0].waiting < PLACES and bus[0].through < PLACES
 
 
-class EmulatedBus:
-    """What the link needs of a ``can.BusABC``, as late as with these bit rates.
+@njit(cache=True, nogil=True)
+def busy(bus):
+    """Whether a frame is on the bus or waits for it."""
+    return bus[0].waiting > 0 or bus[0].through > 0
+
+
+@njit(cache=True, nogil=True)
+def arrive(bus, places, frame, deliver, now):
+    """Take a frame that somebody sent; one of ours (``deliver`` = 0) keeps the bus and no more.
 
     Args:
-        bus: a virtual one.
-        fd, bitrate, data_bitrate: bit/s.
-        clock: s.
+        bus: one record of ``bus_dtype``.
+        places: shape (2 PLACES,) of ``place_dtype``.
+        frame: one record of ``wire.frame_dtype``, in an array.
+        now: ns.
     """
+    b = bus[0]
+    if not b.emulate:
+        _fill(places, PLACES + (b.first + b.through) % PLACES, frame, 1, 0)
+        b.through += 1
+    elif frame[0].id & ERROR:  # tells of the node itself, takes no part in arbitration
+        b.first = (b.first - 1) % PLACES
+        _fill(places, PLACES + b.first, frame, 1, 0)
+        b.through += 1
+    else:
+        _fill(places, b.waiting, frame, deliver, now)
+        b.waiting += 1
 
-    def __init__(
-        self,
-        bus: Any,
-        fd: bool,
-        bitrate: int,
-        data_bitrate: int,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._bus, self._clock = bus, clock
-        self._duration = {
-            n: fd_time(n, bitrate, data_bitrate) if fd else classic_time(n, bitrate)
-            for n in PAYLOADS
-            if fd or n <= 8
-        }
-        self._waiting: list[_Waiting] = []
-        self._free = 0.0  # when the frame on the bus ends
-        self._sent: deque[tuple[float, can.Message]] = deque()  # to be delivered, and when
 
-    def send(self, message: can.Message) -> None:
-        """Send; it waits for the bus behind what was sent before."""
-        self._bus.send(message)
-        self._queue(message, deliver=False)
+@njit(cache=True, nogil=True)
+def _fill(places, k, frame, deliver, at):
+    places[k].at, places[k].deliver = at, deliver
+    copy(places[k : k + 1].ctypes.data + _FRAME_AT, frame.ctypes.data, MTU_FD)
 
-    def _queue(self, message: can.Message, deliver: bool) -> None:
-        if message.is_error_frame:  # tells of the node itself, takes no part in arbitration
-            self._sent.appendleft((0.0, message))
+
+@njit(cache=True, nogil=True)
+def _arbitrate(b, places, now):
+    """Give the bus to all that have had their turn by now."""
+    while b.waiting > 0 and b.through < PLACES:
+        start = places[0].at
+        for k in range(1, b.waiting):
+            start = min(start, places[k].at)
+        start = max(start, b.free)
+        if start > now:
             return
-        length = next(n for n in PAYLOADS if n >= len(message.data))
-        kept = message if deliver else None
-        self._waiting.append(_Waiting(self._clock(), message.arbitration_id, length, kept))
+        best = -1
+        for k in range(b.waiting):
+            if places[k].at <= start and (best < 0 or places[k].id < places[best].id):
+                best = k
+        b.free = start + b.time[places[best].length]
+        if places[best].deliver:
+            to = PLACES + (b.first + b.through) % PLACES
+            places[to] = places[best]
+            places[to].at = b.free
+            b.through += 1
+        b.waiting -= 1
+        for k in range(best, b.waiting):  # in the order in which they came
+            places[k] = places[k + 1]
 
-    def _arbitrate(self, now: float) -> None:
-        """Give the bus to all that have had their turn by now."""
-        while self._waiting:
-            start = max(self._free, min(frame.since for frame in self._waiting))
-            if start > now:
-                return
-            ready = [frame for frame in self._waiting if frame.since <= start]
-            frame = min(ready, key=lambda f: (f.number, f.since))
-            self._waiting.remove(frame)
-            self._free = start + self._duration[frame.length]
-            if frame.message is not None:
-                self._sent.append((self._free, frame.message))
 
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame whose end has come, or None after ``timeout`` s."""
-        until = self._clock() + (timeout or 0.0)
-        while True:
-            while (message := self._bus.recv(0)) is not None:
-                self._queue(message, deliver=True)
-            now = self._clock()
-            self._arbitrate(now)
-            if self._sent and self._sent[0][0] <= now:
-                return self._sent.popleft()[1]
-            if now >= until:
-                return None
-            busy = self._sent or self._waiting
-            message = self._bus.recv(min(until - now, _LOOK_S) if busy else until - now)
-            if message is not None:
-                self._queue(message, deliver=True)
+@njit(cache=True, nogil=True)
+def is_through(bus, places, now):
+    """Whether there is a frame to be delivered."""
+    b = bus[0]
+    if b.waiting > 0:
+        _arbitrate(b, places, now)
+    return b.through > 0 and places[PLACES + b.first].at <= now
 
-    def shutdown(self) -> None:
-        """Leave the bus."""
-        self._bus.shutdown()
+
+@njit(cache=True, nogil=True)
+def deliver(bus, places, frame):
+    """Write the frame that ``is_through`` to the one in an array of ``wire.frame_dtype``."""
+    b = bus[0]
+    copy(
+        frame.ctypes.data, places[PLACES + b.first : PLACES + b.first + 1].ctypes.data + _FRAME_AT,
+        MTU_FD,
+    )  # fmt: skip
+    b.first = (b.first + 1) % PLACES
+    b.through -= 1

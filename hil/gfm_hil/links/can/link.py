@@ -1,40 +1,56 @@
-"""The CAN link: one side's node on a bus of python-can."""
+"""The CAN link: one side's node on a bus of python-can, or on a socket that python-can opened."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import logging
+import os
+import select
 import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.errors import PeerLost, UserError
 from gfm_hil.frames import FrameWriter
 from gfm_hil.links.base import SIDES, Side
-from gfm_hil.links.can.dbc import VECTORS
-from gfm_hil.links.can.emulation import EmulatedBus
+from gfm_hil.links.can.emulation import busy, has_room
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.loopback import LoopbackBus
+from gfm_hil.links.can.node import (
+    ANOTHER_DBC,
+    LOST,
+    NOTHING,
+    WENT_BUS_OFF,
+    Node,
+    account,
+    bring,
+    compose,
+    fetch,
+    put,
+    receive,
+    room_to_send,
+)
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
 from gfm_hil.links.can.plan import load_plan
-from gfm_hil.links.can.segments import SegmentReceiver, SegmentSender
-from gfm_hil.links.can.subrate import Subrate
-from gfm_hil.links.can.vectors import CanFrame, VectorReceiver, VectorSender
+from gfm_hil.links.can.port import can_port
+from gfm_hil.links.can.segments import LONGEST, SegmentSender
+from gfm_hil.links.can.sockets import FULL, set_socket
+from gfm_hil.links.can.sockets import LOOPBACK as UDP
+from gfm_hil.links.can.sockets import SOCKETCAN as KERNEL
+from gfm_hil.links.can.wire import BRS, FD, frame_dtype, pack, unpack
 from gfm_hil.links.port import Port
 from gfm_runtime.signals import Group, names
 
 # what python-can logs is in what it raises, which is told in a line of ours
 logging.getLogger("can").addHandler(logging.NullHandler())
 
-_FULL = (errno.ENOBUFS, errno.EAGAIN, None)  # python-can has no number for a full buffer
 _ROOM_S = 0.2  # how long a segment waits for room: a kernel's queue takes ten frames
-_AT_ONCE = 64  # frames looked at in one call, so that a flood of others' frames cannot hold it
-_BUS_OFF = 0x40  # CAN_ERR_BUSOFF of linux/can/error.h, in an error frame's identifier
+_LOOK_S = 20e-6  # while something is on the bus, how long to wait for more
 
 
 class CanLink:
@@ -44,6 +60,9 @@ class CanLink:
         side: which side's frames to send.
         endpoint: ``can://channel`` or ``can+udp://127.0.0.1:port``.
         options: checked.
+
+    Attributes:
+        port: for a bus that is a socket, unless the options leave the frames to python-can.
 
     Raises:
         UserError: the bus or the DBC is not to be had.
@@ -56,58 +75,80 @@ class CanLink:
             plan = load_plan(options)
         except ValueError as problem:
             raise UserError(f"link.options.{problem}") from None
-        self._fd, self._where = options.fd, endpoint.partition("://")[2]
-        mine: Group = "u" if side == "controller" else "y"
-        theirs: Group = "y" if side == "controller" else "u"
-        self._sender = VectorSender(plan, mine, options.heartbeat)
-        self._receiver = VectorReceiver(plan, theirs)
-        self._cut, self._join = SegmentSender(plan, side), SegmentReceiver(plan, side)
-        self._inbox: deque[can.Message] = deque()
-        self._foreign = self._error_frames = self._dropped = 0
+        self._other, self._digest = SIDES[1 - SIDES.index(side)], plan.digest
+        self._flags, self._where = options.fd * (FD | BRS), endpoint.partition("://")[2]
+        self._node = Node(plan, side, options)
+        self._cut = SegmentSender(plan, side)
+        self._message, self._frame = np.zeros(LONGEST, np.uint8), np.zeros(1, frame_dtype)
         _compile(plan)
-        self._subrate = Subrate(side, options.every, self._whole) if options.every > 1 else None
-        bus = _open_bus(side, endpoint, options)
-        rates = options.fd, options.bitrate, options.data_bitrate
-        self._bus = EmulatedBus(bus, *rates) if options.emulate else bus
+        self._bus = _open_bus(side, endpoint, options)
+        if not options.portable:
+            self._reach(self._bus, options)
+
+    def _reach(self, bus: Any, options: CanOptions) -> None:
+        """Have the node use the bus itself, if it is a socket."""
+        if isinstance(bus, LoopbackBus):
+            set_socket(self._node.sockets, UDP, bus.fileno(), bus.others())
+        elif options.interface == "socketcan":
+            set_socket(self._node.sockets, KERNEL, bus.fileno())
+        else:
+            return
+        self.port = can_port(self._node)
 
     @property
     def counters(self) -> dict[str, int]:
         """What happened on the bus besides the faults that the reader of frames counts."""
-        return {
-            "foreign": self._foreign,  # frames with identifiers that are not of this link
-            "incomplete": self._receiver.incomplete,
-            "damaged_messages": self._join.damaged,
-            "error_frames": self._error_frames,
-            "dropped": self._dropped,  # by us, for want of room
-            "saturated": self._sender.saturated,
+        n = self._node
+        counted = {
+            "foreign": n.state["foreign"],
+            "incomplete": n.receiver["incomplete"],
+            "damaged_messages": n.joiner["damaged"],
+            "error_frames": n.state["error_frames"],
+            "dropped": n.state["dropped"],
+            "saturated": n.sender["saturated"],
         }
+        return {name: int(count[0]) for name, count in counted.items()}
 
     def send(self, message: bytes) -> bool:
-        """Hand a message over; False if the bus has no room for all of it."""
-        if self._subrate is not None and not self._subrate.goes(message):
-            return True
-        if self._sender.fits(message):
-            return all([self._put(frame) for frame in self._sender.frames(message)])
+        """Hand a message over; False if the bus has no room for all of it.
+
+        Raises:
+            PeerLost: the bus is down.
+        """
+        count = compose(self._node.handle, np.frombuffer(message, np.uint8))
+        if count != NOTHING:
+            return all([self._put(self._node.out[k : k + 1]) for k in range(count)])
         until = time.monotonic() + _ROOM_S
-        for frame in self._cut.frames(message):
-            while not self._put(frame):
+        for segment in self._cut.frames(message):
+            while not self._put_segment(*segment):
                 if time.monotonic() >= until:
                     return False
                 time.sleep(0.001)
         return True
 
-    def _put(self, frame: CanFrame) -> bool:
-        message = can.Message(
-            arbitration_id=frame[0], data=frame[1], is_extended_id=False,
-            is_fd=self._fd, bitrate_switch=self._fd,
-        )  # fmt: skip
-        try:
-            self._bus.send(message)
-        except can.CanOperationError as problem:
-            if problem.error_code not in _FULL:
-                raise self._gone(problem) from None
-            self._dropped += 1
+    def _put_segment(self, number: int, payload: bytes) -> bool:
+        frame = self._frame[0]
+        frame["id"], frame["flags"], frame["length"] = number, self._flags, len(payload)
+        frame["data"][: len(payload)] = np.frombuffer(payload, np.uint8)
+        return self._put(self._frame)
+
+    def _put(self, frame: NDArray[Any]) -> bool:
+        node = self._node
+        if self.port is not None:
+            sent = bool(put(node.handle, frame))
+            if node.state["lost"][0]:
+                raise self._gone()
+            return sent
+        if not room_to_send(node.handle):
             return False
+        try:
+            self._bus.send(unpack(frame.tobytes()))
+        except can.CanOperationError as problem:
+            if problem.error_code not in (*FULL, None):  # no number: a full buffer, too
+                raise self._gone(str(problem)) from None
+            node.state["dropped"] += 1
+            return False
+        account(node.handle, frame)
         return True
 
     def receive(self) -> bytes | None:
@@ -116,69 +157,79 @@ class CanLink:
         Raises:
             PeerLost: the bus is down, or the other side uses another DBC.
         """
-        return self._whole() if self._subrate is None else self._subrate.receive()
+        if self.port is None:
+            while has_room(self._node.bus) and self._bring(0.0):
+                pass
+        size = receive(self._node.handle, self._message)
+        if size == LOST:
+            raise self._gone()
+        return None if size == NOTHING else self._message[:size].tobytes()
 
-    def _whole(self) -> bytes | None:
-        """The next message that the bus itself brought."""
-        for _ in range(_AT_ONCE):
-            frame = self._inbox.popleft() if self._inbox else self._next(0.0)
-            if frame is None:
-                return None
-            message = self._take(frame)
-            if message is not None:
-                return message
-        return None
-
-    def _take(self, frame: can.Message) -> bytes | None:
-        if frame.is_error_frame:
-            self._error_frames += 1
-            if frame.arbitration_id & _BUS_OFF:
-                raise PeerLost(f"the CAN controller of {self._where} went bus off")
-        elif frame.is_extended_id or frame.is_remote_frame:
-            self._foreign += 1
-        elif self._receiver.knows(frame.arbitration_id):
-            return self._receiver.take(frame.arbitration_id, bytes(frame.data))
-        elif frame.arbitration_id == self._join.number:
-            try:
-                return self._join.take(bytes(frame.data))
-            except PeerLost:
-                for answer in self._cut.frames(b""):  # so that both sides see the misfit
-                    self._put(answer)
-                raise
-        else:
-            self._foreign += 1
-        return None
-
-    def _next(self, timeout: float) -> can.Message | None:
+    def _bring(self, timeout: float) -> bool:
+        """Take a frame from python-can to the node, if one comes."""
         try:
-            return self._bus.recv(timeout)
+            message = self._bus.recv(timeout)
         except can.CanOperationError as problem:
-            raise self._gone(problem) from None
+            raise self._gone(str(problem)) from None
+        if message is None:
+            return False
+        datagram = np.frombuffer(pack(message), np.uint8)
+        self._frame.view(np.uint8)[: len(datagram)] = datagram
+        bring(self._node.handle, self._frame)
+        return True
 
-    def _gone(self, problem: can.CanOperationError) -> PeerLost:
-        return PeerLost(f"the CAN bus {self._where} is gone: {problem}")
+    def _gone(self, said: str = "") -> PeerLost:
+        """Why the bus is of no more use."""
+        lost, self._node.state["lost"] = int(self._node.state["lost"][0]), 0
+        if lost == WENT_BUS_OFF:
+            return PeerLost(f"the CAN controller of {self._where} went bus off")
+        if lost == ANOTHER_DBC:
+            for segment in self._cut.frames(b""):  # so that both sides see the misfit
+                self._put_segment(*segment)
+            theirs = int(self._node.joiner["theirs"][0])
+            return PeerLost(
+                f"the {self._other} uses another DBC ({theirs:08x}, ours is {self._digest:08x})"
+            )
+        return PeerLost(f"the CAN bus {self._where} is gone: {said or os.strerror(lost)}")
 
     def wait(self, seconds: float) -> bool:
         """Sleep until a frame is there, ours or not, at most ``seconds``."""
-        if not self._inbox:
-            frame = self._next(seconds)
-            if frame is not None:
-                self._inbox.append(frame)
-        return bool(self._inbox)
+        node = self._node
+        until = time.monotonic() + seconds
+        while not fetch(node.handle):
+            if node.state["lost"][0]:
+                raise self._gone()
+            left = until - time.monotonic()
+            if left <= 0:
+                return False
+            pause = min(left, _LOOK_S) if busy(node.bus) else left
+            if self.port is None:
+                self._bring(pause)
+            else:
+                select.select([self._bus], [], [], pause)
+        return True
 
     def close(self) -> None:
         """Leave the bus; frames handed over leave by themselves."""
+        self._node.state["open"] = 0
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
 
 
 def _compile(plan: Plan) -> None:
     """Compile (or load from cache) what a tick calls, before the other side waits for it."""
-    for group in VECTORS:
-        sender, receiver = VectorSender(plan, group, 1), VectorReceiver(plan, group)
-        message = FrameWriter(group).pack(0, 0, 0, np.zeros(len(names(group))))
-        for frame in sender.frames(message):
-            receiver.take(*frame)
+    ends = {side: Node(plan, side, CanOptions(fd=plan.fd)) for side in SIDES}
+    message = np.zeros(LONGEST, np.uint8)
+    groups: tuple[tuple[Side, Group], ...] = (("plant", "y"), ("controller", "u"))
+    for side, group in groups:
+        mine, theirs = ends[side].handle, ends[SIDES[1 - SIDES.index(side)]].handle
+        words = FrameWriter(group).pack(0, 0, 0, np.zeros(len(names(group))))
+        for k in range(compose(mine, np.frombuffer(words, np.uint8))):
+            account(mine, ends[side].out[k : k + 1])
+            bring(theirs, ends[side].out[k : k + 1])
+        fetch(theirs)
+        receive(theirs, message)
+        room_to_send(mine)
 
 
 def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:

@@ -12,17 +12,15 @@ import contextlib
 import errno
 import select
 import socket
-import struct
 import time
 from typing import Any
 
 import can
 
+from gfm_hil.links.can.wire import pack, unpack
+
 NODES = 4
 _HOST = "127.0.0.1"
-_HEAD = struct.Struct("=IBB2x")  # can_id with flags, length, FD flags: canfd_frame of linux/can.h
-_EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
-_BRS, _ESI, _FD = 0x01, 0x02, 0x04
 _BUFFER = 1 << 20  # bytes, or as many as the kernel allows
 _RECHECK_S = 0.05  # how long a place found empty is passed over
 
@@ -61,13 +59,7 @@ class LoopbackBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send to every other node that is there."""
-        flags = msg.is_fd and (_FD | msg.bitrate_switch * _BRS | msg.error_state_indicator * _ESI)
-        number = msg.arbitration_id | (
-            msg.is_extended_id * _EXTENDED
-            | msg.is_remote_frame * _REMOTE
-            | msg.is_error_frame * _ERROR
-        )
-        datagram = _HEAD.pack(number, len(msg.data), flags) + msg.data
+        datagram = pack(msg)
         for peer in self._peers:
             peer.send(datagram)
 
@@ -79,23 +71,15 @@ class LoopbackBus(can.BusABC):
             except BlockingIOError:
                 if timeout == 0 or not select.select([self._socket], [], [], timeout)[0]:
                     return None, False
-        number, length, flags = _HEAD.unpack_from(datagram)
-        message = can.Message(
-            timestamp=time.time(),
-            arbitration_id=number & 0x1FFF_FFFF,
-            is_extended_id=bool(number & _EXTENDED),
-            is_remote_frame=bool(number & _REMOTE),
-            is_error_frame=bool(number & _ERROR),
-            is_fd=bool(flags & _FD),
-            bitrate_switch=bool(flags & _BRS),
-            error_state_indicator=bool(flags & _ESI),
-            data=datagram[_HEAD.size : _HEAD.size + length],
-        )
-        return message, False
+        return unpack(datagram), False
 
     def fileno(self) -> int:
         """For select."""
         return self._socket.fileno()
+
+    def others(self) -> list[int]:
+        """Descriptors of the sockets connected to the other places."""
+        return [peer.fileno() for peer in self._peers]
 
     def shutdown(self) -> None:
         """Leave the bus."""
@@ -126,6 +110,9 @@ class _Peer:
         except OSError as problem:  # its buffer is full: what a controller's overrun is
             if problem.errno not in (errno.EAGAIN, errno.ENOBUFS):
                 raise can.CanOperationError(str(problem), problem.errno) from problem
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
 
     def close(self) -> None:
         self._socket.close()

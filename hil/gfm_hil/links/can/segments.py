@@ -2,6 +2,8 @@
 
 Each begins with a digest of the sender's DBC and a CRC-32 of what follows. There is no flow
 control (ISO-TP has it): a message has a few hundred bytes, and one that is lost is said again.
+Cutting is Python, for only the handshake does it; joining is compiled, for a late one may come in
+the midst of a run.
 """
 
 from __future__ import annotations
@@ -10,14 +12,35 @@ import struct
 import zlib
 
 import numpy as np
+from numba import njit
 
-from gfm_hil.errors import PeerLost
+from gfm_hil.codec import crc32
 from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.can.bench_frame import number
 from gfm_hil.links.can.layout import Plan
 
+NOTHING, OTHER_DBC = -1, -2
+
 _HEAD = struct.Struct("<II")  # digest of the DBC, CRC-32 of the message
+_HEAD_BYTES = 8
 _DATA = 4  # first byte of data in a segment: Message, Index, Segments, Used lie before
 _MOST = 255  # segments
+LONGEST = _MOST * (64 - _DATA)  # bytes of a message
+
+joiner_dtype = np.dtype(
+    [
+        ("number", "i8"),  # identifier
+        ("length", "i8"),
+        ("at", "i8", (_DATA,)),  # where Message, Index, Segments and Used lie
+        ("digest", "i8"),  # of our DBC
+        ("theirs", "i8"),  # of the DBC of the message last joined
+        ("message", "i8"),  # its number, -1 between two
+        ("next", "i8"),  # segment
+        ("used", "i8"),  # bytes so far
+        ("damaged", "i8"),  # messages of which a segment is missing or wrong
+        ("text", "u1", ((LONGEST + 7) // 8 * 8,)),
+    ]
+)
 
 
 class SegmentSender:
@@ -34,7 +57,7 @@ class SegmentSender:
         self.most = _MOST * self._room - _HEAD.size  # bytes of the longest message
 
     def frames(self, message: bytes) -> list[tuple[int, bytes]]:
-        """The CAN frames of a message.
+        """Identifier and payload of the CAN frames of a message.
 
         Raises:
             ValueError: it is too long.
@@ -54,56 +77,60 @@ class SegmentSender:
         return out
 
 
-class SegmentReceiver:
-    """Puts the other side's messages together.
+def set_joiner(joiner: np.ndarray, plan: Plan, side: Side) -> None:
+    """Make one record of ``joiner_dtype`` ready for what the other side sends to this one."""
+    layout, j = plan.segment[SIDES[1 - SIDES.index(side)]], joiner[0]
+    fields = layout.dtype.fields
+    assert fields is not None
+    j["number"], j["length"], j["digest"] = layout.number, layout.length, plan.digest
+    j["at"] = [fields[name][1] for name in ("Message", "Index", "Segments", "Used")]
+    j["message"] = NOTHING
+
+
+@njit(cache=True, nogil=True)
+def join(joiner, frame, message):
+    """Take a segment.
 
     Args:
-        plan: of the DBC.
-        side: ours.
+        joiner: one record of ``joiner_dtype``.
+        frame: one record of ``wire.frame_dtype`` with its identifier.
+        message: bytes, written; of one that is longer only the beginning.
+
+    Returns:
+        The length of the message that it completes, NOTHING, or OTHER_DBC.
     """
+    j = joiner[0]
+    if frame.length != j.length:
+        j.damaged += 1
+        return NOTHING
+    data = frame.data
+    of, index = np.int64(data[j.at[0]]), np.int64(data[j.at[1]])
+    segments, used = np.int64(data[j.at[2]]), np.int64(data[j.at[3]])
+    if index == 0:
+        j.message, j.next, j.used = of, 0, 0
+    if of != j.message or index != j.next:
+        j.damaged += j.message >= 0
+        j.message = NOTHING
+        return NOTHING
+    for k in range(min(used, j.length - _DATA)):
+        j.text[j.used] = data[_DATA + k]
+        j.used += 1
+    j.next += 1
+    if j.next < segments:
+        return NOTHING
+    j.message = NOTHING
+    return _whole(j, message)
 
-    def __init__(self, plan: Plan, side: Side) -> None:
-        other = SIDES[1 - SIDES.index(side)]
-        self._layout, self._digest, self._other = plan.segment[other], plan.digest, other
-        self.number = self._layout.number
-        self._message, self._pieces = -1, b""
-        self._next = 0
-        self.damaged = 0  # messages of which a segment is missing or wrong
 
-    def take(self, payload: bytes) -> bytes | None:
-        """A segment: the message that it completes, if it does.
-
-        Raises:
-            PeerLost: the other side uses another DBC.
-        """
-        if len(payload) != self._layout.length:
-            self.damaged += 1
-            return None
-        s = np.frombuffer(payload, self._layout.dtype)[0]
-        if s["Index"] == 0:
-            self._message, self._pieces, self._next = int(s["Message"]), b"", 0
-        if (int(s["Message"]), int(s["Index"])) != (self._message, self._next):
-            self.damaged += self._message >= 0
-            self._message = -1
-            return None
-        self._pieces += payload[_DATA : _DATA + int(s["Used"])]
-        self._next += 1
-        if self._next < int(s["Segments"]):
-            return None
-        self._message = -1
-        return self._whole(self._pieces)
-
-    def _whole(self, text: bytes) -> bytes | None:
-        if len(text) < _HEAD.size:
-            self.damaged += 1
-            return None
-        digest, crc = _HEAD.unpack_from(text)
-        message = text[_HEAD.size :]
-        if crc != zlib.crc32(message):
-            self.damaged += 1
-            return None
-        if digest != self._digest:
-            raise PeerLost(
-                f"the {self._other} uses another DBC ({digest:08x}, ours is {self._digest:08x})"
-            )
-        return message
+@njit(cache=True, nogil=True)
+def _whole(j, message):
+    size = j.used - _HEAD_BYTES
+    if size < 0 or number(j.text, 4, 4) != crc32(j.text[_HEAD_BYTES:], size):
+        j.damaged += 1
+        return NOTHING
+    j.theirs = number(j.text, 0, 4)
+    if j.theirs != j.digest:
+        return OTHER_DBC
+    for k in range(min(size, len(message))):
+        message[k] = j.text[_HEAD_BYTES + k]
+    return size

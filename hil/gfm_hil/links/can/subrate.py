@@ -9,133 +9,170 @@ lost ones for one that the bus lost. A word of a side that leaves goes at once.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
-
 import numpy as np
+from numba import njit
 
-from gfm_hil.codec import buffer, crc32
-from gfm_hil.frames import DATA_IDS
 from gfm_hil.links.base import Side
-from gfm_hil.links.can.dbc import SENDERS
+from gfm_hil.links.can.bench_frame import (
+    MOST,
+    SEQUENCE,
+    STATE,
+    TICK,
+    begins_with,
+    number,
+    put_number,
+    seal,
+    size_and_head,
+    undamaged,
+)
 from gfm_runtime.controller import RUNNING
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import Group
 
-_CRC_BYTES = 4
-_WORDS = {"plant": 0, "controller": RUNNING}  # the state of a side that is running
+NOTHING = -1
+
 _KEPT = 4  # commands at hand: the one in force, its successor, and those that came early
+_ROOM = (MOST + 7) // 8 * 8
+_LOW = 0xFFFF_FFFF
+
+subrate_dtype = np.dtype(
+    [
+        ("every", "i8"),  # n
+        ("plant", "i8"),  # which side this is
+        ("size", "i8", (2,)),  # of our frames and of theirs
+        ("head", "i8", (2,)),
+        ("ordinary", "i8", (2,)),  # the state of a side that is running
+        # the controller: the measurement received last, and one that waits until the ticks
+        # before it are made; ``left`` of them, and itself
+        ("has", "i8"),
+        ("left", "i8"),
+        ("last", "u1", (_ROOM,)),
+        ("next", "u1", (_ROOM,)),
+        # the plant
+        ("due", "i8"),  # tick for which it wants a command
+        ("again", "i8"),  # commands that were sent again
+        ("given", "i8"),  # sequence given out last
+        ("ticks", "i8", (_KEPT + 1,)),  # that the commands at hand answer; NOTHING: none
+        ("sequences", "i8", (_KEPT + 1,)),  # theirs, but for those sent again
+        ("commands", "u1", ((_KEPT + 1) * _ROOM,)),
+    ]
+)
 
 
-class Frame:
-    """A frame of the bench, read and written field by field.
-
-    Args:
-        group: whose.
-    """
-
-    def __init__(self, group: Group) -> None:
-        self._frame, self._bytes = buffer(len(names(group)), DATA_IDS[group])
-        self._head = self._bytes[:4].tobytes()
-        self.ordinary = _WORDS[SENDERS[group]]
-
-    def read(self, message: bytes) -> bool:
-        """Take a message; False if it is not an undamaged frame of the vector."""
-        if len(message) != len(self._bytes) or message[:4] != self._head:
-            return False
-        self._bytes[:] = np.frombuffer(message, np.uint8)
-        return int(self._frame["crc"][0]) == crc32(self._bytes, len(message) - _CRC_BYTES)
-
-    @property
-    def tick(self) -> int:
-        """Of the frame taken."""
-        return int(self._frame["tick"][0])
-
-    @property
-    def sequence(self) -> int:
-        """Of the frame taken."""
-        return int(self._frame["sequence"][0])
-
-    @property
-    def leaves(self) -> bool:
-        """Whether its sender has anything to say but values."""
-        return int(self._frame["state"][0]) != self.ordinary
-
-    def under(self, tick: int, sequence: int) -> bytes:
-        """The frame taken under another tick and sequence."""
-        self._frame["tick"], self._frame["sequence"] = tick, sequence & 0xFFFF_FFFF
-        self._frame["crc"] = crc32(self._bytes, len(self._bytes) - _CRC_BYTES)
-        return self._bytes.tobytes()
+def set_subrate(subrate: np.ndarray, side: Side, every: int) -> None:
+    """Make one record of ``subrate_dtype`` ready for a side that exchanges every n-th tick."""
+    s, plant = subrate[0], side == "plant"
+    groups: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
+    s["every"], s["plant"] = every, plant
+    for k, group in enumerate(groups):
+        s["size"][k], s["head"][k] = size_and_head(group)
+    s["ordinary"] = (0, RUNNING) if plant else (RUNNING, 0)
+    s["due"] = s["given"] = s["ticks"] = NOTHING
 
 
-class Subrate:
-    """What one side's link sends on, and what it makes of what it receives.
+@njit(cache=True, nogil=True)
+def _good(s, whose, message, size):
+    if size != s.size[whose] or not begins_with(s.head[whose], message):
+        return False
+    return undamaged(message, size)
 
-    Args:
-        side: ours.
-        every: n.
-        receive: the next message of the bus.
-    """
 
-    def __init__(self, side: Side, every: int, receive: Callable[[], bytes | None]) -> None:
-        self._every, self._receive = every, receive
-        self._mine: Frame
-        if side == "plant":
-            self._mine, self._theirs, self._next = Frame("y"), Frame("u"), self._command
-        else:
-            self._mine, self._theirs, self._next = Frame("u"), Frame("y"), self._measurement
-        self._made: deque[bytes] = deque()  # ready to be given out
-        self._held, self._last = Frame("y"), b""  # measurement received last
-        self._due = -1  # tick for which the plant wants a command
-        # by the tick they answer: commands and their sequences but for those sent again
-        self._commands: dict[int, tuple[bytes, int]] = {}
-        self._again = 0
-        self._given = -1  # sequence given out last
+@njit(cache=True, nogil=True)
+def goes(subrate, message):
+    """Whether a message of ours is to be sent; asked of every one."""
+    s = subrate[0]
+    if not _good(s, 0, message, len(message)):
+        return True
+    s.due = number(message, TICK, 8)
+    return s.due % s.every == 0 or message[STATE] != s.ordinary[0]
 
-    def goes(self, message: bytes) -> bool:
-        """Whether a message of ours is to be sent; asked of every one."""
-        if not self._mine.read(message):
-            return True
-        self._due = self._mine.tick
-        return self._mine.tick % self._every == 0 or self._mine.leaves
 
-    def receive(self) -> bytes | None:
-        """The next message, from the bus or made here."""
-        if self._made:
-            return self._made.popleft()
-        return self._next()
+@njit(cache=True, nogil=True)
+def _under(message, size, tick, sequence):
+    """Give a frame another tick and sequence."""
+    put_number(message, TICK, 8, tick)
+    put_number(message, SEQUENCE, 4, sequence & _LOW)
+    seal(message, size)
+    return size
 
-    def _measurement(self) -> bytes | None:
-        message = self._receive()
-        if message is None or not self._theirs.read(message):
-            return message
-        tick, sequence = self._theirs.tick, self._theirs.sequence
-        held = self._held
-        if held.read(self._last):
-            missing = min(self._every - 1, tick - held.tick - 1)
-            self._made += [held.under(tick - k, sequence - k) for k in range(missing, 0, -1)]
-        self._last = message
-        self._made.append(message)
-        return self._made.popleft()
 
-    def _command(self) -> bytes | None:
-        while True:
-            message = self._receive()
-            if message is None:
-                break
-            if not self._theirs.read(message):
-                return message  # damaged: for the reader to count
-            if self._theirs.tick in self._commands:  # sent again: likewise
-                self._again += 1
-                return self._theirs.under(self._theirs.tick, self._given)
-            if self._theirs.leaves:
-                return self._theirs.under(self._theirs.tick, self._given + 1)
-            self._commands[self._theirs.tick] = message, self._theirs.sequence - self._again
-            if len(self._commands) > _KEPT:
-                del self._commands[min(self._commands)]
-        in_force = max(0, (self._due // self._every - 1) * self._every)
-        message, sequence = self._commands.get(in_force, (b"", 0))
-        if self._due < 0 or not self._theirs.read(message):
-            return None
-        due, self._due = self._due, -1
-        self._given = sequence + due - in_force
-        return self._theirs.under(due, self._given)
+@njit(cache=True, nogil=True)
+def made(subrate, message):
+    """Write the next frame that is ready to be given out: its length, or NOTHING."""
+    s = subrate[0]
+    if s.left == 0:
+        return NOTHING
+    s.left -= 1
+    size = s.size[1]
+    if s.left == 0:
+        message[:size] = s.next[:size]
+        s.last[:size] = s.next[:size]
+        return size
+    message[:size] = s.last[:size]
+    tick, sequence = number(s.next, TICK, 8), number(s.next, SEQUENCE, 4)
+    return _under(message, size, tick - s.left, sequence - s.left)
+
+
+@njit(cache=True, nogil=True)
+def admit(subrate, message, size):
+    """Take a message that the bus brought; returns the length of what ``message`` then is to give
+    out, or NOTHING."""
+    s = subrate[0]
+    if not _good(s, 1, message, size):
+        return size  # damaged: for the reader to count
+    return _command(s, message, size) if s.plant else _measurement(subrate, message, size)
+
+
+@njit(cache=True, nogil=True)
+def _measurement(subrate, message, size):
+    s = subrate[0]
+    missing = 0
+    if s.has:
+        missing = number(message, TICK, 8) - number(s.last, TICK, 8) - 1
+    s.has = 1
+    if missing <= 0:
+        s.last[:size] = message[:size]
+        return size
+    s.next[:size] = message[:size]
+    s.left = min(s.every - 1, missing) + 1
+    return made(subrate, message)
+
+
+@njit(cache=True, nogil=True)
+def _command(s, message, size):
+    tick, sequence = number(message, TICK, 8), number(message, SEQUENCE, 4)
+    free, oldest = -1, 0
+    for k in range(_KEPT + 1):
+        if s.ticks[k] == tick:  # sent again: likewise
+            s.again += 1
+            return _under(message, size, tick, s.given)
+        if s.ticks[k] == NOTHING:
+            free = k
+    if message[STATE] != s.ordinary[1]:
+        return _under(message, size, tick, s.given + 1)
+    s.ticks[free], s.sequences[free] = tick, sequence - s.again
+    s.commands[free * _ROOM : free * _ROOM + size] = message[:size]
+    for k in range(_KEPT + 1):
+        if s.ticks[k] == NOTHING:
+            return NOTHING
+        if s.ticks[k] < s.ticks[oldest]:
+            oldest = k
+    s.ticks[oldest] = NOTHING
+    return NOTHING
+
+
+@njit(cache=True, nogil=True)
+def in_force(subrate, message):
+    """The plant: write the command for the tick that is due, if it is there: its length, or
+    NOTHING."""
+    s = subrate[0]
+    if s.due < 0:
+        return NOTHING
+    tick = max(0, (s.due // s.every - 1) * s.every)
+    for k in range(_KEPT + 1):
+        if s.ticks[k] == tick:
+            size = s.size[1]
+            message[:size] = s.commands[k * _ROOM : k * _ROOM + size]
+            s.given = s.sequences[k] + s.due - tick
+            due, s.due = s.due, NOTHING
+            return _under(message, size, due, s.given)
+    return NOTHING

@@ -15,42 +15,270 @@ What fails its check here is made a frame that fails its own, so that its reader
 
 from __future__ import annotations
 
-import struct
-import zlib
-
 import numpy as np
+from numba import njit
 
-from gfm_hil.codec import buffer
-from gfm_hil.frames import DATA_IDS
-from gfm_hil.links.can.dbc import COUNTER, CRC, SENDERS
+from gfm_hil.atomics import copy
+from gfm_hil.links.can.bench_frame import (
+    CRC_BYTES,
+    FIRST,
+    REASON,
+    SEQUENCE,
+    SPARE,
+    STATE,
+    TICK,
+    VALUES,
+    begins_with,
+    number,
+    put_number,
+    seal,
+    size_and_head,
+    undamaged,
+)
+from gfm_hil.links.can.dbc import SENDERS
 from gfm_hil.links.can.e2e import crc8
-from gfm_hil.links.can.layout import Layout, Plan, pack_vector, unpack_vector
-from gfm_runtime.signals import Group, names
+from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
+from gfm_hil.links.can.wire import BRS, FD, frame_dtype
+from gfm_runtime.signals import Group
 
 #: a CAN frame: identifier and payload
 CanFrame = tuple[int, bytes]
 
+NOTHING = -1
+PARTS = VALUES  # frames of a vector, at most
+
 _SEQUENCES = 64  # that a counter tells apart
 _LAG, _MARK = 0x40, 0x80  # its other bits
 _BEHIND = 4  # how many of the sequences mean an older vector
-_CRC_BYTES = 4  # at the end of a frame of the bench
+_LOW = 0xFFFF_FFFF
+_SAID = ("State", "Reason", "Tick")  # in a status, in this order
+
+#: a vector's frames by the DBC; the values of part k are those from first[k] to first[k + 1]
+_TABLE = [
+    ("parts", "i8"),
+    ("flags", "i8"),  # of a CAN FD frame
+    ("number", "i8", (PARTS,)),
+    ("length", "i8", (PARTS,)),
+    ("data_id", "i8", (PARTS,)),
+    ("first", "i8", (PARTS + 1,)),
+    ("index", "i8", (VALUES,)),
+    ("start", "i8", (VALUES,)),
+    ("scale", "f8", (VALUES,)),
+    ("offset", "f8", (VALUES,)),
+    ("status_number", "i8"),
+    ("status_length", "i8"),
+    ("status_data_id", "i8"),
+    ("status_at", "i8", (len(_SAID),)),
+    ("status_width", "i8", (len(_SAID),)),
+    ("size", "i8"),  # of the bench's frames
+    ("head", "i8"),
+]
+
+sender_dtype = np.dtype(
+    [
+        *_TABLE,
+        ("heartbeat", "i8"),
+        ("since", "i8"),  # vectors since the state was said
+        ("told", "i8", (3,)),  # state, reason and lag
+        ("tick", "i8"),  # sent last
+        ("ticks", "i8"),  # for how many more the state is said with the values
+        ("saturated", "i8"),  # values that lay outside 16 bits
+        ("values", "f8", (VALUES,)),
+    ]
+)
+receiver_dtype = np.dtype(
+    [
+        *_TABLE,
+        ("sequence", "i8"),  # of the newest frame
+        ("lag", "i8"),
+        ("said", "i8"),  # sequence of the newest state
+        ("told", "i8", (2,)),  # what it says
+        ("counter", "i8"),  # of the vector being put together
+        ("have", "i8"),  # its parts, bit by bit
+        ("incomplete", "i8"),  # vectors of which a part or the state never came
+        ("values", "f8", (VALUES,)),
+    ]
+)
 
 
-def _header(group: Group) -> tuple[struct.Struct, bytes, int]:
-    """Layout of a frame's header, an empty frame, and where its values begin.
+def set_sender(sender: np.ndarray, plan: Plan, group: Group, heartbeat: int) -> None:
+    """Make one record of ``sender_dtype`` ready; the state is said every ``heartbeat`` vectors."""
+    _set_table(sender, plan, group)
+    sender["heartbeat"], sender["told"], sender["tick"] = heartbeat, NOTHING, NOTHING
 
-    By ``struct`` and ``zlib``: a field of a NumPy record costs a microsecond.
+
+def set_receiver(receiver: np.ndarray, plan: Plan, group: Group) -> None:
+    """Make one record of ``receiver_dtype`` ready."""
+    _set_table(receiver, plan, group)
+    receiver["sequence"] = receiver["said"] = receiver["counter"] = NOTHING
+
+
+def _set_table(record: np.ndarray, plan: Plan, group: Group) -> None:
+    r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
+    r["parts"], r["flags"] = len(parts), plan.fd * (FD | BRS)
+    r["size"], r["head"] = size_and_head(group)
+    done = 0
+    for k, part in enumerate(parts):
+        r["number"][k], r["length"][k], r["data_id"][k] = part.number, part.length, part.data_id
+        end = done + len(part.index)
+        for name in ("index", "start", "scale", "offset"):
+            r[name][done:end] = getattr(part, name)
+        done = r["first"][k + 1] = end
+    r["status_number"], r["status_length"] = status.number, status.length
+    r["status_data_id"] = status.data_id
+    fields = status.dtype.fields
+    assert fields is not None
+    r["status_at"] = [fields[name][1] for name in _SAID]
+    r["status_width"] = [fields[name][0].itemsize for name in _SAID]
+
+
+@njit(cache=True, nogil=True)
+def encode(sender, message, frames):
+    """The CAN frames of a frame of the bench, in the order in which to send them.
+
+    Args:
+        sender: one record of ``sender_dtype``.
+        message: bytes.
+        frames: of ``wire.frame_dtype``, one more than parts, written.
+
+    Returns:
+        How many; NOTHING if the message is not a frame of this vector.
     """
-    frame, message = buffer(len(names(group)), DATA_IDS[group])
-    dtype = frame.dtype
-    fields = [dtype[name] for name in dtype.names or () if name not in ("values", "crc")]
-    kinds = {1: "B", 2: "H", 4: "I", 8: "Q"}
-    layout = struct.Struct("<" + "".join(kinds[field.itemsize] for field in fields))
-    return layout, message.tobytes(), layout.size
+    s, size = sender[0], len(message)
+    if size != s.size or not begins_with(s.head, message):
+        return NOTHING
+    state, reason = np.int64(message[STATE]), np.int64(message[REASON])
+    sequence, tick = number(message, SEQUENCE, 4), number(message, TICK, 8)
+    lag = (sequence - tick) & _LOW
+    copy(s.values.ctypes.data, message.ctypes.data + FIRST, size - FIRST - CRC_BYTES)
+    good = undamaged(message, size)
+    if good:
+        if tick != s.tick and s.ticks > 0:
+            s.ticks -= 1
+        s.tick = tick
+        if state != s.told[0] or reason != s.told[1] or lag != s.told[2]:
+            s.told[0], s.told[1], s.told[2] = state, reason, lag
+            s.ticks = 2
+    counter = sequence % _SEQUENCES | (lag & 1) * _LAG | (s.ticks > 0) * _MARK
+    count = 0
+    if good and (s.ticks > 0 or s.since >= s.heartbeat):
+        _head(frames[0], s.status_number, s.status_length, s.flags)
+        data = frames[0].data[: s.status_length]
+        data[:] = 0
+        put_number(data, s.status_at[0], s.status_width[0], state)
+        put_number(data, s.status_at[1], s.status_width[1], reason)
+        put_number(data, s.status_at[2], s.status_width[2], tick)
+        data[1] = counter
+        data[0] = crc8(s.status_data_id, data)
+        count, s.since = 1, 0
+    s.since += 1
+    for k in range(s.parts):
+        a, b = s.first[k], s.first[k + 1]
+        _head(frames[count], s.number[k], s.length[k], s.flags)
+        data = frames[count].data[: s.length[k]]
+        s.saturated += pack_vector(
+            s.values, s.index[a:b], s.start[a:b], s.scale[a:b], s.offset[a:b], s.data_id[k],
+            counter, data,
+        )  # fmt: skip
+        if not good:  # damaged before it came here, and so it shall arrive
+            data[0] ^= 0xFF
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _head(frame, number, length, flags):
+    frame.id, frame.length, frame.flags = number, length, flags
+
+
+@njit(cache=True, nogil=True)
+def knows(receiver, number):
+    """Whether an identifier is one of this vector or its sender's state."""
+    r = receiver[0]
+    for k in range(r.parts):
+        if r.number[k] == number:
+            return True
+    return number == r.status_number
+
+
+@njit(cache=True, nogil=True)
+def decode(receiver, frame, message):
+    """Take a CAN frame of this vector (see ``knows``).
+
+    Args:
+        receiver: one record of ``receiver_dtype``.
+        frame: one record of ``wire.frame_dtype``.
+        message: bytes, at least those of a frame of the bench, written.
+
+    Returns:
+        The length of the frame of the bench that it completes, or NOTHING.
+    """
+    r = receiver[0]
+    part, length, data_id = -1, r.status_length, r.status_data_id
+    for k in range(r.parts):
+        if r.number[k] == frame.id:
+            part, length, data_id = k, r.length[k], r.data_id[k]
+    data = frame.data[: frame.length]
+    if len(data) != length or data[0] != crc8(data_id, data):
+        message[: r.size] = 0  # its check is 0, which is wrong
+        return r.size
+    if part < 0:
+        _learn(r, data)
+        return NOTHING
+    return _put(r, part, data, message)
+
+
+@njit(cache=True, nogil=True)
+def _learn(r, data):
+    sequence = _count_on(r, np.int64(data[1]))
+    if sequence < r.sequence:
+        return
+    tick = r.sequence - r.lag
+    said = number(data, r.status_at[2], r.status_width[2])
+    tick += (said - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+    r.lag, r.said = sequence - tick, sequence
+    for k in range(2):
+        r.told[k] = number(data, r.status_at[k], r.status_width[k])
+
+
+@njit(cache=True, nogil=True)
+def _count_on(r, counter):
+    """The whole sequence of which the low bits came."""
+    return r.sequence + (counter - r.sequence + _BEHIND) % _SEQUENCES - _BEHIND
+
+
+@njit(cache=True, nogil=True)
+def _put(r, part, data, message):
+    counter = np.int64(data[1])
+    if counter != r.counter:
+        r.incomplete += r.have != 0
+        r.counter, r.have = counter, 0
+    a, b = r.first[part], r.first[part + 1]
+    unpack_vector(
+        data, r.index[a:b], r.start[a:b], r.scale[a:b], r.offset[a:b], r.values
+    )  # fmt: skip
+    r.have |= 1 << part
+    if r.have != (1 << r.parts) - 1:
+        return NOTHING
+    r.have = 0
+    sequence = _count_on(r, counter)
+    unsaid = counter & _MARK != 0 and sequence != r.said
+    if unsaid or (counter & _LAG != 0) != (r.lag & 1 != 0):  # its tick is not known
+        r.incomplete += 1
+        return NOTHING
+    r.sequence = max(r.sequence, sequence)
+    put_number(message, 0, STATE, r.head)
+    message[STATE], message[REASON] = r.told[0], r.told[1]
+    put_number(message, SPARE, SEQUENCE - SPARE, 0)
+    put_number(message, SEQUENCE, 4, sequence & _LOW)
+    put_number(message, TICK, 8, max(sequence - r.lag, 0))
+    copy(message.ctypes.data + FIRST, r.values.ctypes.data, r.size - FIRST - CRC_BYTES)
+    seal(message, r.size)
+    return r.size
 
 
 class VectorSender:
-    """Makes CAN frames of one side's vectors.
+    """Makes CAN frames of one side's vectors, for Python.
 
     Args:
         plan: of the DBC.
@@ -59,122 +287,12 @@ class VectorSender:
     """
 
     def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
-        self._header, self._empty, self._at = _header(group)
-        self._parts = [(part, np.zeros(part.length, np.uint8)) for part in plan.vectors[group]]
-        self._status = plan.status[SENDERS[group]]
-        self._heartbeat, self._since = heartbeat, 0
-        self._told: tuple[int, int, int] | None = None
-        self._tick, self._ticks = -1, 0  # sent last; for how many more it is said with the values
-        self.saturated = 0  # values that lay outside 16 bits
-
-    def fits(self, message: bytes) -> bool:
-        """Whether a message is a frame of this vector."""
-        head = self._empty[:4]  # magic, version, data id
-        return len(message) == len(self._empty) and message[:4] == head
+        self.record = np.zeros(1, sender_dtype)
+        set_sender(self.record, plan, group, heartbeat)
+        self._frames = np.zeros(PARTS + 1, frame_dtype)
 
     def frames(self, message: bytes) -> list[CanFrame]:
         """The CAN frames of a frame of the bench, in the order in which to send them."""
-        *_, state, reason, _, sequence, tick = self._header.unpack_from(message)
-        values = np.frombuffer(message[self._at : -_CRC_BYTES], np.float64)
-        told = (state, reason, (sequence - tick) & 0xFFFF_FFFF)
-        good = message[-_CRC_BYTES:] == _crc(message[:-_CRC_BYTES])
-        if good:
-            self._ticks -= tick != self._tick and self._ticks > 0
-            self._tick = tick
-            if told != self._told:
-                self._told, self._ticks = told, 2
-        counter = sequence % _SEQUENCES | (told[2] & 1) * _LAG | (self._ticks > 0) * _MARK
-        out: list[CanFrame] = []
-        if good and (self._ticks > 0 or self._since >= self._heartbeat):
-            out.append((self._status.number, self._state(counter, tick, *told[:2])))
-            self._since = 0
-        self._since += 1
-        for part, payload in self._parts:
-            self.saturated += pack_vector(
-                values, part.index, part.start, part.scale, part.offset, part.data_id,
-                counter, payload,
-            )  # fmt: skip
-            if not good:  # damaged before it came here, and so it shall arrive
-                payload[0] ^= 0xFF
-            out.append((part.number, payload.tobytes()))
-        return out
-
-    def _state(self, counter: int, tick: int, state: int, reason: int) -> bytes:
-        record = np.zeros(1, self._status.dtype)
-        record["State"], record["Reason"] = state, reason
-        record["Tick"], record[COUNTER] = tick & 0xFFFF_FFFF, counter
-        record[CRC] = crc8(self._status.data_id, record.view(np.uint8))
-        return record.tobytes()
-
-
-class VectorReceiver:
-    """Makes the frames of the bench again.
-
-    Args:
-        plan, group: as of the sender.
-    """
-
-    def __init__(self, plan: Plan, group: Group) -> None:
-        self._header, self._empty, self._at = _header(group)
-        self._magic = self._header.unpack_from(self._empty)[:3]
-        self._values = np.zeros(len(names(group)))
-        self._parts = {part.number: (k, part) for k, part in enumerate(plan.vectors[group])}
-        self._status = plan.status[SENDERS[group]]
-        self._sequence, self._lag = -1, 0  # of the newest frame
-        self._said, self._told = -1, (0, 0)  # the newest state: its sequence, and what it says
-        self._counter, self._have = -1, 0  # of the vector being put together, and its parts
-        self.incomplete = 0  # vectors of which a part or the state never came
-
-    def knows(self, number: int) -> bool:
-        """Whether an identifier is one of this vector or its sender's state."""
-        return number in self._parts or number == self._status.number
-
-    def take(self, number: int, payload: bytes) -> bytes | None:
-        """A CAN frame of this vector: the bench's frame that it completes, if it does."""
-        k, layout = self._parts.get(number, (-1, self._status))
-        data = np.frombuffer(payload, np.uint8)
-        if len(data) != layout.length or data[0] != crc8(layout.data_id, data):
-            return self._empty  # its CRC is 0, which is wrong
-        if k < 0:
-            self._learn(data.view(layout.dtype)[0])
-            return None
-        return self._put(k, layout, data)
-
-    def _learn(self, status: np.void) -> None:
-        sequence = self._count_on(int(status[COUNTER]))
-        if sequence < self._sequence:
-            return
-        tick = self._sequence - self._lag
-        tick += (int(status["Tick"]) - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
-        self._lag, self._said = sequence - tick, sequence
-        self._told = int(status["State"]), int(status["Reason"])
-
-    def _count_on(self, counter: int) -> int:
-        """The whole sequence of which the low bits came."""
-        ahead = (counter - self._sequence + _BEHIND) % _SEQUENCES - _BEHIND
-        return self._sequence + ahead
-
-    def _put(self, k: int, layout: Layout, data: np.ndarray) -> bytes | None:
-        counter = int(data[1])
-        if counter != self._counter:
-            self.incomplete += self._have != 0
-            self._counter, self._have = counter, 0
-        unpack_vector(data, layout.index, layout.start, layout.scale, layout.offset, self._values)
-        self._have |= 1 << k
-        if self._have != (1 << len(self._parts)) - 1:
-            return None
-        self._have = 0
-        sequence, lag = self._count_on(counter), self._lag
-        marked = counter & _MARK and sequence != self._said
-        if marked or bool(counter & _LAG) != bool(lag & 1):  # its tick is not known
-            self.incomplete += 1
-            return None
-        self._sequence = max(self._sequence, sequence)
-        body = self._header.pack(
-            *self._magic, *self._told, 0, sequence & 0xFFFF_FFFF, max(sequence - lag, 0)
-        ) + self._values.tobytes()  # fmt: skip
-        return body + _crc(body)
-
-
-def _crc(body: bytes) -> bytes:
-    return zlib.crc32(body).to_bytes(_CRC_BYTES, "little")
+        count = encode(self.record, np.frombuffer(message, np.uint8), self._frames)
+        frames = self._frames[: max(0, count)]
+        return [(int(f["id"]), f["data"][: f["length"]].tobytes()) for f in frames]

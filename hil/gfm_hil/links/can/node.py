@@ -1,0 +1,309 @@
+"""One side's node on a bus, compiled: from messages to frames, and from frames to messages.
+
+All that a node remembers lies in one int64 array, which is the ``handle`` of its port, so that
+Python and compiled loops use the same node by the same code. Frames come from a socket (see
+``sockets``), or Python brings and takes them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gfm_hil.links.base import Side
+from gfm_hil.links.can.emulation import (
+    PLACES,
+    arrive,
+    bus_dtype,
+    busy,
+    deliver,
+    has_room,
+    is_through,
+    place_dtype,
+    set_bus,
+)
+from gfm_hil.links.can.layout import Plan
+from gfm_hil.links.can.options import CanOptions
+from gfm_hil.links.can.segments import OTHER_DBC, join, joiner_dtype, set_joiner
+from gfm_hil.links.can.sockets import (
+    FULL,
+    PORTABLE,
+    read_frame,
+    sleep_for_frame,
+    socket_dtype,
+    write_frame,
+)
+from gfm_hil.links.can.subrate import admit, goes, in_force, made, set_subrate, subrate_dtype
+from gfm_hil.links.can.vectors import (
+    PARTS,
+    decode,
+    encode,
+    knows,
+    receiver_dtype,
+    sender_dtype,
+    set_receiver,
+    set_sender,
+)
+from gfm_hil.links.can.wire import BUS_OFF, ERROR, EXTENDED, REMOTE, frame_dtype
+from gfm_hil.loops.clock import now_ns
+
+NOTHING, LOST = -1, -2  # no message; the bus is gone, see ``lost``
+
+_AT_ONCE = 64  # frames looked at in one call, so that a flood of others' frames cannot hold it
+
+#: ``lost`` says why: an errno, or one of these
+WENT_BUS_OFF, ANOTHER_DBC = -1, -2
+
+state_dtype = np.dtype(
+    [
+        ("open", "i8"),
+        ("lost", "i8"),  # 0: it is there
+        ("foreign", "i8"),  # frames with identifiers that are not of this link
+        ("error_frames", "i8"),
+        ("dropped", "i8"),  # frames of ours, for want of room
+    ]
+)
+
+FRAMES = PARTS + 1  # that a message of the loops becomes, at most
+_WORD = 8
+_SIZES = {
+    "state": (state_dtype, 1),
+    "sockets": (socket_dtype, 1),
+    "sender": (sender_dtype, 1),
+    "receiver": (receiver_dtype, 1),
+    "joiner": (joiner_dtype, 1),
+    "subrate": (subrate_dtype, 1),
+    "bus": (bus_dtype, 1),
+    "places": (place_dtype, 2 * PLACES),
+    "out": (frame_dtype, FRAMES),
+    "into": (frame_dtype, 1),
+}
+_ENDS = np.cumsum([dtype.itemsize * count for dtype, count in _SIZES.values()]) // _WORD
+# where each begins, the first at 0
+_SOCKETS, _SENDER, _RECEIVER, _JOINER, _SUBRATE, _BUS, _PLACES, _OUT, _INTO, _END = _ENDS.tolist()
+
+
+class Node:
+    """The array and, for Python, what lies in it; see the dtypes.
+
+    Args:
+        plan: of the DBC.
+        side: ours.
+        options: of the link.
+    """
+
+    def __init__(self, plan: Plan, side: Side, options: CanOptions) -> None:
+        self.handle: NDArray[np.int64] = np.zeros(_END, np.int64)
+        parts = np.split(self.handle, _ENDS[:-1])
+        views = {
+            name: part.view(dtype)
+            for (name, (dtype, _)), part in zip(_SIZES.items(), parts, strict=True)
+        }
+        self.state, self.sockets, self.joiner = views["state"], views["sockets"], views["joiner"]
+        self.sender, self.receiver = views["sender"], views["receiver"]
+        self.bus, self.places, self.out = views["bus"], views["places"], views["out"]
+        self.state["open"] = 1
+        plant = side == "plant"
+        set_sender(self.sender, plan, "y" if plant else "u", options.heartbeat)
+        set_receiver(self.receiver, plan, "u" if plant else "y")
+        set_joiner(self.joiner, plan, side)
+        set_subrate(views["subrate"], side, options.every)
+        if options.emulate:
+            set_bus(self.bus, options.fd, options.bitrate, options.data_bitrate)
+
+
+@njit(cache=True, nogil=True)
+def _state(handle):
+    return handle[:_SOCKETS].view(state_dtype)
+
+
+@njit(cache=True, nogil=True)
+def _sockets(handle):
+    return handle[_SOCKETS:_SENDER].view(socket_dtype)
+
+
+@njit(cache=True, nogil=True)
+def _subrate(handle):
+    return handle[_SUBRATE:_BUS].view(subrate_dtype)
+
+
+@njit(cache=True, nogil=True)
+def _bus(handle):
+    return handle[_BUS:_PLACES].view(bus_dtype)
+
+
+@njit(cache=True, nogil=True)
+def _places(handle):
+    return handle[_PLACES:_OUT].view(place_dtype)
+
+
+@njit(cache=True, nogil=True)
+def _out(handle):
+    return handle[_OUT:_INTO].view(frame_dtype)
+
+
+@njit(cache=True, nogil=True)
+def _into(handle):
+    return handle[_INTO:_END].view(frame_dtype)
+
+
+@njit(cache=True, nogil=True)
+def compose(handle, message):
+    """Make the frames of a message of the loops, in ``out``; returns how many, or NOTHING if it
+    is another message, which has to be cut."""
+    subrate = _subrate(handle)
+    if subrate[0].every > 1 and not goes(subrate, message):
+        return 0
+    return encode(handle[_SENDER:_RECEIVER].view(sender_dtype), message, _out(handle))
+
+
+@njit(cache=True, nogil=True)
+def room_to_send(handle):
+    """Whether another frame may be sent; one that may not is counted."""
+    if _bus(handle)[0].waiting < PLACES:
+        return True
+    _state(handle)[0].dropped += 1
+    return False
+
+
+@njit(cache=True, nogil=True)
+def account(handle, frame):
+    """A frame of ours has been sent: it keeps an emulated bus."""
+    bus = _bus(handle)
+    if bus[0].emulate:
+        arrive(bus, _places(handle), frame, 0, now_ns())
+
+
+@njit(cache=True, nogil=True)
+def bring(handle, frame):
+    """A frame of another node has come."""
+    bus = _bus(handle)
+    arrive(bus, _places(handle), frame, 1, now_ns())
+
+
+@njit(cache=True, nogil=True)
+def put(handle, frame):
+    """Send the frame in an array; False if it was dropped or the bus is gone."""
+    if not room_to_send(handle):
+        return False
+    problem = write_frame(_sockets(handle), frame)
+    if problem == 0:
+        account(handle, frame)
+        return True
+    state = _state(handle)
+    if problem in FULL:
+        state[0].dropped += 1
+    else:
+        state[0].lost = problem
+    return False
+
+
+@njit(cache=True, nogil=True)
+def send(handle, message):
+    """Send a message of the loops: 1, or 0 if some of it was dropped."""
+    if _state(handle)[0].open == 0:
+        return 0
+    count = compose(handle, message)
+    out = _out(handle)
+    sent = count >= 0
+    for k in range(count):
+        if not put(handle, out[k : k + 1]):
+            sent = False
+    return 1 if sent else 0
+
+
+@njit(cache=True, nogil=True)
+def fetch(handle):
+    """Take in what has come by the socket; returns whether there is a frame to be looked at."""
+    sockets, bus = _sockets(handle), _bus(handle)
+    places, into = _places(handle), _into(handle)
+    if sockets[0].kind != PORTABLE:
+        # all of them, where it matters when they came
+        while has_room(bus) and (bus[0].emulate or bus[0].through == 0):
+            came = read_frame(sockets, into)
+            if came < 0:
+                _state(handle)[0].lost = -came
+            if came <= 0:
+                break
+            arrive(bus, places, into, 1, now_ns() if bus[0].emulate else 0)
+    return is_through(bus, places, now_ns() if bus[0].emulate else 0)
+
+
+@njit(cache=True, nogil=True)
+def receive(handle, message):
+    """The next message.
+
+    Args:
+        handle: of the node.
+        message: bytes, at least those of a frame of the bench, written; of a longer message only
+            the beginning.
+
+    Returns:
+        Its length, NOTHING, or LOST.
+    """
+    subrate = _subrate(handle)
+    if subrate[0].every == 1:
+        return _from_bus(handle, message)
+    size = made(subrate, message)
+    while size == NOTHING:
+        size = _from_bus(handle, message)
+        if size == NOTHING:
+            return in_force(subrate, message)
+        if size == LOST:
+            return LOST
+        size = admit(subrate, message, size)
+    return size
+
+
+@njit(cache=True, nogil=True)
+def _from_bus(handle, message):
+    """The next message that the bus itself brought."""
+    state = _state(handle)
+    bus, places = _bus(handle), _places(handle)
+    frame = _into(handle)
+    if state[0].open == 0:
+        return NOTHING
+    for _ in range(_AT_ONCE):
+        there = state[0].lost == 0 and fetch(handle)
+        if state[0].lost != 0:
+            return LOST
+        if not there:
+            return NOTHING
+        deliver(bus, places, frame)
+        size = _take(handle, state[0], frame[0], message)
+        if size != NOTHING:
+            return size
+    return NOTHING
+
+
+@njit(cache=True, nogil=True)
+def _take(handle, state, frame, message):
+    """Look at a frame; returns the length of the message that it completes, NOTHING, or LOST."""
+    receiver = handle[_RECEIVER:_JOINER].view(receiver_dtype)
+    joiner = handle[_JOINER:_SUBRATE].view(joiner_dtype)
+    if frame.id & ERROR:
+        state.error_frames += 1
+        if frame.id & BUS_OFF:
+            state.lost = WENT_BUS_OFF
+            return LOST
+    elif frame.id & (EXTENDED | REMOTE):
+        state.foreign += 1
+    elif knows(receiver, frame.id):
+        return decode(receiver, frame, message)
+    elif frame.id == joiner[0].number:
+        size = join(joiner, frame, message)
+        if size == OTHER_DBC:
+            state.lost = ANOTHER_DBC
+            return LOST
+        return size
+    else:
+        state.foreign += 1
+    return NOTHING
+
+
+@njit(cache=True, nogil=True)
+def sleep(handle, ms):
+    """Sleep until a frame comes by the socket, at most that long; not while one is on the bus."""
+    if _state(handle)[0].open != 0 and not busy(_bus(handle)):
+        sleep_for_frame(_sockets(handle), ms)
