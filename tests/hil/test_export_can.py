@@ -40,16 +40,18 @@ class Listener(threading.Thread):
         self.bus.shutdown()
 
 
-def run_over_can(folder: Path, port: int, **options) -> list[can.Message]:
+CONTENT = {
+    "title": "on a bus",
+    "duration": 0.03,
+    "events": [{"type": "reference", "t": 0.01, "P_ref": 0.8}],
+}
+
+
+def run_over_can(folder: Path, port: int, content=CONTENT, **options) -> list[can.Message]:
     """A short run over CAN; returns what was on the bus."""
     channel = BUS.format(port=port)
     link = {"type": "can", "endpoint": f"can+udp://{channel}", "repeat_s": 5.0}
-    content = {
-        "title": "on a bus",
-        "duration": 0.03,
-        "link": {**link, "options": {"heartbeat": 50, **options}},
-        "events": [{"type": "reference", "t": 0.01, "P_ref": 0.8}],
-    }
+    content = {**content, "link": {**link, "options": {"heartbeat": 50, **options}}}
     listener = Listener(channel)
     listener.start()
     try:
@@ -120,6 +122,29 @@ def test_any_run_can_be_put_into_frames(run, tmp_path):
         "INIT", None, "RUNNING", None,
     ]  # fmt: skip
     assert len(found) == 2 * 200 + 2 * 2  # each state is said with its first two vectors
+
+
+def test_a_safe_state_is_said_with_its_reason(tmp_path):
+    """The plant trips at a phase jump and both sides say so, until the reset."""
+    content = {
+        "title": "tripped on a bus",
+        "duration": 0.04,
+        "after_trip": "wait",
+        "events": [
+            {"type": "grid-phase-jump", "t": 0.01, "degrees": 120.0},
+            {"type": "reset", "t": 0.03},
+        ],
+    }
+    heard = run_over_can(tmp_path / "run", 19540, content)
+    found, dbc = exported(tmp_path / "run", tmp_path)
+    for side in ("plant", "controller"):
+        message = dbc.get_message_by_name(STATUS[side])
+        told = [bytes(m.data) for m in heard if m.arbitration_id == message.frame_id]
+        again = [bytes(m.data) for m in found if m.arbitration_id == message.frame_id]
+        assert again == told[: len(again)]
+        assert len(told) - len(again) <= LAST
+        said = {(str(s["State"]), str(s["Reason"])) for s in map(message.decode, again)}
+        assert ("SAFE", "the plant's protection tripped") in said
 
 
 def test_both_sides_are_needed(run, tmp_path):

@@ -14,7 +14,6 @@ import heapq
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -24,10 +23,12 @@ from gfm_hil.errors import UserError
 from gfm_hil.export.table import RunTable
 from gfm_hil.frames import FrameWriter
 from gfm_hil.links.can.dbc import write_dbc
+from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.plan import load_plan
-from gfm_hil.links.can.vectors import CanFrame, VectorSender
-from gfm_runtime.controller import INIT, REASONS, SAFE
+from gfm_hil.links.can.vectors import PARTS, CanFrame, encode, sender_dtype, set_sender
+from gfm_hil.links.can.wire import frame_dtype
+from gfm_runtime.controller import INIT, PLANT_TRIP, REASONS, SAFE
 from gfm_runtime.signals import Group, names
 
 #: a CAN frame and when it was sent, s from tick 0
@@ -77,34 +78,58 @@ def can_frames(table: RunTable, options: CanOptions) -> Iterator[Timed]:
     return heapq.merge(*sides, key=lambda timed: timed[0])
 
 
-def _measurements(table: RunTable, options: CanOptions, plan: Any) -> Iterator[Timed]:
+class _Sender:
+    """One side's frames, as its node on the bus makes them.
+
+    Args:
+        plan: of the DBC.
+        group: ``"y"`` or ``"u"``.
+        heartbeat: vectors after which the state is said again.
+    """
+
+    def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
+        self._writer = FrameWriter(group)
+        self._record, self._frames = np.zeros(1, sender_dtype), np.zeros(PARTS + 1, frame_dtype)
+        set_sender(self._record, plan, group, heartbeat)
+
+    def pack(self, tick: int, state: int, reason: int, values: NDArray[np.float64]) -> None:
+        """Make the bench's frame of a tick."""
+        self._writer.pack(tick, state, reason, values)
+
+    def frames(self) -> list[CanFrame]:
+        """The CAN frames of the frame packed last, which count as sent."""
+        count = encode(self._record, self._writer.message, self._frames)
+        return [(int(f["id"]), f["data"][: f["length"]].tobytes()) for f in self._frames[:count]]
+
+
+def _measurements(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
-    writer, sender = FrameWriter("y"), VectorSender(plan, "y", options.heartbeat)
+    sender = _Sender(plan, "y", options.heartbeat)
     rows, times = _vector(table, "y"), _times(table, "plant")
+    tripped = table.values["true_trip"] != 0
     for k, row in enumerate(rows):
-        message = writer.pack(k, INIT, 0, row)
+        state, reason = (SAFE, PLANT_TRIP) if tripped[k] else (INIT, 0)
+        sender.pack(k, state, reason, row)
         if k % options.every == 0 and not np.isnan(row[0]):
-            yield from ((times[k], frame) for frame in sender.frames(message))
+            yield from ((times[k], frame) for frame in sender.frames())
 
 
-def _commands(table: RunTable, options: CanOptions, plan: Any) -> Iterator[Timed]:
+def _commands(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The controller's: an answer to every vector that it got.
 
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
     """
-    writer, sender = FrameWriter("u"), VectorSender(plan, "u", options.heartbeat)
-    rows, times, n = _vector(table, "u"), _times(table, "controller"), options.every
-    taken = _taken(table)
+    sender, n = _Sender(plan, "u", options.heartbeat), options.every
+    rows, times, taken = _vector(table, "u"), _times(table, "controller"), _taken(table)
     state = table.values["state"]
-    why = _safe_reason(table)
     for k in np.flatnonzero(~np.isnan(state)).tolist():
         at = k + n if n > 1 and k else k
         known = at < len(rows) and bool(taken[at])
         now = int(state[k])
         values = rows[at] if known else np.zeros(rows.shape[1])
-        message = writer.pack(k, now, why if now == SAFE else 0, values)
+        sender.pack(k, now, _safe_reason(table, k) if now == SAFE else 0, values)
         if k % n == 0:
-            frames = sender.frames(message)
+            frames = sender.frames()
             if known:
                 yield from ((times[k], frame) for frame in frames)
 
@@ -130,10 +155,12 @@ def _times(table: RunTable, side: str) -> NDArray[np.float64]:
     return (sent - begin) * 1e-9
 
 
-def _safe_reason(table: RunTable) -> int:
-    """Code of the reason for which the controller went into SAFE; the log has it in words."""
-    for line in table.events:
-        for code, text in enumerate(REASONS):
-            if text and str(line.get("reason", "")).startswith(text):
-                return code
-    return 0
+def _safe_reason(table: RunTable, tick: int) -> int:
+    """Code of the reason for which the controller is in SAFE; the log has it in words."""
+    said = [
+        line["reason"]
+        for line in table.events
+        if "controller" in line.get("side", "") and "reason" in line and line["tick"] <= tick
+    ]
+    codes = [k for k, text in enumerate(REASONS) if text and said and said[-1].startswith(text)]
+    return codes[0] if codes else 0
