@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE
+from gfm_hil.cli.main import parser
 from gfm_hil.links.can.options import CanOptions
 from gfm_hil.realtime import PRIORITY
 from gfm_hil.scenario_model import Link
@@ -25,6 +26,8 @@ ROOT = DEPLOY.parent
 COMPOSE, CONTAINERFILE = (DEPLOY / "container" / n for n in ("compose.yaml", "Containerfile"))
 TUNE = DEPLOY / "tune-realtime"
 SIDES = ("controller", "plant")
+OBSERVERS = ("modbus", "scope", "stream")
+SERVICES = (*SIDES, "bench", *OBSERVERS)
 SYSTEM_UNITS = Path("/usr/lib/systemd/system")
 
 needs_systemd = pytest.mark.skipif(
@@ -67,7 +70,7 @@ def installed(root: Path) -> Path:
     shutil.copytree(SYSTEM_UNITS, root / "usr/lib/systemd/system", symlinks=True)
     shutil.copytree(DEPLOY / "systemd", units)
     shutil.copytree(DEPLOY / "can", units, dirs_exist_ok=True)
-    for program in ("opt/gfmhil/bin/gfmhil", "usr/sbin/ip"):
+    for program in ("opt/gfmhil/bin/gfmhil", "usr/sbin/ip", "usr/bin/ln"):
         (root / program).parent.mkdir(parents=True, exist_ok=True)
         (root / program).write_text("#!/bin/sh\n")
         (root / program).chmod(0o755)
@@ -84,7 +87,8 @@ def verify(root: Path, name: str) -> str:
 @needs_systemd
 def test_systemd_finds_no_fault_and_would_find_one(tmp_path):
     units = installed(tmp_path)
-    for name in ("gfmhil-controller@rig", "gfmhil-plant@rig", "gfmhil-can@can0", "gfmhil-vcan@v"):
+    services = [f"gfmhil-{name}@rig" for name in SERVICES]
+    for name in (*services, "gfmhil-can@can0", "gfmhil-vcan@v"):
         assert verify(tmp_path, f"{name}.service") == ""
     drop_in = units / "gfmhil-plant@.service.d" / "10-processors.conf"
     drop_in.write_text(drop_in.read_text().replace("CPUAffinity", "CpuAffinity"))
@@ -93,10 +97,10 @@ def test_systemd_finds_no_fault_and_would_find_one(tmp_path):
 
 @pytest.mark.apt
 @needs_systemd
-@pytest.mark.parametrize("side", SIDES)
-def test_services_expose_little(side):
+@pytest.mark.parametrize("name", SERVICES)
+def test_services_expose_little(name):
     done = call(
-        "systemd-analyze", "security", "--offline=true", "--threshold=25", "--no-pager", unit(side)
+        "systemd-analyze", "security", "--offline=true", "--threshold=25", "--no-pager", unit(name)
     )
     assert done.returncode == 0, done.stdout
 
@@ -109,9 +113,9 @@ def test_both_services_differ_only_in_their_side():
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_services_fit_the_program(side):
-    found = {key: " ".join(values) for key, values in settings(unit(side)).items()}
+@pytest.mark.parametrize("name", [*SIDES, "bench"])
+def test_services_fit_the_program(name):
+    found = {key: " ".join(values) for key, values in settings(unit(name)).items()}
     assert found["LimitRTPRIO"] == str(PRIORITY)
     assert found["RestartPreventExitStatus"] == f"2 {EXIT_OTHERWISE}"
     assert found["SuccessExitStatus"] == str(EXIT_INTERRUPTED)
@@ -121,6 +125,33 @@ def test_services_fit_the_program(side):
     forbidden = {"MemoryDenyWriteExecute", "PrivateIPC", "DynamicUser", "PrivateNetwork"}
     forbidden |= {"RestrictRealtime", "CPUSchedulingPolicy"}
     assert not forbidden & set(found)
+
+
+def words(service: dict[str, list[str]]) -> list[str]:
+    """Arguments of gfmhil in a unit's ExecStart."""
+    (start,) = service["ExecStart"]
+    assert start.startswith("/opt/gfmhil/bin/gfmhil ")
+    return start.split()[1:]
+
+
+def test_the_operators_services_look_where_the_bench_records():
+    bench = settings(unit("bench"))
+    (link,) = bench["ExecStartPre"]
+    folder, place = link.split()[-2:]
+    assert words(bench)[-1] == folder.removeprefix("%S/gfmhil/")
+    assert bench["WorkingDirectory"] == ["%S/gfmhil"]
+    for name in OBSERVERS:
+        service, relations = settings(unit(name)), settings(unit(name), "Unit")
+        assert words(service)[:2] == [name, place]
+        bound = relations.get("BindsTo", []) + relations.get("PartOf", [])
+        assert bound == relations["After"] == ["gfmhil-bench@%i.service"]
+        assert settings(unit(name), "Install")["WantedBy"] == bound
+        assert parser(name).parse_args(words(service)).call  # every option is there
+        same = ("User", "RuntimeDirectory", "RuntimeDirectoryPreserve", "StateDirectory")
+        assert [service[key] for key in same] == [bench[key] for key in same]
+        forbidden = {"MemoryDenyWriteExecute", "PrivateIPC", "DynamicUser", "PrivateNetwork"}
+        assert not forbidden & set(service)
+    assert parser("run").parse_args(words(bench)).call
 
 
 def test_can_comes_up_at_the_bit_rates_of_the_link():

@@ -1,4 +1,4 @@
-"""Both sides compile, run and get their real-time rights within what their units leave them.
+"""The services compile, run and get their real-time rights within what their units leave them.
 
 systemd is not asked to start them: the limits, the lack of capabilities and the filter of system
 calls are taken from the units and set before the command is executed. Where root itself may not
@@ -13,6 +13,7 @@ import json
 import os
 import resource
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 
 from gfm_hil.toml_out import toml_text
 
@@ -79,8 +81,9 @@ def confine(side: str) -> Callable[[], None]:
     assert given == ""
     limits = []
     for key, (number, same) in LIMITS.items():
-        (value,) = setting(side, key)
-        limits.append((number, resource.RLIM_INFINITY if value == "infinity" else int(value), same))
+        for value in setting(side, key):
+            limit = resource.RLIM_INFINITY if value == "infinity" else int(value)
+            limits.append((number, limit, same))
 
     def work() -> None:
         kept = set()
@@ -196,3 +199,59 @@ def test_sides_run_in_real_time_within_what_their_units_leave(state):
         (got,) = [event for event in events if event["event"] == "scheduling"]
         assert got["policy"] == "fifo 50"
         assert got["memory_locked"] is True
+
+
+def test_the_bench_and_a_stream_beside_it_run_within_what_their_units_leave(state):
+    content: dict[str, Any] = {
+        "title": "rig",
+        "duration": 600.0,
+        "mode": "realtime",
+        "late_policy": {"hold": 10_000_000},
+        "link": {"type": "shm", "peer_timeout_s": 60.0, "start_timeout_s": 500.0},
+    }
+    (state / "rig.toml").write_text(toml_text(content))
+    (state / "rig").symlink_to(state / "runs/rig-1")  # as ExecStartPre= does
+
+    def begin(service: str, *words: str) -> subprocess.Popen[str]:
+        # systemd watches the process that it started, but hears its children too
+        told = {"NOTIFY_SOCKET": f"{state}/notify", "WATCHDOG_USEC": "5000000", "WATCHDOG_PID": "1"}
+        return subprocess.Popen(
+            [sys.executable, "-m", "gfm_hil", *words], cwd=state, text=True,
+            env={**environment(service, state), **(told if service == "bench" else {})},
+            preexec_fn=confine(service), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as subscriber,
+    ):
+        manager.bind(f"{state}/notify")
+        manager.settimeout(500.0)
+
+        def wait_for(line: str) -> None:
+            while line not in manager.recv(4096).decode().split("\n"):
+                pass
+
+        bench = begin("bench", "run", "rig.toml", "--quiet", "--no-figures", "--out", "runs/rig-1")
+        stream = None
+        try:
+            wait_for("READY=1")
+            wait_for("WATCHDOG=1")
+            stream = begin("stream", "stream", str(state / "rig"), "--port", "0")
+            assert stream.stdout is not None
+            subscriber.subscribe(b"")
+            subscriber.connect(stream.stdout.readline().split()[1])
+            assert subscriber.poll(60_000)
+            assert "tick" in json.loads(subscriber.recv_multipart()[1])
+            bench.terminate()  # KillMode=mixed: the sides are for it to stop
+            _, error = bench.communicate(timeout=300)
+            assert (bench.returncode, error) == (130, "")
+            _, said = stream.communicate(timeout=60)
+            assert stream.returncode == 0
+            assert said.endswith(" ticks sent on\n")
+        finally:
+            for process in (bench, stream):
+                if process is not None:
+                    process.kill()
+                    process.wait()
