@@ -14,6 +14,7 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
+from gfm_hil.links.base import SIDES
 from gfm_hil.operator import Operator
 from gfm_hil.recording import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
 from gfm_hil.telemetry import BlockReader
@@ -75,6 +76,10 @@ def run_and_stream(start, folder: Path, mode: str, *options: str):
 
 def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[str, np.ndarray]:
     """End the run; returns what it recorded."""
+    until = time.monotonic() + PATIENCE_S
+    while not all((folder / f"desk_{side}.json").exists() for side in SIDES):
+        assert time.monotonic() < until
+        time.sleep(0.05)
     operator = Operator(folder)
     operator.stop()
     operator.close()
@@ -227,10 +232,31 @@ def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, wo
     assert error.count("\n") == 1
 
 
+def test_a_run_streams_itself(start, tmp_path):
+    file = tmp_path / "short.toml"
+    file.write_text('title = "short"\nduration = 0.5\n[link]\ntype = "shm"\n', encoding="utf-8")
+    with zmq.Context() as context, context.socket(zmq.REP) as socket:
+        taken = socket.bind_to_random_port("tcp://127.0.0.1")
+        words = ["run", str(file), "--out", "run", "--quiet", "--no-figures", "--stream"]
+        refused = start(*words, str(taken))
+        _, error = refused.communicate(timeout=PATIENCE_S)
+    assert error == f"gfmhil: --port {taken}: tcp://127.0.0.1:{taken}: Address already in use\n"
+    assert (refused.returncode, (tmp_path / "run").exists()) == (2, False)
+    run = start(*words, "0")
+    ports = [run.stderr.readline().split()[1].rpartition(":")[2] for _ in range(2)]
+    juggler = PlotJuggler(ports[0])
+    until = time.monotonic() + PATIENCE_S
+    while not juggler.series:
+        assert time.monotonic() < until
+        juggler.receive(1.0)
+    run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0
+
+
 def test_a_port_that_is_taken_is_named(start, tmp_path):
     folder = tmp_path / "run"
     run, stream, (port, _) = run_and_stream(start, folder, "lockstep")
-    again = start("stream", str(folder), "--port", port)
+    again = start("stream", str(folder), "--wait", "--port", port)
     _, error = again.communicate(timeout=PATIENCE_S)
     assert again.returncode == 2
     assert f"--port {port}: tcp://127.0.0.1:{port}: Address already in use" in error

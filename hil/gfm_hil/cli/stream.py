@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from gfm_hil.errors import UserError
 from gfm_hil.links.zeromq.reach import beyond_loopback
-from gfm_hil.stopping import Interrupt
+from gfm_hil.stopping import Interrupt, end_with_parent
 
 PORT = 9872  # what PlotJuggler's ZeroMQ subscriber connects to unless told otherwise
 _LOOK_S = 0.1
@@ -35,11 +37,15 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--rate", type=float, default=1000.0, metavar="HZ", help="samples a second (%(default)g)"
     )
+    command.add_argument(
+        "--prometheus", type=int, metavar="PORT", help="serve metrics at /metrics, 0: any port"
+    )
     command.add_argument("--host", default="127.0.0.1", help="address to listen on (%(default)s)")
     command.add_argument(
         "--plain", action="store_true",
         help="listen beyond this machine: everybody there can read, nobody can command",
     )  # fmt: skip
+    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
     command.set_defaults(call=call)
 
 
@@ -47,25 +53,34 @@ def call(options: argparse.Namespace) -> int:
     """Carry it out; returns the exit code."""
     _check(options)
     from gfm_hil.telemetry.follow import Follower, begun
-    from gfm_hil.telemetry.publish import Ports, publish
+    from gfm_hil.telemetry.publish import Ports, Publisher
 
+    if options.part is not None:
+        end_with_parent(options.part)
+    follower = None if options.wait and not begun(options.folder) else Follower(options.folder)
     following = options.port + 1 if options.port else 0
-    ports = Ports(
-        options.host, options.port, following if options.blocks is None else options.blocks
-    )
+    blocks = following if options.blocks is None else options.blocks
+    with Interrupt() as interrupt, contextlib.ExitStack() as stack:
+        publisher = stack.enter_context(Publisher(Ports(options.host, options.port, blocks)))
+        print(f"samples: {publisher.samples} (JSON, {options.rate:g} Hz)")
+        print(f"blocks:  {publisher.blocks}")
+        collector = None
+        if options.prometheus is not None:
+            from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics
 
-    def ready(samples: str, blocks: str) -> None:
-        print(f"samples: {samples} (JSON, {options.rate:g} Hz)\nblocks:  {blocks}", flush=True)
-
-    with Interrupt() as interrupt:
-        while options.wait and not begun(options.folder) and not interrupt.came:
+            collector = RunCollector()
+            port = stack.enter_context(serve_metrics(collector, options.host, options.prometheus))
+            print(f"metrics: http://{options.host}:{port}/metrics")
+        sys.stdout.flush()
+        while follower is None:
+            if interrupt.came:
+                return 130
             time.sleep(_LOOK_S)
-        if interrupt.came:
-            return 130
+            follower = Follower(options.folder) if begun(options.folder) else None
+        if collector is not None:
+            collector.follower = follower
         os.nice(_NICENESS)
-        ticks = publish(
-            Follower(options.folder), ports, options.rate, ready, lambda: interrupt.came
-        )
+        ticks = publisher.follow(follower, options.rate, lambda: interrupt.came)
     print(f"{ticks} ticks sent on", file=sys.stderr)
     return 130 if interrupt.came else 0
 
@@ -76,7 +91,9 @@ def _check(options: argparse.Namespace) -> None:
     Raises:
         UserError: one cannot, or goes beyond this machine without being meant to.
     """
-    for name in ("port", "blocks"):
+    if options.prometheus is not None and find_spec("prometheus_client") is None:
+        raise UserError("--prometheus needs prometheus-client: pip install 'gfmhil[metrics]'")
+    for name in ("port", "blocks", "prometheus"):
         port = getattr(options, name)
         if port is not None and not 0 <= port <= 65535:
             raise UserError(f"--{name} {port}: must be 0 (any) to 65535")

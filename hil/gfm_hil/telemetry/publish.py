@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import zmq
 
 from gfm_hil.errors import UserError
+from gfm_hil.links.base import SIDES, Side
 from gfm_hil.telemetry import blocks
 from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.samples import Sampler
@@ -26,33 +27,47 @@ class Ports:
     blocks: int
 
 
-def publish(
-    follower: Follower,
-    ports: Ports,
-    rate: float,
-    ready: Callable[[str, str], None],
-    stopped: Callable[[], bool],
-) -> int:
-    """Send on what a run records, to its end; returns how many ticks of the plant or, without
-    it, of the controller were sent.
+class Publisher:
+    """Both sockets, bound; use as a context manager.
 
     Args:
-        follower: of the run.
         ports: to listen on.
-        rate: samples a second.
-        ready: told the endpoints of samples and blocks.
-        stopped: whether to end before the run does.
 
     Raises:
         UserError: a port is not to be had.
     """
-    context = zmq.Context()
-    try:
-        samples = _bind(context, ports.host, ports.samples, "--port")
-        raw = _bind(context, ports.host, ports.blocks, "--blocks")
-        ready(_endpoint(samples), _endpoint(raw))
+
+    def __init__(self, ports: Ports) -> None:
+        self._context = zmq.Context()
+        try:
+            self._samples = _bind(self._context, ports.host, ports.samples, "--port")
+            self._blocks = _bind(self._context, ports.host, ports.blocks, "--blocks")
+        except UserError:
+            self._context.destroy(linger=0)
+            raise
+        self.samples, self.blocks = (
+            socket.get_string(zmq.LAST_ENDPOINT) for socket in (self._samples, self._blocks)
+        )
+
+    def __enter__(self) -> Publisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.destroy(linger=_LINGER_MS)
+
+    def follow(self, follower: Follower, rate: float, stopped: Callable[[], bool]) -> int:
+        """Send on what a run records, to its end.
+
+        Args:
+            follower: of the run.
+            rate: samples a second.
+            stopped: whether to end before the run does.
+
+        Returns:
+            How many ticks of the plant or, without it, of the controller were sent.
+        """
         sampler = Sampler(follower.T_s, rate, follower.misses_before())
-        count = dict.fromkeys(("plant", "controller"), 0)
+        count: dict[Side, int] = dict.fromkeys(SIDES, 0)
         looked = time.monotonic()
         while not follower.over and not stopped():
             time.sleep(_LOOK_S)
@@ -60,13 +75,11 @@ def publish(
             for rows in follower.news():
                 count[rows.side] += len(rows.signals)
                 for message in sampler.messages(rows, now - looked):
-                    samples.send_multipart(message)
+                    self._samples.send_multipart(message)
                 for message in blocks.messages(rows):
-                    raw.send_multipart(message)
+                    self._blocks.send_multipart(message)
             looked = now
         return count["plant"] or count["controller"]
-    finally:
-        context.destroy(linger=_LINGER_MS)
 
 
 def _bind(
@@ -78,9 +91,5 @@ def _bind(
         socket.set(zmq.IPV6, int(":" in host))
         socket.bind(where)
     except zmq.ZMQError as problem:
-        raise UserError(f"{option} {port}: {where}: {problem}") from None
+        raise UserError(f"{option} {port}: {where}: {zmq.strerror(problem.errno or 0)}") from None
     return socket
-
-
-def _endpoint(socket: zmq.Socket[bytes]) -> str:
-    return socket.get_string(zmq.LAST_ENDPOINT)

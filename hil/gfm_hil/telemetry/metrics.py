@@ -1,0 +1,25 @@
+"""The metrics there are, for who serves them and who describes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class About:
+    """A metric's label, if it has one, and what it is in a few words."""
+
+    label: str
+    text: str
+
+
+METRICS = {
+    "gfmhil_ticks_total": About("side", "ticks recorded"),
+    "gfmhil_misses_total": About("", "ticks without a fresh u at the plant"),
+    "gfmhil_slack_seconds": About("quantile", "left when u arrived; in real time"),
+    "gfmhil_round_trip_seconds": About("quantile", "from y sent to u taken"),
+    "gfmhil_state": About("state", "1 for the state of the controller, 0 for others"),
+    "gfmhil_law_info": About("law", "the law in force"),
+    "gfmhil_reason_info": About("reason", "why the controller is in SAFE"),
+    "gfmhil_trip_info": About("trip", "what has tripped"),
+}

@@ -1,0 +1,133 @@
+"""A run as metrics that Prometheus collects, computed from the recording when it asks."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from gfm_hil.errors import UserError
+from gfm_hil.operator import Operator
+from gfm_hil.telemetry.follow import Follower, Rows, slack_us
+from gfm_hil.telemetry.metrics import METRICS
+from gfm_runtime.controller import STATES
+
+_WINDOW_S = 10.0  # of the run's time, over which quantiles are taken
+_SLACK = (0.0, 0.001, 0.01, 0.5)  # little slack is bad
+_ROUND_TRIP = (0.5, 0.99, 0.999, 1.0)  # long round trips are
+
+
+class RunCollector(Collector):
+    """The metrics of one run.
+
+    Attributes:
+        follower: of the run; None, and nothing to collect, before it begins.
+    """
+
+    def __init__(self, follower: Follower | None = None) -> None:
+        self.follower = follower
+        self._operator: Operator | None = None
+
+    def close(self) -> None:
+        """Let go of what was opened on the way."""
+        if self._operator is not None:
+            self._operator.close()
+
+    def collect(self) -> Iterator[Metric]:
+        """The metrics as they are now."""
+        if self.follower is not None:
+            yield from self._counts(self.follower)
+            yield from self._times(self.follower)
+            yield from self._words(self.follower)
+
+    def _counts(self, follower: Follower) -> Iterator[Metric]:
+        ticks, misses = _metric("gfmhil_ticks_total"), _metric("gfmhil_misses_total")
+        for side, part in follower.parts.items():
+            ticks.add_metric([side], float(part.progress[0]))
+            if side == "plant":
+                misses.add_metric([], float(part.progress[1]))
+        yield ticks
+        yield misses
+
+    def _times(self, follower: Follower) -> Iterator[Metric]:
+        """Quantiles of slack and round trip over the newest ticks; none in lockstep of slack."""
+        part = follower.parts.get("plant")
+        if part is None:
+            return
+        done = int(part.progress[0])
+        first = max(0, done - round(_WINDOW_S / follower.T_s))
+        rows = Rows("plant", first, part.signals[:0], np.array(part.times[first:done]))
+        there = rows.time("received") >= 0
+        trips = (rows.time("received") - rows.time("sent"))[there] * 1e-9
+        slack = slack_us(rows, follower.T_s) * 1e-6
+        yield _quantiles("gfmhil_slack_seconds", slack, _SLACK)
+        yield _quantiles("gfmhil_round_trip_seconds", trips, _ROUND_TRIP)
+
+    def _words(self, follower: Follower) -> Iterator[Metric]:
+        seen = self._seen(follower)
+        if "state" in seen:
+            state = _metric("gfmhil_state")
+            for name in STATES:
+                state.add_metric([name], float(name == seen["state"]))
+            yield state
+        for label, key in (("law", "active"), ("reason", "reason"), ("trip", "trip")):
+            if key in seen:
+                metric = _metric(f"gfmhil_{label}_info")
+                metric.add_metric([str(seen[key])], 1.0)
+                yield metric
+
+    def _seen(self, follower: Follower) -> dict[str, Any]:
+        """The newest tick in words; laws by their index where no desk tells their names."""
+        with contextlib.suppress(UserError):  # no desk: in process, or not yet
+            self._operator = self._operator or Operator(follower.folder)
+        seen = self._operator.snapshot() if self._operator is not None else {}
+        part = follower.parts.get("controller")
+        if part is not None and not seen and int(part.progress[0]):
+            law, state, _ = part.signals[int(part.progress[0]) - 1, -3:].tolist()
+            seen = {"state": STATES[int(state)], "active": str(int(law))}
+        return seen
+
+
+def _metric(name: str) -> CounterMetricFamily | GaugeMetricFamily:
+    about = METRICS[name]
+    kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
+    return kind(name, about.text, labels=[about.label] if about.label else [])
+
+
+def _quantiles(
+    name: str, values: NDArray[np.floating[Any]], quantiles: tuple[float, ...]
+) -> Metric:
+    metric = _metric(name)
+    known = values[~np.isnan(values)]
+    if len(known):
+        for q, value in zip(quantiles, np.quantile(known, quantiles).tolist(), strict=True):
+            metric.add_metric([f"{q:g}"], value)
+    return metric
+
+
+@contextlib.contextmanager
+def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int]:
+    """Serve metrics at ``/metrics`` while in this context; yields the port.
+
+    Raises:
+        UserError: the port is not to be had.
+    """
+    registry = CollectorRegistry()
+    registry.register(collector)
+    try:
+        server, thread = start_http_server(port, addr=host, registry=registry)
+    except OSError as problem:
+        raise UserError(f"--prometheus {port}: {host}: {problem.strerror}") from None
+    try:
+        yield int(server.server_port)
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+        collector.close()
