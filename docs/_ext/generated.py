@@ -10,7 +10,14 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from _ext import design_pages, law_pages, outputs, scenario_pages, testing_pages
+from _ext import (
+    design_pages,
+    law_pages,
+    outputs,
+    scenario_pages,
+    stream_pages,
+    testing_pages,
+)
 
 _LINE = re.compile(r"^<!-- generate: (\S+) ?(.*?) *-->$", re.MULTILINE)
 
@@ -27,6 +34,9 @@ MAKERS: dict[str, Callable[..., str]] = {
     "command": outputs.command,
     "frame-layout": testing_pages.frame_layout,
     "testing-calls": testing_pages.calls,
+    "export-formats": stream_pages.export_formats,
+    "columns": stream_pages.columns,
+    "metrics": stream_pages.metrics,
 }
 
 

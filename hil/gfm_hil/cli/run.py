@@ -16,9 +16,11 @@ from gfm_hil.cli.common import (
     progress_bar,
     resolve,
 )
+from gfm_hil.cli.stream import PORT
 from gfm_hil.runner import run_scenario
 from gfm_hil.scenario import find_scenario
 from gfm_hil.scope.beside import scope_beside
+from gfm_hil.telemetry.beside import stream_beside
 
 
 def add(commands: Any) -> None:
@@ -34,6 +36,10 @@ def add(commands: Any) -> None:
         "--scope", nargs="?", type=int, const=-1, metavar="PORT",
         help="serve a scope of it to the browser; it stays when the run is over, until Ctrl-C",
     )  # fmt: skip
+    command.add_argument(
+        "--stream", nargs="?", type=int, const=PORT, metavar="PORT",
+        help="stream it while it goes on, as gfmhil stream does",
+    )  # fmt: skip
     command.set_defaults(call=call)
 
 
@@ -46,6 +52,8 @@ def call(options: argparse.Namespace) -> int:
         if options.scope is not None:
             port = None if options.scope < 0 else options.scope
             scope = stack.enter_context(scope_beside(folder, port))
+        if options.stream is not None:
+            stack.enter_context(stream_beside(folder, options.stream))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
             run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
         if options.json:
