@@ -1,4 +1,4 @@
-"""Figures and tables of experiments.md, cli.md and testing.md: runs in process and writes
+"""Figures and tables of experiments, cli, testing and streams: runs in process and writes
 
     docs/_static/figures/*.png    the figures
     docs/tables/*.md              the numbers that the page quotes
@@ -15,6 +15,7 @@ from _ext.outputs import command
 from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
 from _figures.limit_cycle import limit_cycles
+from _figures.streams import from_mf4
 from _figures.testing import failed_assertion
 
 
@@ -47,6 +48,7 @@ def main() -> None:
     eigenvalues.q_droop_table()
     limit_cycles()
     failed_assertion()
+    from_mf4()
     terminal()
 
 
