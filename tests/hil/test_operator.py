@@ -149,8 +149,11 @@ def test_the_command(going):
 
     wait_for(lambda: json.loads(tell().stdout or "{}").get("tick", 0) > 0)
     assert tell("P_ref=0.7", "--ramp", "0.1").stdout.startswith("P_ref = 0.7 at tick ")
+    assert tell("--gain", "D_p=0.0101").stdout.startswith("D_p = 0.0101 at tick ")
     for words, problem in (
         (["P=1"], "gfmhil: 'P=1': must be NAME=VALUE"),
+        (["--gain", "k_21"], "gfmhil: 'k_21': must be NAME=VALUE, NAME a gain"),
+        (["--reset"], "gfmhil: reset: the controller is RUNNING, not SAFE"),
         (["--ramp", "1"], "gfmhil: --ramp 1: there is no reference"),
         (["--event", "{"], "gfmhil: --event: not JSON"),
     ):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,13 @@ def add(commands: Any) -> None:
     )
     command.add_argument("--ramp", type=float, metavar="S", help="spread them over a time, s")
     command.add_argument("--law", help="change to this law, one that the scenario names")
+    command.add_argument(
+        "--gain", action="append", default=[], metavar="NAME=VALUE",
+        help="another gain of the active law, bumpless; may be repeated",
+    )  # fmt: skip
+    command.add_argument(
+        "--reset", action="store_true", help="bring a run that waits after a trip back to its start"
+    )
     command.add_argument("--event", metavar="JSON", help="an event as in a scenario, without t")
     command.add_argument("--stop", action="store_true", help="end the run")
     command.set_defaults(call=call)
@@ -48,21 +56,15 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """What is asked for, in the order: references, law, event.
+    """What is asked for, in the order: reset, references, law, gains, event.
 
     Raises:
         UserError: not NAME=VALUE, or not JSON.
     """
     events: list[dict[str, Any]] = []
-    values: dict[str, float] = {}
-    for text in options.references:
-        name, _, value = text.partition("=")
-        try:
-            if name not in REF_NAMES:
-                raise ValueError
-            values[name] = float(value)
-        except ValueError:
-            raise UserError(f"{text!r}: must be NAME=VALUE, NAME one of {REF_NAMES}") from None
+    if options.reset:
+        events.append({"type": "reset"})
+    values = _values(options.references, f"one of {REF_NAMES}", REF_NAMES)
     if values:
         ramp = {} if options.ramp is None else {"ramp_s": options.ramp}
         events.append({"type": "reference", **values, **ramp})
@@ -70,6 +72,8 @@ def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
         raise UserError(f"--ramp {options.ramp:g}: there is no reference to spread")
     if options.law is not None:
         events.append({"type": "law", "law": options.law})
+    if options.gain:
+        events.append({"type": "gains", "values": _values(options.gain, "a gain of the law")})
     if options.event is not None:
         try:
             event = json.loads(options.event)
@@ -79,3 +83,21 @@ def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
             raise UserError(f"--event {options.event}: must be an object")
         events.append(event)
     return events
+
+
+def _values(texts: list[str], what: str, known: Sequence[str] | None = None) -> dict[str, float]:
+    """Numbers by name from NAME=VALUE.
+
+    Raises:
+        UserError: it is not that, or the name is not known.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            if known is not None and name not in known:
+                raise ValueError
+            values[name] = float(value)
+        except ValueError:
+            raise UserError(f"{text!r}: must be NAME=VALUE, NAME {what}") from None
+    return values
