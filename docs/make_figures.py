@@ -1,4 +1,4 @@
-"""Figures and tables of experiments, cli, testing and streams: runs in process and writes
+"""Figures and tables of experiments, cli, deploy, testing, streams: runs in process and writes
 
     docs/_static/figures/*.png    the figures
     docs/tables/*.md              the numbers that the page quotes
@@ -15,6 +15,7 @@ from _ext.outputs import command
 from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
 from _figures.limit_cycle import limit_cycles
+from _figures.services import services
 from _figures.streams import from_mf4
 from _figures.testing import failed_assertion
 
@@ -49,6 +50,7 @@ def main() -> None:
     limit_cycles()
     failed_assertion()
     from_mf4()
+    services()
     terminal()
 
 

@@ -281,6 +281,22 @@ def test_change_of_law_and_its_bump(lab: Lab) -> None:
         bench.assert_bump_below(-1.0)
 
 
+def test_other_gains_and_a_way_back_from_a_trip(lab: Lab) -> None:
+    bench = lab(law="droop-1", after_trip="wait")
+    bench.run(0.1)
+    bench.gains(D_p=0.002)
+    bench.run(0.1)
+    assert np.ptp(bench.signals["p"]) < 1e-6  # bumpless, at rest
+    bench.phase_jump(150)
+    bench.run(0.05)
+    with pytest.raises(AssertionError, match="tripped: over-current"):
+        bench.assert_no_trip()
+    bench.reset()
+    bench.run(0.05)
+    bench.assert_settles("p", to=0.5, within=0.001, tolerance=1e-3)
+    assert bench.signals["trip"][[2010, -1]].tolist() == [1.0, 0.0]
+
+
 def test_results_over_can_are_those_in_process_but_for_its_sixteen_bits(lab: Lab) -> None:
     p = []
     for link in ("inproc", "can"):

@@ -109,6 +109,18 @@ class Steps:
             raise UserError(f"law = {law!r}: a controller of one's own has laws of its own")
         plan.step("law", law=beside(self._near, law))
 
+    def gains(self, **values: float) -> None:
+        """Other gains of the law in force, by the names in its file, bumpless: ``D_p=0.02``."""
+        if self.setting.controller_command:
+            raise UserError("gains: a controller of one's own has gains of its own")
+        self._planned.step("gains", values={name: float(v) for name, v in values.items()})
+
+    def reset(self) -> None:
+        """Back from a trip or the safe state to the start; begin with ``after_trip="wait"``."""
+        if self.setting.controller_command:
+            raise UserError("reset: a controller of one's own is not ours to reset")
+        self._planned.step("reset")
+
     def run(self, seconds: float | None = None) -> None:
         """Go on for a time [s]; without one, to the scenario's end."""
         self._planned.run(seconds)
