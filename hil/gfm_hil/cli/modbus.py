@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import time
 from pathlib import Path
 from typing import Any
 
 from gfm_hil.errors import UserError
+from gfm_hil.modbus.beside import check_pysunspec2
+from gfm_hil.stopping import end_with_parent
+
+PORT = 5020
+_LOOK_S = 0.1
 
 
 def add(commands: Any) -> None:
@@ -18,11 +23,12 @@ def add(commands: Any) -> None:
         description="Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end.",
     )
     command.add_argument("folder", nargs="?", type=Path, metavar="RUN", help="the run folder")
+    command.add_argument("--wait", action="store_true", help="wait for the run to begin")
     command.add_argument(
         "--host", default="127.0.0.1",
         help="address to listen on; any that others can reach needs --tls (%(default)s)",
     )  # fmt: skip
-    command.add_argument("--port", type=int, default=5020, help="0: a free one (%(default)s)")
+    command.add_argument("--port", type=int, default=PORT, help="0: a free one (%(default)s)")
     command.add_argument(
         "--tls", nargs=3, type=Path, metavar=("CERT", "KEY", "CLIENT-CA"),
         help="TLS with a certificate of ours, and one of every client, signed by CLIENT-CA",
@@ -42,14 +48,18 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--vendor-model", action="store_true", help="print the vendor model's file, and end"
     )
+    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
     command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry it out; returns the exit code."""
+    check_pysunspec2()
     from gfm_hil.modbus.image import vendor_model
-    from gfm_hil.modbus.serve import LOCAL, Address, serve
+    from gfm_hil.modbus.serve import LOCAL, Address, begun, serve
 
+    if options.part is not None:
+        end_with_parent(options.part)
     if options.vendor_model:
         print(vendor_model(), end="")
         return 0
@@ -65,8 +75,8 @@ def call(options: argparse.Namespace) -> int:
         raise UserError(f"--heartbeat {options.heartbeat}: must be >= 0 ms")
     tls = None if options.tls is None else tuple(options.tls)
     address = Address(options.host, options.port, tls, options.anyone_may_command)
-    serve(
-        options.folder, address, options.heartbeat,
-        notice=lambda text: print(text, file=sys.stderr, flush=True),
-    )  # fmt: skip
+    address.check()
+    while options.wait and not begun(options.folder):
+        time.sleep(_LOOK_S)
+    serve(options.folder, address, options.heartbeat, lambda text: print(text, flush=True))
     return 0

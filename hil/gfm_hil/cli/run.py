@@ -16,9 +16,13 @@ from gfm_hil.cli.common import (
     progress_bar,
     resolve,
 )
+from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.stream import PORT
+from gfm_hil.errors import UserError
+from gfm_hil.modbus.beside import modbus_beside
 from gfm_hil.runner import run_scenario
 from gfm_hil.scenario import find_scenario
+from gfm_hil.scenario_model import INPROC
 from gfm_hil.scope.beside import scope_beside
 from gfm_hil.telemetry.beside import stream_beside
 
@@ -40,6 +44,10 @@ def add(commands: Any) -> None:
         "--stream", nargs="?", type=int, const=PORT, metavar="PORT",
         help="stream it while it goes on, as gfmhil stream does",
     )  # fmt: skip
+    command.add_argument(
+        "--modbus", nargs="?", type=int, const=MODBUS_PORT, metavar="PORT",
+        help="serve it as a SunSpec device while it goes on, as gfmhil modbus does",
+    )  # fmt: skip
     command.set_defaults(call=call)
 
 
@@ -54,6 +62,10 @@ def call(options: argparse.Namespace) -> int:
             scope = stack.enter_context(scope_beside(folder, port))
         if options.stream is not None:
             stack.enter_context(stream_beside(folder, options.stream))
+        if options.modbus is not None:
+            if scenario.link.type == INPROC:
+                raise UserError("--modbus: a run in process takes no commands; choose --link")
+            stack.enter_context(modbus_beside(folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
             run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
         if options.json:

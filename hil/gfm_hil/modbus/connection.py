@@ -20,9 +20,11 @@ from pymodbus.transport import CommParams, CommType
 
 UNIT = 1
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows it, unit
-_LONGEST = 254  # of unit and PDU, by the specification
+_LONGEST = 1024  # of unit and PDU; 254 by the specification, and what is longer hears so
+_BUFFER = 64 * 1024
 _MOST_WAITING = 32
-_FUNCTIONS = (3, 6, 16)
+_WRITE_ONE, _WRITE_MANY = 6, 16
+_FUNCTIONS = (3, _WRITE_ONE, _WRITE_MANY)
 
 _Request = tuple[int, int, bytes]  # transaction, unit, PDU
 
@@ -33,8 +35,9 @@ class Connection(ServerRequestHandler):
     def callback_connected(self) -> None:
         """Begin to answer."""
         super().callback_connected()
+        self.max_buffer_size = _BUFFER  # pymodbus throws away what is beyond it
         self._waiting: asyncio.Queue[_Request | None] = asyncio.Queue()
-        self._worker = asyncio.create_task(self._work())
+        self.server.workers.add(asyncio.create_task(self._work()))
 
     def callback_disconnected(self, exc: Exception | None) -> None:
         """What was received is still carried out, what it said is not sent any more."""
@@ -57,12 +60,14 @@ class Connection(ServerRequestHandler):
         return used
 
     async def _work(self) -> None:
+        """Answer one request after the other until the connection is closed."""
         while (request := await self._waiting.get()) is not None:
             transaction, unit, frame = request
             answer = await self._answer(unit, frame)
             answer.transaction_id, answer.dev_id = transaction, unit
             if self.transport is not None:
                 self.server_send(answer, None)
+        self.server.workers.discard(asyncio.current_task())
 
     async def _answer(self, unit: int, frame: bytes) -> ModbusPDU:
         code = frame[0]
@@ -71,9 +76,12 @@ class Connection(ServerRequestHandler):
         if code not in _FUNCTIONS:
             return ExceptionResponse(code & 0x7F, ExcCodes.ILLEGAL_FUNCTION)
         request = self.framer.decoder.decode(frame)
-        if request is None or (code != 16 and len(frame) != 5):
+        if request is None or (code != _WRITE_MANY and len(frame) != 5):
             return ExceptionResponse(code, ExcCodes.ILLEGAL_VALUE)
-        return await request.datastore_update(self.server.context, UNIT)
+        answer = await request.datastore_update(self.server.context, UNIT)
+        if code == _WRITE_ONE and not answer.isError():  # an echo, whatever it reads afterwards
+            answer.address, *answer.registers = struct.unpack(">HH", frame[1:])
+        return answer
 
 
 class Server(ModbusTcpServer):
@@ -94,6 +102,14 @@ class Server(ModbusTcpServer):
                 reconnect_delay_max=0.0, timeout_connect=0.0, sslctx=tls,
             )  # fmt: skip
         super().__init__(device, address=address)
+        self.workers: set[asyncio.Task[None]] = set()
+
+    async def shutdown(self) -> None:
+        """Hang up on everybody."""
+        await super().shutdown()
+        for worker in self.workers:
+            worker.cancel()
+        await asyncio.gather(*self.workers, return_exceptions=True)
 
     @property
     def port(self) -> int:

@@ -14,13 +14,8 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
-from gfm_hil.errors import UserError
-
-try:
-    import sunspec2.device as sunspec
-    from sunspec2 import mb
-except ImportError:
-    raise UserError("the Modbus server needs pysunspec2: pip install 'gfmhil[modbus]'") from None
+import sunspec2.device as sunspec
+from sunspec2 import mb
 
 BASE = 40000
 VENDOR = 64901
@@ -120,6 +115,7 @@ class Image:
 
     def __init__(self, models: Mapping[int, Mapping[str, Any]]) -> None:
         self.points: dict[str, Point] = {}
+        self._set: dict[str, object] = {}
         self.registers: list[int] = [*struct.unpack(">2H", b"SunS")]
         for number, content in models.items():
             model = sunspec.Model(number, model_def=definition(number), data=dict(content))
@@ -143,6 +139,9 @@ class Image:
 
     def set(self, path: str, value: Value) -> None:
         """Put a value into a point's registers."""
+        if self._set.get(path, self) == value:  # most do not change from one look to the next
+            return
+        self._set[path] = value
         point = self.points[path]
         first = point.address - BASE
         self.registers[first : first + point.length] = point.encode(value)

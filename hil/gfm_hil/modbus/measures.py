@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 from gfm_hil.modbus.image import VENDOR, Value
@@ -67,7 +68,9 @@ class Measures:
             },
             714: {
                 "ID": 714, "NPrt": 1, "DCV_SF": _exponent(b.V_dcref * _top("v_dc"), 16),
-                "DCA_SF": _exponent(b.I_dcb * _top("i_u"), 16, signed=True), "Prt": [{}],
+                "DCA_SF": _exponent(b.I_dcb * _top("i_u"), 16, signed=True),
+                "DCW_SF": _exponent(b.S_n * _top("i_u") * _top("v_dc"), 16, signed=True),
+                "Prt": [{}],
             },
             715: {"ID": 715},
             VENDOR: {"ID": VENDOR, "NLaw": len(laws), "Laws": [{} for _ in laws]},
@@ -76,7 +79,7 @@ class Measures:
     def plate(self, laws: Sequence[str]) -> dict[str, Value]:
         """What never changes."""
         b = self._bases
-        names = {f"{VENDOR}.Laws{k}.Nm": name for k, name in enumerate(laws, 1)}
+        names = {f"{VENDOR}.Laws{k}.Nm": Path(name).name for k, name in enumerate(laws, 1)}
         island = self._scenario.plant.grid.load_R is not None
         found: dict[str, Value] = {
             "1.Mn": "gfmhil",
@@ -138,6 +141,8 @@ class Measures:
             "701.Hz": y["y_omega_u"] * b.omega_n / (2 * math.pi),
             "714.DCA": i_dc * b.I_dcb,
             "714.Prt1.DCA": i_dc * b.I_dcb,
+            "714.DCW": i_dc * y["y_v_dc"] * b.S_n,
+            "714.Prt1.DCW": i_dc * y["y_v_dc"] * b.S_n,
             "714.Prt1.DCV": y["y_v_dc"] * b.V_dcref,
             "714.Prt1.DCSta": 3.0 if view.safe else 1.0,
             "715.LocRemCtl": float(local),

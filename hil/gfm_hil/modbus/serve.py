@@ -162,18 +162,25 @@ async def _clock(
     folder: Path, device: Device, watcher: Watcher, began: float, over: asyncio.Event
 ) -> None:
     """Tick until the run is over; ticks that were slept through are made up for by the last."""
-    tick = 0
+    tick = look = second = 0
     while not over.is_set():
-        if tick % _LOOK == 0:
+        if tick >= look:
+            look = tick + _LOOK
             if not _going(folder):
                 return
             device.take((folder / LOCAL).exists())
-        if tick % _SECOND == 0:
+        if tick >= second:
+            second = tick + _SECOND
             device.slack = watcher.slack()
         await device.clock()
         tick = max(tick + 1, int((time.monotonic() - began) / TICK_S))
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), max(began + tick * TICK_S - time.monotonic(), 0))
+
+
+def begun(folder: Path) -> bool:
+    """Whether both sides of a run are there."""
+    return all((folder / f"desk_{side}.json").exists() for side in SIDES)
 
 
 def _going(folder: Path) -> bool:

@@ -1,0 +1,265 @@
+"""Misses of a run in real time without Modbus clients, and with many that poll all they can.
+
+One run over shared memory with its server beside it; turns without a client and with many follow
+each other in that one run, so that what else the machine does meets both. Before and after the run
+both processors only pace, with nothing else to do: those ticks the host loses by itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import select
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.benchmark.attribution import CAUSES, attribute
+from gfm_hil.benchmark.contenders import memory_folder
+from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
+from gfm_hil.benchmark.pair import pair
+from gfm_hil.environment import environment, may_sched_fifo
+from gfm_hil.links.base import SIDES
+from gfm_hil.recording import CONTROLLER_TIMES, PLANT_TIMES, Part
+
+T_S = 1e-4  # s
+_SETTLE_S = 0.5  # between two turns, not counted: clients come and go
+_READ = (40070, 125)  # first register and count: most of model 701
+_NONE, _MANY = "no client", "clients"
+SCENARIO = f"""
+title = "observers"
+T_s = {T_S}
+duration = {{duration}}
+mode = "realtime"
+law = "vsg-2-tuned"
+after_trip = "wait"
+[link]
+type = "shm"
+peer_timeout_s = 30.0
+[late_policy]
+hold = 1000000000
+"""
+
+
+Timing = dict[str, NDArray[np.int64]]
+
+
+@dataclass
+class Turn:
+    """One stretch of the run, ns of CLOCK_MONOTONIC, and the answers that clients got in it."""
+
+    kind: str
+    begin: int
+    end: int
+    answers: int = 0
+
+
+@dataclass
+class Found:
+    """All turns of one kind together."""
+
+    ticks: int = 0
+    missed: list[int] = field(default_factory=list)  # a turn
+    answers: int = 0
+    seconds: float = 0.0
+    trips: list[NDArray[np.int64]] = field(default_factory=list)
+    causes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(CAUSES), np.int64))
+
+
+def poll(pipe: Connection, port: int, clients: int) -> None:
+    """In a process of its own: at each message of the pipe begin or stop polling."""
+    host, request = ("127.0.0.1", port), struct.pack(">HHHBBHH", 0, 0, 6, 1, 3, *_READ)
+    whole = 9 + 2 * _READ[1]  # bytes of an answer
+    while pipe.recv() == "go":
+        connections = {
+            s.fileno(): s for s in (socket.create_connection(host) for _ in range(clients))
+        }
+        waits, due, answers = select.epoll(), dict.fromkeys(connections, whole), 0
+        for number, connection in connections.items():
+            waits.register(number, select.EPOLLIN)
+            connection.sendall(request)
+        while not pipe.poll():
+            for number, _ in waits.poll(0.1):
+                due[number] -= len(connections[number].recv(due[number]))
+                if not due[number]:
+                    due[number], answers = whole, answers + 1
+                    connections[number].sendall(request)
+        for connection in connections.values():
+            connection.close()
+        pipe.recv()
+        pipe.send(answers)
+
+
+def measure(clients: int, seconds: float, turns: int) -> dict[str, Any]:
+    """Everything; plain data."""
+    policy = "fifo" if may_sched_fifo() else "other"
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
+        late = [_pace(policy, seconds, turns)]
+        timing, stretches = _run(Path(place), clients, seconds, turns)
+        late.append(_pace(policy, seconds, turns))
+    found = {
+        kind: _count(timing, [s for s in stretches if s.kind == kind]) for kind in (_NONE, _MANY)
+    }
+    trip = float(np.median(np.concatenate(found[_NONE].trips)))
+    gone = [len(lost(each, T_S * 1e9 - trip)) for each in late]
+    ticks = sum(each.shape[1] for each in late)
+    rows = [{"what": "bare pacing", "ticks": ticks, "missed": sum(gone),
+             "missed_pct": 100 * sum(gone) / ticks, "by_turn": gone}]  # fmt: skip
+    for kind, one in found.items():
+        slack = T_S * 1e6 - np.percentile(np.concatenate(one.trips), (50, 99, 99.9)) * 1e-3
+        rows.append({
+            "what": kind, "ticks": one.ticks, "missed": sum(one.missed),
+            "missed_pct": 100 * sum(one.missed) / one.ticks, "by_turn": one.missed,
+            "slack_us": dict(zip(("p50", "p1", "p01"), slack.round(2).tolist(), strict=True)),
+            "causes": dict(zip(CAUSES, one.causes.tolist(), strict=True)),
+            "answers_per_s": one.answers / one.seconds,
+        })  # fmt: skip
+    more = np.subtract(found[_MANY].missed, found[_NONE].missed)
+    return {
+        "clients": clients, "seconds": seconds * turns, "policy": policy, "rows": rows,
+        "more_by_turn": more.tolist(), "more_per_million": 1e6 * more.sum() / found[_MANY].ticks,
+        "environment": environment(),
+    }  # fmt: skip
+
+
+def _pace(policy: Any, seconds: float, turns: int) -> NDArray[np.int64]:
+    """Lateness of a loop that only paces, half as long as the turns, (2, ticks), ns."""
+    with ExitStack() as stack:
+        two = stack.enter_context(pair(policy, memory_folder(stack)))
+        two.both(pace_here, 0, 1, HYBRID, 1)
+        return pace_both(two, round(T_S * 1e9), HYBRID, seconds * turns / 2)
+
+
+def _run(place: Path, clients: int, seconds: float, turns: int) -> tuple[Timing, list[Turn]]:
+    duration = 2 * turns * (seconds + 2 * _SETTLE_S) + 20.0
+    file, folder = place / "observers.toml", place / "run"
+    file.write_text(SCENARIO.format(duration=duration), encoding="utf-8")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder)]
+    command += ["--quiet", "--no-figures", "--modbus", str(port)]
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    pollers = multiprocessing.get_context("spawn").Process(
+        target=poll, args=(theirs, port, clients), daemon=True
+    )
+    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        assert run.stderr is not None
+        while "Modbus" not in (line := run.stderr.readline()):
+            if not line:
+                raise SystemExit("the run did not start")
+        pollers.start()
+        time.sleep(2.0)
+        stretches = []
+        for turn in range(turns):
+            for kind in (_NONE, _MANY)[:: -1 if turn % 2 else 1]:
+                stretches.append(_turn(kind, seconds, ours))
+        timing = _times(folder)
+    finally:
+        run.terminate()
+        run.communicate()
+        if pollers.is_alive():
+            pollers.kill()
+    return timing, stretches
+
+
+def _times(folder: Path) -> Timing:
+    """What both sides have recorded so far, as in timing.npz."""
+    parts = {side: Part.open(folder, side) for side in SIDES}
+    done = min(int(part.progress[0]) for part in parts.values() if part is not None)
+    return {
+        f"{side}_{name}": np.array(part.times[:done, k])
+        for side, part in parts.items()
+        if part is not None
+        for k, name in enumerate(PLANT_TIMES if side == "plant" else CONTROLLER_TIMES)
+    }
+
+
+def _turn(kind: str, seconds: float, pipe: Any) -> Turn:
+    if kind == _MANY:
+        pipe.send("go")
+    time.sleep(_SETTLE_S)
+    begin = time.monotonic_ns()
+    time.sleep(seconds)
+    turn = Turn(kind, begin, time.monotonic_ns())
+    if kind == _MANY:
+        pipe.send("stop")
+        turn.answers = pipe.recv()
+    time.sleep(_SETTLE_S)
+    return turn
+
+
+def _count(timing: Timing, stretches: list[Turn]) -> Found:
+    found = Found()
+    for turn in stretches:
+        scheduled = timing["plant_scheduled"]
+        here = (scheduled >= turn.begin) & (scheduled < turn.end)
+        part = {name: column[here] for name, column in timing.items()}
+        there = part["plant_received"] >= 0
+        found.ticks += len(there)
+        found.missed.append(int((~there).sum()))
+        found.trips.append((part["plant_received"] - part["plant_scheduled"])[there])
+        causes = attribute(part, round(T_S * 1e9))
+        found.causes += np.bincount(causes, minlength=len(CAUSES))
+        found.answers += turn.answers
+        found.seconds += (turn.end - turn.begin) * 1e-9
+    return found
+
+
+def _table(found: dict[str, Any]) -> str:
+    """Side by side, as lines of Markdown."""
+    kinds = found["rows"]
+    lines = [f"| | {' | '.join(row['what'] for row in kinds)} |", "|---" * (len(kinds) + 1) + "|"]
+
+    def line(name: str, cells: list[str]) -> None:
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+
+    line("ticks", [f"{row['ticks']}" for row in kinds])
+    line("missed", [f"{row['missed']}" for row in kinds])
+    line("missed, %", [f"{row['missed_pct']:.4f}" for row in kinds])
+    line("missed, turn by turn", [", ".join(map(str, row["by_turn"])) for row in kinds])
+    for name, words in (("p50", "50"), ("p1", "99"), ("p01", "99.9")):
+        cells = [f"{row['slack_us'][name]:g}" if "slack_us" in row else "–" for row in kinds]
+        line(f"slack that {words} % have, µs", cells)
+    for cause in CAUSES:
+        cells = [str(row["causes"][cause]) if "causes" in row else "–" for row in kinds]
+        line(f"missed for {cause}", cells)
+    cells = [f"{row['answers_per_s']:.0f}" if row.get("answers_per_s") else "–" for row in kinds]
+    line("answers a second", cells)
+    more = ", ".join(f"{each:+d}" for each in found["more_by_turn"])
+    return "\n".join([
+        *lines, "",
+        f"{found['clients']} clients for {found['seconds']:g} s, {found['policy']}: "
+        f"{found['more_per_million']:+.0f} misses in a million ticks; turn by turn {more}",
+    ])  # fmt: skip
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--clients", type=int, default=50, help="(default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of a turn (%(default)s)")
+    parser.add_argument("--turns", type=int, default=6, help="of each kind (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="print JSON and nothing else")
+    options = parser.parse_args()
+    if options.clients < 1 or options.turns < 1 or not 0.1 <= options.seconds <= 3600:
+        parser.error("--clients and --turns must be at least 1, --seconds in [0.1, 3600]")
+    found = measure(options.clients, options.seconds, options.turns)
+    print(json.dumps(found, indent=1) if options.json else _table(found))
+
+
+if __name__ == "__main__":
+    main()
