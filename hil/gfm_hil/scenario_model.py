@@ -63,8 +63,7 @@ class Link(_Model):
             options = kind.options.model_validate(self.options)
         except ValidationError as problem:
             raise ValueError("; ".join(f"options.{line}" for line in lines(problem))) from None
-        if self.endpoint is not None:
-            kind.check_both(self.endpoint, options)
+        kind.check_both(self.endpoint, options)
         return self
 
 

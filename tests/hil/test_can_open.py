@@ -30,12 +30,23 @@ def endpoint(tmp_path: Path) -> str:
         ("can://nocan", {}, "'can://nocan': cannot be opened: "),
         ("can://x", {"bitrate": 5}, "bitrate"),
         ("can://x", {"dbc": "nowhere.dbc"}, "dbc = 'nowhere.dbc': No such file"),
-        ("can://x", {"dbc": __file__}, "dbc = .*test_can.py': "),
+        ("can://x", {"dbc": __file__}, "dbc = .*test_can_open.py': "),
     ],
 )
 def test_what_is_not_to_be_had_is_said(endpoint, options, fault):
     with pytest.raises(UserError, match=fault):
         open_link("can", "plant", endpoint, options)
+
+
+@pytest.mark.parametrize("interface", ["pcan", "socketcan"])
+def test_an_interface_that_would_not_be_used_is_refused(interface, make, endpoint):
+    link = {"type": "can", "options": {"interface": interface}}
+    said = rf"options\.interface = '{interface}' with %s, which is the loopback bus: set endpoint = "
+    with pytest.raises(UserError, match=said % "no endpoint"):
+        make(link=link)
+    with pytest.raises(UserError, match=said % "endpoint = 'can.*'"):
+        make(link={**link, "endpoint": endpoint})
+    make(link={**link, "endpoint": "can://can0"})
 
 
 def test_a_dbc_of_the_other_kind_of_bus(tmp_path, endpoint):

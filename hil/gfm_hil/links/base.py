@@ -50,7 +50,7 @@ def _fits(options: Any, T_s: float) -> None:
     """Any options at any sampling time."""
 
 
-def _may(endpoint: str, options: Any) -> None:
+def _may(endpoint: str | None, options: Any) -> None:
     """Any endpoint with any options."""
 
 
@@ -67,7 +67,8 @@ class LinkKind:
             in there. Raises ``UserError`` where the endpoint is not to be had.
         options: model of ``link.options``.
         check: sees that options fit the sampling time in s; raises ValueError in one line.
-        check_both: sees that an endpoint may be used with options; raises ValueError likewise.
+        check_both: sees that an endpoint (None: a fresh one) may be used with options; raises
+            ValueError likewise.
         exact: float64 arrives as sent, so that results are those of a run in process.
     """
 
@@ -79,7 +80,7 @@ class LinkKind:
     open: Callable[[Side, str, Any], Link]
     options: type[LinkOptions] = LinkOptions
     check: Callable[[Any, float], None] = _fits
-    check_both: Callable[[str, Any], None] = _may
+    check_both: Callable[[str | None, Any], None] = _may
     exact: bool = True
 
     def check_endpoint(self, endpoint: str) -> None:

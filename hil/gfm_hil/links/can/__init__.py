@@ -33,6 +33,21 @@ def _check(options: CanOptions, T_s: float) -> None:
     check_budget(options, T_s)
 
 
+def _refuse_unused(endpoint: str | None, options: CanOptions) -> None:
+    """See that a backend that is asked for is the one that carries the frames.
+
+    Raises:
+        ValueError: it is not.
+    """
+    named = "interface" in options.model_fields_set
+    if named and (endpoint is None or endpoint.startswith(LOOPBACK)):
+        said = "no endpoint" if endpoint is None else f"endpoint = {endpoint!r}"
+        raise ValueError(
+            f"options.interface = {options.interface!r} with {said}, which is the loopback bus: "
+            "set endpoint = 'can://channel' with a channel of that interface"
+        )
+
+
 def _fresh(folder: Path) -> str:
     """A loopback bus of free ports, below those that the kernel gives to others."""
     begin = secrets.randbelow(2500)  # two runs that start at a time shall not meet
@@ -62,5 +77,6 @@ KIND = LinkKind(
     open=_open,
     options=CanOptions,
     check=_check,
+    check_both=_refuse_unused,
     exact=False,
 )

@@ -11,12 +11,20 @@ from gfm_hil.links.zeromq.options import ZmqOptions
 _IFF_LOOPBACK = 0x8  # of linux/if.h
 
 
-def refuse_open(endpoint: str, options: ZmqOptions) -> None:
-    """See that frames leave this machine encrypted, or because somebody said so.
+def refuse_open(endpoint: str | None, options: ZmqOptions) -> None:
+    """See that frames leave this machine encrypted, or because somebody said so, and that on it
+    file permissions say who may connect.
 
     Raises:
-        ValueError: neither.
+        ValueError: they do not.
     """
+    if endpoint is None:
+        return
+    if endpoint.startswith("ipc://@"):
+        raise ValueError(
+            f"endpoint = {endpoint!r}: an abstract socket is no file, so that any user of this "
+            "machine could connect; give a path, as ipc:///tmp/link"
+        )
     if options.curve is None and not options.plain and beyond_loopback(endpoint):
         raise ValueError(
             f"endpoint = {endpoint!r}: goes beyond this machine, unencrypted: set "
