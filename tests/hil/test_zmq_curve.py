@@ -134,6 +134,22 @@ def test_only_the_plant_whose_key_is_known_gets_in(controller, tcp, keys, others
         intruder.close()
 
 
+def test_nobody_gets_in_while_there_is_nobody_to_ask(controller, tcp, keys, others, tmp_path):
+    """libzmq by itself would let in whoever knows the controller's public key."""
+    controller._curve.close()
+    intruder = ZmqLink("plant", tcp, curve(mixed(tmp_path, others, keys)))
+    try:
+        assert not arrives(intruder, controller, seconds=1.0)
+    finally:
+        intruder.close()
+
+
+def test_an_abstract_socket_is_refused():
+    for side in SIDES:
+        with pytest.raises(UserError, match=r"'ipc://@rig': an abstract socket is no file"):
+            open_link("zmq", side, "ipc://@rig")
+
+
 def test_a_plant_talks_to_no_other_controller(tcp, keys, others, tmp_path):
     false = ZmqLink("controller", tcp, curve(others))
     plant = ZmqLink("plant", tcp, curve(mixed(tmp_path, keys, keys)))

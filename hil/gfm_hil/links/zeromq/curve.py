@@ -19,6 +19,7 @@ from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES, Side
 
 _KEY_BYTES = 32
+_DOMAIN = "gfmhil"
 
 
 def key_files(folder: Path) -> list[Path]:
@@ -71,9 +72,13 @@ class Curve:
         socket.curve_publickey, socket.curve_secretkey = public, secret
         if side == "controller":
             socket.curve_server = True
+            # libzmq lets in whoever knows our public key if there is nobody to ask, unless
+            # asking is enforced, which takes a domain
+            socket.zap_domain = _DOMAIN.encode()
+            socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)
             self._door = ThreadAuthenticator(socket.context)
-            self._door.start()  # without it libzmq would let in whoever knows our public key
-            self._door.configure_curve_callback(credentials_provider=self)
+            self._door.start()
+            self._door.configure_curve_callback(_DOMAIN, self)
         else:
             socket.curve_serverkey = self._peer
 
