@@ -70,7 +70,7 @@ class Processes:
                 place = stack.enter_context(scratch.temporary("gfmhil-run-"))
                 endpoint = link_kind(self.scenario.link.type).fresh(place)
             if self.scenario.mode == "realtime":
-                keep_in_memory(self.folder, self.scenario.ticks)
+                keep_in_memory(self.folder, self.scenario.ticks, self.notice)
             self.notice("starting controller and plant …")
             self._sides = {side: self._start(side, endpoint) for side in SIDES}
             try:

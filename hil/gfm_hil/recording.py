@@ -11,6 +11,7 @@ import contextlib
 import os
 import secrets
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,17 +123,20 @@ class Part:
         return Part(*arrays)
 
 
-def keep_in_memory(folder: Path, ticks: int) -> None:
+def keep_in_memory(
+    folder: Path, ticks: int, notice: Callable[[str], None] = lambda text: None
+) -> None:
     """Have the parts of a run lie in memory until they are merged, if there is room.
 
     A page of a file on a disk is write-protected while it is written back: a loop that touches it
     waits for the disk. ``folder``/parts becomes a link. To be called by every process of the run,
     which then holds the place until it removes the parts or ends. What a run whose processes were
-    all killed has left is first moved to its own folder: nothing recorded is lost.
+    all killed has left is first moved to its own folder, or stays, and ``notice`` is told where:
+    nothing recorded is lost.
     """
     if not _MEMORY.is_dir():
         return
-    _rescue()
+    _rescue(notice)
     columns = (PLANT_COLUMNS, CONTROLLER_COLUMNS, PLANT_TIMES, CONTROLLER_TIMES)
     needed = 8 * ticks * sum(map(len, columns))
     parts = folder / "parts"
@@ -150,18 +154,36 @@ def keep_in_memory(folder: Path, ticks: int) -> None:
     _holds[parts] = scratch.hold(parts.resolve())
 
 
-def _rescue() -> None:
-    """Move parts that nobody uses any more to where their run is, if that is still there."""
+def _rescue(notice: Callable[[str], None]) -> None:
+    """Move parts that nobody uses any more to where their run is, if that can be found."""
     for place, hold in scratch.left_behind(_PREFIX, _MEMORY):
         with contextlib.suppress(OSError):  # no room, no rights: they stay
-            home = (place / _HOME).readlink()
-            if home.is_symlink() and home.resolve() == place:
+            home, recorded = _home_of(place), any(place.glob("*.npy"))
+            if home is not None:
                 copy = home.with_name(f"parts-{secrets.token_hex(4)}")
                 shutil.copytree(place, copy, ignore=shutil.ignore_patterns(_HOME))
                 home.unlink()
                 copy.rename(home)
-            shutil.rmtree(place)
+            elif recorded:
+                gone = (place / _HOME).readlink().parent
+                notice(
+                    f"{place}: kept, the recording of a killed run whose folder {gone} is gone; "
+                    "move it where it belongs, or remove it"
+                )
+            if home is not None or not recorded:
+                shutil.rmtree(place)
         scratch.let_go(hold)
+
+
+def _home_of(place: Path) -> Path | None:
+    """The link to a folder in memory, in its run's folder: where it was made, or, if that has been
+    renamed, beside there."""
+    with contextlib.suppress(OSError):
+        made = (place / _HOME).readlink()
+        for link in (made, *sorted(made.parent.parent.glob(f"*/{made.name}"))):
+            if link.is_symlink() and link.resolve() == place:
+                return link
+    return None
 
 
 def remove_parts(folder: Path) -> None:

@@ -61,7 +61,7 @@ def _run(
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
     if scenario.mode == "realtime":
-        keep_in_memory(folder, scenario.ticks)
+        keep_in_memory(folder, scenario.ticks, notice)
     part = Part.create(folder, side, scenario.ticks)
     compile_side(side, bench, part)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))

@@ -64,13 +64,14 @@ def kill(process: subprocess.Popen[str]) -> None:
     process.wait()
 
 
-def another_run(tmp_path: Path) -> None:
-    """What any run in real time does at its start and its end."""
-    folder = tmp_path / "another"
+def another_run(tmp_path: Path) -> list[str]:
+    """What any run in real time does at its start and its end; returns what it said."""
+    folder, said = tmp_path / "another", []
     folder.mkdir()
-    recording.keep_in_memory(folder, 10)
+    recording.keep_in_memory(folder, 10, said.append)
     recording.remove_parts(folder)
     folder.rmdir()
+    return said
 
 
 def test_a_folder_is_left_behind_once_nobody_holds_it(tmp_path):
@@ -126,12 +127,33 @@ def test_it_stays_while_one_side_lives(record, memory, tmp_path):
     assert list(memory.iterdir()) == []
 
 
-def test_it_goes_where_the_run_folder_is_gone(record, memory, tmp_path):
+def test_it_is_found_in_a_folder_that_was_renamed(record, memory, tmp_path):
     folder = tmp_path / "run"
     kill(record(folder, "plant"))
-    (folder / "parts").unlink()
-    folder.rmdir()
-    another_run(tmp_path)
+    folder = folder.rename(tmp_path / "a better name")
+    assert another_run(tmp_path) == []
+    assert not (folder / "parts").is_symlink()
+    assert recording.Part.open(folder, "plant") is not None
+    assert list(memory.iterdir()) == []
+
+
+def test_it_stays_and_is_named_where_the_run_folder_is_gone(record, memory, tmp_path):
+    folder, elsewhere = tmp_path / "run", tmp_path / "archive" / "2026" / "run"
+    kill(record(folder, "plant"))
+    elsewhere.parent.mkdir(parents=True)
+    folder.rename(elsewhere)
+    (place,) = memory.iterdir()
+    for _ in range(2):
+        (said,) = another_run(tmp_path)
+        assert said.startswith(f"{place}: kept, ")
+        assert str(folder) in said
+    assert recording.Part.open(elsewhere, "plant") is not None
+
+
+def test_a_place_in_which_nothing_was_recorded_goes(memory, tmp_path):
+    _, handle = scratch.make("gfmhil-parts-", memory)
+    scratch.let_go(handle)
+    assert another_run(tmp_path) == []
     assert list(memory.iterdir()) == []
 
 
