@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 from collections.abc import Iterable
@@ -22,6 +23,9 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+
+
+_AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d+)?")  # of RFC 3986, no user
 
 
 class Access:
@@ -50,10 +54,10 @@ class Access:
         return ""
 
     def _ours(self, authority: str) -> bool:
-        try:
-            host = urlsplit(f"//{authority}").hostname or ""
-        except ValueError:
+        found = _AUTHORITY.fullmatch(authority.lower())
+        if found is None:
             return False
+        host = found[1].strip("[]")
         try:
             ipaddress.ip_address(host)
         except ValueError:

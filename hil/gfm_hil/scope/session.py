@@ -117,7 +117,7 @@ class Session:
                     case Tell():
                         await self._command(message)
             except ValidationError as problem:
-                await self.say("error", text="; ".join(lines(problem)))
+                await self.say("error", text="; ".join(lines(problem)).removeprefix(": "))
             except ValueError as problem:
                 await self.say("error", text=str(problem))
 

@@ -1,7 +1,7 @@
 // Two cursors: lines over all strips that can be dragged, and what lies at and between them.
 
 import { colour } from "./palette.js";
-import { make, span, symbol, value } from "./text.js";
+import { make, seconds, span, symbol, value } from "./text.js";
 
 export class Cursors {
   // strips(): those to be seen; about: of the channels; redraw(): draws the strips again
@@ -106,19 +106,17 @@ export class Cursors {
       if (k < 0 || k >= x.length / each) return NaN;
       return (frame.low[name][k] + frame.high[name][k]) / 2;
     };
-    const dt = b - a;
-    const head = make("tr", {}, make("th", {}, ""), make("th", {}, "A"), make("th", {}, "B"),
-      make("th", {}, "Δ"));
-    const time = make("tr", {}, make("th", {}, make("i", {}, "t")), ...[a, b].map((t) =>
-      make("td", {}, `${value(t, "p.u.")} s`)),
-      make("td", { "data-delta": "t" }, `${span(Math.abs(dt))} · ${(1 / Math.abs(dt)).toPrecision(3)} Hz`));
-    const rows = this.strips().flatMap((strip) => strip.spec.traces).map((name) => {
+    const names = this.strips().flatMap((strip) => strip.spec.traces);
+    const row = (title, time, cell) => make("tr", {}, make("th", {}, title), make("td", {}, time),
+      ...names.map((name) => make("td", {}, value(cell(name), this.about[name].unit))));
+    const head = make("tr", {}, make("th"), make("th", {}, symbol("t")), ...names.map((name) => {
       const { symbol: text, unit } = this.about[name];
-      const values = [at(name, a), at(name, b)];
-      return make("tr", { class: `c-${name}` }, make("th", {}, symbol(text)),
-        ...values.map((v) => make("td", {}, value(v, unit))),
-        make("td", { "data-delta": name }, `${value(values[1] - values[0], unit)} ${unit}`));
-    });
-    this.table.replaceChildren(make("tbody", {}, head, time, ...rows));
+      return make("th", { class: `c-${name}` }, symbol(text), " ", make("small", {}, unit));
+    }));
+    const delta = row("B − A", `${span(Math.abs(b - a))} · ${(1 / Math.abs(b - a)).toPrecision(3)} Hz`,
+      (name) => at(name, b) - at(name, a));
+    delta.className = "delta";
+    this.table.replaceChildren(make("tbody", {}, head, row("A", seconds(a, 1e-4), (n) => at(n, a)),
+      row("B", seconds(b, 1e-4), (n) => at(n, b)), delta));
   }
 }

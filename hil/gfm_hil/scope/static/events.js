@@ -22,8 +22,8 @@ export class Events {
   }
 
   // What was asked from this page and refused, at the time of the run.
-  refuse(t, what, why) {
-    this.said.push({ t, text: `${what}: ${why}`, kind: "refused" });
+  refuse(t, why) {
+    this.said.push({ t, text: `refused: ${why}`, kind: "refused" });
     this.write();
   }
 
@@ -97,8 +97,8 @@ export class OverviewMap {
     this.box = make("div", { class: "box" });
     this.filled = make("div", { class: "filled" });
     this.marks = make("div", { class: "marks" });
-    this.text = make("span", { class: "text" });
-    element.append(this.filled, this.marks, this.box, this.text);
+    this.text = document.getElementById("length");
+    element.append(this.filled, this.marks, this.box);
     element.addEventListener("pointerdown", (event) => {
       element.setPointerCapture(event.pointerId);
       const move = (e) => {

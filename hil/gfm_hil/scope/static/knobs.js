@@ -21,7 +21,7 @@ export class Knobs {
   allow(may) {
     this.may = may;
     for (const knob of this.all) knob.disabled = !may;
-    this.condition(this.running ?? true, this.active);
+    this.condition(this.wasSafe ?? false, this.active);
   }
 
   section(title, ...content) {
@@ -57,17 +57,17 @@ export class Knobs {
         onclick: by(1) }, "+"), make("small", {}, unit));
   }
 
-  // label, what it is now, and the field to set it
+  // label, what it is now if that is known by an id, and the field to set it
   row(label, name, now, options) {
-    return make("div", { class: "row" }, make("label", { for: `set-${name}` }, label),
-      make("output", now ? { id: now, title: "now" } : {}, now ? "–" : ""),
-      this.field(name, options));
+    const value = now ? [make("output", { id: now, title: "now" }, "–")] : [];
+    return make("div", { class: now ? "row" : "row short" },
+      make("label", { for: `set-${name}` }, label), ...value, this.field(name, options));
   }
 
-  // rows over a button; send(): what it asks for
+  // rows, with the button in the last one; send(): what it asks for
   form(button, id, rows, send) {
-    const form = make("form", { novalidate: true }, ...rows,
-      make("div", { class: "row end" }, make("button", { class: "strong", id }, button)));
+    rows.at(-1).append(make("button", { class: "strong go", id }, button));
+    const form = make("form", { novalidate: true }, ...rows);
     form.addEventListener("submit", (submit) => {
       submit.preventDefault();
       send();
@@ -97,12 +97,12 @@ export class Knobs {
       this.row("at", "rate", "", { step: 0.5, unit: "Hz/s", initial: 0, min: 0 }),
     ];
     const section = this.section("Grid",
-      this.form("Set frequency", "set-frequency", frequency, () => {
+      this.form("Set", "set-frequency", frequency, () => {
         const rate = +this.inputs.rate.value;
         const event = { type: "grid-frequency", f_hz: +this.inputs.f_hz.value };
         this.send(section, rate ? { ...event, rate } : event);
       }),
-      this.form("Jump the phase", "jump",
+      this.form("Jump", "jump",
         [this.row("phase", "degrees", "", { step: 5, unit: "°", initial: 10 })],
         () => this.send(section, { type: "grid-phase-jump", degrees: +this.inputs.degrees.value })));
     return section;
@@ -123,19 +123,20 @@ export class Knobs {
 
   state() {
     this.reset = make("button", { type: "button", class: "strong", id: "reset" }, "Reset from SAFE");
-    const section = this.section("Safe state", make("div", { class: "row end" }, this.reset));
-    section.classList.add("safe");
-    section.hidden = true;
+    this.reason = make("p", { class: "why" });
+    const section = this.section("State", this.reset, this.reason);
+    section.classList.add("state");
     this.reset.addEventListener("click", () => this.send(section, { type: "reset" }));
     this.safe = section;
     return section;
   }
 
   // What the run is doing: there is something to reset only in SAFE.
-  condition(running, active) {
-    this.running = running;
-    this.active = active;
-    this.safe.hidden = running;
+  condition(safe, active, words = this.words) {
+    Object.assign(this, { wasSafe: safe, active, words });
+    this.safe.classList.toggle("safe", safe);
+    this.reset.disabled = !this.may || !safe;
+    if (words !== this.reason.textContent) this.reason.textContent = words ?? "";
     for (const button of this.lawButtons) {
       const is = button.dataset.law === active;
       button.setAttribute("aria-pressed", String(is));

@@ -8,9 +8,11 @@ import { Link } from "./link.js";
 import { Look } from "./look.js";
 import { THEMES, colour, watch } from "./palette.js";
 import { STRIPS, Strip, channelsOf } from "./strips.js";
+import { make, span } from "./text.js";
 import { Tools } from "./tools.js";
 
 const get = (id) => document.getElementById(id);
+const WORDS = { RUNNING: "running, no fault", READY: "ready", INIT: "not started yet" };
 const WORDS_MS = 200; // numbers that change faster cannot be read
 
 const events = new Events(document.querySelector("#log ol"));
@@ -51,7 +53,7 @@ function begin(message) {
   about = { ...message, byName: Object.fromEntries(message.channels.map((c) => [c.name, c])) };
   document.title = `${about.title} · gfmhil scope`;
   get("title").textContent = about.title;
-  get("where").textContent = `${about.link}, ${about.mode}, T\u209B = ${+(about.T_s * 1e6).toPrecision(4)} µs`;
+  get("where").textContent = `${about.link}, ${about.mode}, T\u209B = ${span(about.T_s)}`;
   look.T_s = about.T_s;
   look.live = about.live;
   look.watched = WATCHED;
@@ -65,7 +67,7 @@ function begin(message) {
 
 async function tell(event) {
   const answer = await link.tell(event);
-  if (!answer.ok) events.refuse(look.done, event.type, answer.text);
+  if (!answer.ok) events.refuse(look.done, answer.text);
   return answer;
 }
 
@@ -91,7 +93,7 @@ function layout() {
 }
 
 function bins() {
-  const wide = strips[0]?.plot.over.clientWidth ?? 800;
+  const wide = (strips[0]?.area.clientWidth ?? 860) - 60;
   return Math.max(100, Math.min(2000, Math.round(wide)));
 }
 
@@ -157,8 +159,18 @@ function drawOver(u, strip) {
   if (!strip.window) return;
   const first = strip === strips[0];
   events.draw(u, strip, origin(), first);
+  if (look.frame.edge >= 0) drawEdge(u);
   if (look.trigger && strip.spec.traces.includes(look.trigger.channel)) drawLevel(u);
   cursors.draw(u, strip, first);
+}
+
+function drawEdge(u) {
+  const { ctx, bbox } = u;
+  const left = Math.round(u.valToPos(0, "x", true)) + 0.5;
+  ctx.save();
+  ctx.fillStyle = colour("trigger");
+  ctx.fillRect(left - devicePixelRatio / 2, bbox.top, devicePixelRatio, bbox.height);
+  ctx.restore();
 }
 
 function drawLevel(u) {
@@ -204,8 +216,8 @@ function words(frame) {
   if (frame.live) state(running || "running", running);
   else state(summary ? `over: ${summary.status}` : "over", summary?.status ?? "over");
   knobs.show(frame.now);
-  knobs.condition(running !== "SAFE", law?.gains ? "" : law?.name);
   why();
+  knobs.condition(running === "SAFE", law?.gains ? "" : law?.name, reason || WORDS[running] || "");
   map.show(events.events);
   tools.show();
 }
@@ -234,6 +246,7 @@ function permit() {
   get("permission").textContent = text;
   get("permission").hidden = !text;
   get("panel").classList.toggle("barred", Boolean(text));
+  get("panel").classList.toggle("ended", !look.live && summary?.status !== "completed");
   knobs.allow(!text);
 }
 
@@ -251,7 +264,8 @@ get("theme").onclick = () => applyTheme(THEMES[(THEMES.indexOf(theme) + 1) % THE
 function applyTheme(name) {
   theme = name;
   localStorage.setItem("gfmhil-scope-theme", name);
-  get("theme").textContent = { auto: "◐ auto", light: "○ light", dark: "● dark" }[name];
+  const icon = { auto: "◐", light: "○", dark: "●" }[name];
+  get("theme").replaceChildren(icon, make("span", {}, ` ${name}`));
   setTheme(name);
 }
 applyTheme(theme);

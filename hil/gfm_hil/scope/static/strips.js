@@ -98,7 +98,7 @@ export class Strip {
     const narrow = this.area.clientWidth < 600;
     this.plot = new uPlot({
       width: Math.max(60, this.area.clientWidth), height: Math.max(40, this.area.clientHeight),
-      padding: [7, 10, this.last ? 0 : 7, 0], legend: { show: false },
+      padding: [7, 24, this.last ? 0 : 7, 0], legend: { show: false },
       scales: { x: { time: false, auto: false }, y: { auto: false } },
       series,
       axes: [

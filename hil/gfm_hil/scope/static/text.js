@@ -4,7 +4,8 @@ const DIGITS = { "p.u.": 3, Hz: 3, "µs": 1, "°": 2, "": 0 };
 
 export function value(number, unit) {
   if (number === undefined || Number.isNaN(number)) return "–";
-  return number.toFixed(DIGITS[unit] ?? 3).replace("-", "−");
+  const text = number.toFixed(DIGITS[unit] ?? 3);
+  return +text === 0 ? text.replace("-", "") : text.replace("-", "−");
 }
 
 // A time with as many digits as `step` [s] needs.
@@ -15,6 +16,7 @@ export function seconds(t, step) {
 }
 
 export function span(s) {
+  if (s < 0.9995e-3) return `${+(s * 1e6).toPrecision(3)} µs`;
   return s < 0.9995 ? `${+(s * 1e3).toPrecision(3)} ms` : `${+s.toPrecision(4)} s`;
 }
 
@@ -33,6 +35,7 @@ export function make(tag, attributes = {}, ...children) {
 // A symbol such as V_dcref as V with a subscript.
 export function symbol(text) {
   const [base, ...below] = text.split("_");
+  if (base.length > 2) return make("span", { class: "symbol word" }, text);
   const part = make("span", { class: "symbol" }, make("i", {}, base));
   if (below.length) part.append(make("sub", {}, below.join(" ")));
   return part;

@@ -112,6 +112,7 @@ export class Tools {
     if (document.activeElement !== get("span") && get("span").value !== wanted) {
       get("span").value = wanted;
     }
+    get("again").hidden = look.trigger?.mode !== "single";
     get("trigger").classList.toggle("off", look.trigger === null);
     get("trigger-unit").textContent = this.about.byName[get("trigger-channel").value]?.unit ?? "";
     const doing = look.mode === "trigger" && look.frame ? DOING[look.frame.doing] : "";

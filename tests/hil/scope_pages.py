@@ -1,0 +1,193 @@
+"""For the scope's tests: a run on a rig with its scope, and a browser that looks at it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+PATIENCE_S = 60.0
+RIG = """
+title = "A rig that is told what to do"
+duration = 300.0
+T_s = 1e-3  # so that browser and both sides have two processors' time
+mode = "realtime"
+law = "droop-5"
+ready_laws = ["mimo-gfm-deployable", "vsg-2"]
+after_trip = "wait"
+seed = 1
+[late_policy]
+hold = 10000
+[link]
+type = "shm"
+peer_timeout_s = 30.0
+[plant]
+delay = { samples = 1 }
+factors = { R_f = 0.5, R_g = 0.5 }
+dc_source = { mode = "regulated" }
+[plant.sensors]
+bandwidth_hz = 300.0
+noise_std = { v_dc = 3e-5, p = 5e-4, q = 5e-4, V = 1e-4 }
+"""
+
+HAS_BROWSER = None not in (shutil.which("chromium"), shutil.which("chromedriver"))
+
+
+@dataclass
+class Rig:
+    """A run that goes on, and the addresses of its scope."""
+
+    folder: Path
+    look: str
+    control: str
+    process: subprocess.Popen[str]
+
+    @property
+    def token(self) -> str:
+        return self.control.partition("#token=")[2]
+
+
+def wait_for(what: Callable[[], Any], patience: float = PATIENCE_S) -> Any:
+    """Until it is true, and what it then is."""
+    until = time.monotonic() + patience
+    while not (found := what()):
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.05)
+    return found
+
+
+def addresses(lines: Iterator[str]) -> tuple[str, str]:
+    """To look and to control, from what a scope prints."""
+    found: list[str] = []
+    for line in lines:
+        found += re.findall(r"https?://\S+", line)
+        if len(found) == 2:
+            return found[0], found[1]
+    raise AssertionError("the scope has not said where it is")
+
+
+@contextmanager
+def rig(folder: Path) -> Iterator[Rig]:
+    """Start a run with a scope; ends both."""
+    file = folder / "rig.toml"
+    file.write_text(RIG, encoding="utf-8")
+    command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder / "run")]
+    process = subprocess.Popen(
+        [*command, "--scope", "0", "--quiet", "--no-figures"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stderr is not None
+        yield Rig(folder / "run", *addresses(iter(process.stderr)), process)
+    finally:
+        process.terminate()
+        process.wait()
+
+
+class Browser:
+    """Chromium, without a window.
+
+    Args:
+        width, height: of the page, CSS pixels.
+        dark: what the system is said to prefer.
+        phone: with touch and a fine screen.
+    """
+
+    def __init__(
+        self, width: int = 1440, height: int = 900, dark: bool = False, phone: bool = False
+    ) -> None:
+        from selenium import webdriver
+        from selenium.webdriver.chrome.options import Options
+        from selenium.webdriver.chrome.service import Service
+
+        options = Options()
+        options.binary_location = shutil.which("chromium") or ""
+        for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
+            options.add_argument(argument)
+        options.add_argument(f"--window-size={width},{height}")
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+        service = Service(shutil.which("chromedriver") or "")
+        self.driver = webdriver.Chrome(options=options, service=service)
+        self.driver.execute_cdp_cmd(
+            "Emulation.setDeviceMetricsOverride",
+            {
+                "width": width,
+                "height": height,
+                "deviceScaleFactor": 2 if phone else 1,
+                "mobile": phone,
+            },
+        )
+        self.driver.execute_cdp_cmd(
+            "Emulation.setEmulatedMedia",
+            {"features": [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]},
+        )
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.driver.quit()
+
+    def js(self, text: str) -> Any:
+        """What a script returns."""
+        return self.driver.execute_script(text)
+
+    def text(self, selector: str) -> str:
+        """The words of an element."""
+        return str(self.js(f"return document.querySelector({selector!r})?.textContent ?? ''"))
+
+    def click(self, selector: str) -> None:
+        """As a person would: where it can be seen, and not if something lies over it."""
+        from selenium.webdriver.common.by import By
+
+        self.driver.find_element(By.CSS_SELECTOR, selector).click()
+
+    def write(self, selector: str, text: str) -> None:
+        """Put text into a field."""
+        from selenium.webdriver.common.by import By
+
+        field = self.driver.find_element(By.CSS_SELECTOR, selector)
+        field.clear()
+        field.send_keys(text)
+
+    def choose(self, selector: str, value: str) -> None:
+        """Choose from a list."""
+        from selenium.webdriver.common.by import By
+        from selenium.webdriver.support.ui import Select
+
+        Select(self.driver.find_element(By.CSS_SELECTOR, selector)).select_by_value(value)
+
+    def drag(self, selector: str, start: tuple[int, int], by: tuple[int, int]) -> None:
+        """With the pointer, from a place against the element's middle."""
+        from selenium.webdriver.common.action_chains import ActionChains
+        from selenium.webdriver.common.by import By
+
+        element = self.driver.find_element(By.CSS_SELECTOR, selector)
+        moves = ActionChains(self.driver).move_to_element_with_offset(element, *start)
+        moves.click_and_hold().move_by_offset(by[0] // 2, by[1] // 2)
+        moves.move_by_offset(by[0] - by[0] // 2, by[1] - by[1] // 2).release().perform()
+
+    def complaints(self) -> list[str]:
+        """What the browser complained of."""
+        return [str(line["message"]) for line in self.driver.get_log("browser")]
+
+    def picture(self, strip: str) -> list[int]:
+        """The pixels of a strip's plot."""
+        return list(
+            self.js(
+                f"const from = document.querySelector('[data-strip={strip}] canvas');"
+                "const { width, height } = from;"
+                "const to = new OffscreenCanvas(width, height).getContext('2d',"
+                " { willReadFrequently: true });"
+                "to.drawImage(from, 0, 0);"
+                "return Array.from(to.getImageData(0, 0, width, height).data)"
+                ".filter((v, k) => k % 97 == 0)"
+            )
+        )

@@ -1,0 +1,291 @@
+"""The scope's server: what it serves, to whom, and what it makes of messages."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import ssl
+import subprocess
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from gfm_hil.cli import main
+from gfm_hil.scope.access import Access
+from gfm_hil.scope.record import open_record
+from gfm_hil.scope.server import Scope, static_files
+from gfm_hil.scope.view import HEAD
+
+from .scope_pages import addresses
+
+LOOK = {"kind": "look", "id": 1, "channels": ["p", "omega_u"], "bins": 50, "mode": "held"}
+
+
+@pytest.fixture
+def served(run) -> Iterator[tuple[int, Access, Any]]:
+    """A finished run, served; its port, the rules, and the run."""
+    done = run(events=[{"type": "reference", "t": 0.05, "P_ref": 0.6}])
+    access = Access()
+    scope = Scope(open_record(done.folder), access)
+    loop = asyncio.new_event_loop()
+    ports: list[int] = []
+    ready = threading.Event()
+
+    def note(port: int) -> None:
+        ports.append(port)
+        ready.set()
+
+    task = loop.create_task(scope.serve("127.0.0.1", [0], None, note))
+
+    def work() -> None:
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            loop.close()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    assert ready.wait(20)
+    yield ports[0], access, done
+    loop.call_soon_threadsafe(task.cancel)
+    thread.join()
+
+
+def fetch(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return answer.status, dict(answer.headers), answer.read()
+    except urllib.error.HTTPError as problem:
+        return problem.code, dict(problem.headers), problem.read()
+
+
+def words(socket: ClientConnection, kind: str) -> dict[str, Any]:
+    """The next message of that kind."""
+    while True:
+        message = socket.recv(10)
+        if isinstance(message, str) and json.loads(message)["kind"] == kind:
+            return dict(json.loads(message))
+
+
+def test_page_with_its_policy(served) -> None:
+    port, _, _ = served
+    for path, (kind, content) in static_files().items():
+        status, headers, body = fetch(port, path)
+        assert (status, headers["Content-Type"], body) == (200, kind, content)
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        assert "unsafe" not in headers["Content-Security-Policy"]
+        assert headers["X-Content-Type-Options"] == "nosniff"
+    assert b"<style" not in static_files()["/"][1]
+    for wrong in ("/../server.py", "/server.py", "/%2e%2e/server.py", "/vendor", "/x.js"):
+        assert fetch(port, wrong)[0] == 404
+
+
+def test_nothing_is_fetched_from_elsewhere() -> None:
+    for path, (_, content) in static_files().items():
+        if not path.startswith("/vendor/"):
+            assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
+            assert b"https://" not in content
+            assert b"innerHTML" not in content
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},  # a name of somebody's that points here
+        {"Host": "evil.example:80@127.0.0.1"},
+        {"Host": "["},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+    ],
+)
+def test_others_pages_are_refused(served, headers) -> None:
+    port, _, _ = served
+    status, _, body = fetch(port, "/", **headers)
+    assert status == 403
+    assert b"not" in body
+
+
+def test_sockets_of_others_pages_are_refused(served) -> None:
+    port, _, _ = served
+    address = f"ws://127.0.0.1:{port}/socket"
+    with pytest.raises(InvalidStatus) as refused:
+        connect(address, origin="http://127.0.0.1:1")  # type: ignore[arg-type]
+    assert refused.value.response.status_code == 403
+    with connect(address, origin=f"http://127.0.0.1:{port}") as socket:  # type: ignore[arg-type]
+        assert words(socket, "about")["title"] == "test"
+
+
+def test_it_says_what_there_is_and_shows_it(served) -> None:
+    port, _, done = served
+    with connect(f"ws://127.0.0.1:{port}/socket") as socket:
+        about = words(socket, "about")
+        assert (about["live"], about["commands"], about["f_b"]) == (False, False, 50.0)
+        assert about["labels"][0]["name"] == "mimo-gfm"
+        assert {c["name"] for c in about["channels"]} >= {"p", "q", "V", "omega_u", "v_dc", "slack"}
+        events = words(socket, "events")
+        assert [e["label"] for e in events["events"] if "label" in e] == ["P_ref = 0.6"]
+        assert events["summary"]["status"] == "completed"
+        socket.send(json.dumps({**LOOK, "start": 0.0, "span": 0.1}))
+        frame = socket.recv(10)
+        assert isinstance(frame, bytes)
+        head = dict(zip(HEAD, np.frombuffer(frame, "<f8", len(HEAD)), strict=True))
+        assert (head["head"], head["width"], head["bins"]) == (1000, 16, 63)
+        values = np.frombuffer(frame, "<f4", 4 * 63, 8 * len(HEAD)).reshape(4, 63)
+        p = done.signals["y_p"].astype(np.float32)
+        assert (values[0].min(), values[1].max()) == (p.min(), p.max())
+        assert values[2, 0] == pytest.approx(50 * done.signals["y_omega_u"][:16].min())
+
+
+def test_a_run_that_is_over_can_be_played(served) -> None:
+    port, _, _ = served
+    with connect(f"ws://127.0.0.1:{port}/socket") as socket:
+        socket.send(json.dumps({"kind": "play", "start": 0.02, "speed": 0.1}))
+        socket.send(json.dumps({**LOOK, "mode": "roll", "span": 0.01}))
+        heads: list[float] = []
+        while len(heads) < 4:
+            frame = socket.recv(10)
+            if isinstance(frame, bytes):
+                heads.append(np.frombuffer(frame, "<f8", len(HEAD))[HEAD.index("head")])
+        assert heads == sorted(heads)
+        assert 200 <= heads[0] < heads[-1] < 1000
+
+
+@pytest.mark.parametrize(
+    ("message", "words_of_it"),
+    [
+        ("no JSON", "JSON"),
+        ("[]", "an object"),
+        ('{"kind": "fire"}', "fire"),
+        ('{"kind": "look"}', "missing"),
+        (json.dumps({**LOOK, "span": 0.1, "bins": 10**9}), "bins"),
+        (json.dumps({**LOOK, "span": -1.0}), "span"),
+        (json.dumps({**LOOK, "span": 0.1, "channels": ["p"] * 100}), "channels"),
+        (json.dumps({**LOOK, "span": 0.1, "channels": ["__class__"]}), "none of that name"),
+        (json.dumps({**LOOK, "span": 0.1, "mode": "trigger"}), "trigger"),
+        ('{"kind": "look", "span": NaN}', "span"),
+    ],
+)
+def test_bad_messages_are_answered_and_change_nothing(served, message, words_of_it) -> None:
+    port, _, _ = served
+    with connect(f"ws://127.0.0.1:{port}/socket") as socket:
+        socket.send(message)
+        assert words_of_it in words(socket, "error")["text"]
+        socket.send(json.dumps({**LOOK, "span": 0.1}))
+        assert isinstance(socket.recv(10), bytes)
+
+
+def test_oversized_messages_end_the_connection(served) -> None:
+    port, _, _ = served
+    with connect(f"ws://127.0.0.1:{port}/socket") as socket:
+        socket.send("x" * 100_000)
+        with pytest.raises(ConnectionClosed):
+            while True:
+                socket.recv(10)
+
+
+def test_control_needs_the_token(served) -> None:
+    port, access, _ = served
+    with connect(f"ws://127.0.0.1:{port}/socket") as socket:
+        tell = json.dumps({"kind": "tell", "id": 1, "event": {"type": "reset"}})
+        for token in ("", "wrong", access.token[:-1], "é"):
+            socket.send(json.dumps({"kind": "hello", "token": token}))
+            assert words(socket, "control")["granted"] is False
+            socket.send(tell)
+            assert "may look, not touch" in words(socket, "answer")["text"]
+        socket.send(json.dumps({"kind": "hello", "token": access.token}))
+        assert words(socket, "control")["granted"] is True
+        socket.send(tell)
+        assert words(socket, "answer") == {
+            "kind": "answer", "id": 1, "ok": False, "text": "the run is over",
+        }  # fmt: skip
+
+
+def test_pages_beyond_the_limit_are_put_off(served) -> None:
+    port, _, _ = served
+    address = f"ws://127.0.0.1:{port}/socket"
+    sockets = [connect(address) for _ in range(16)]
+    for socket in sockets:
+        words(socket, "about")
+    with pytest.raises(InvalidStatus) as refused:
+        connect(address)
+    assert refused.value.response.status_code == 503
+    for socket in sockets:
+        socket.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["nowhere"], "nowhere: not a run folder"),
+        (["{run}", "--port", "70000"], "--port 70000: must be"),
+        (["{run}", "--host", "0.0.0.0"], "--host 0.0.0.0: goes beyond this machine, unencrypted"),
+        (["{run}", "--cert", "a.pem"], "--cert, --key: give both"),
+        (["{run}", "--cert", "a.pem", "--key", "b.pem"], "--cert a.pem"),
+        (["{run}", "--host", "203.0.113.1", "--plain"], "--host 203.0.113.1"),
+    ],
+)
+def test_wrong_options_are_one_line(run, capsys, tmp_path, monkeypatch, options, message) -> None:
+    monkeypatch.setattr(os, "nice", lambda by: by)  # of pytest, for good
+    monkeypatch.chdir(tmp_path)
+    folder = str(run(duration=0.01).folder) if "{run}" in options else ""
+    assert main(["scope", *(o.replace("{run}", folder) for o in options)]) == 2
+    said = capsys.readouterr()
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert not said.out
+
+
+def test_a_folder_of_something_else(tmp_path, capsys) -> None:
+    (tmp_path / "scenario.toml").write_text("= 1")
+    assert main(["scope", str(tmp_path)]) == 2
+    assert "not a run folder: scenario.toml" in capsys.readouterr().err
+
+
+def test_run_refuses_a_port_in_use_before_anything_starts(served, tmp_path, capsys) -> None:
+    port, _, _ = served
+    out = tmp_path / "out"
+    assert main(["run", "pref_step", "--scope", str(port), "--out", str(out)]) == 2
+    assert f"--scope {port}: Address already in use" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_encrypted(run, start, tmp_path) -> None:
+    folder = run(duration=0.01).folder
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
+         "-nodes", "-days", "2", "-subj", "/CN=localhost",
+         "-keyout", "key.pem", "-out", "cert.pem"],
+        cwd=tmp_path, check=True, capture_output=True,
+    )  # fmt: skip
+    command = ["scope", str(folder), "--port", "0", "--cert", "cert.pem", "--key", "key.pem"]
+    look, _ = addresses(iter(start(*command).stdout))
+    assert look.startswith("https://127.0.0.1:")
+    context = ssl.create_default_context(cafile=str(tmp_path / "cert.pem"))
+    context.check_hostname = False
+    address = look.replace("https", "wss") + "socket"
+    with connect(address, ssl=context, origin=look.rstrip("/")) as socket:  # type: ignore[arg-type]
+        assert words(socket, "about")["kind"] == "about"
+
+
+def test_scope_waits_for_a_run_that_is_to_come(start, tmp_path) -> None:
+    scope = start("scope", "run", "--wait", "--port", "0")
+    assert main(["run", "pref_step", "--link", "inproc", "--duration", "1.5", "--quiet",
+                 "--no-figures", "--out", str(tmp_path / "run")]) == 0  # fmt: skip
+    look, _ = addresses(iter(scope.stdout))
+    with connect(look.replace("http", "ws") + "socket") as socket:
+        assert words(socket, "about")["capacity"] == 15_000
+
+
+def test_static_files_lie_in_the_package() -> None:
+    licence = Path(static_files.__code__.co_filename).parent / "static/vendor/uPlot.LICENSE"
+    assert "MIT" in licence.read_text("utf-8")
