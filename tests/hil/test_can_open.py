@@ -41,7 +41,7 @@ def test_what_is_not_to_be_had_is_said(endpoint, options, fault):
 @pytest.mark.parametrize("interface", ["pcan", "socketcan"])
 def test_an_interface_that_would_not_be_used_is_refused(interface, make, endpoint):
     link = {"type": "can", "options": {"interface": interface}}
-    said = rf"options\.interface = '{interface}' with %s, which is the loopback bus: set endpoint = "
+    said = rf"options\.interface = '{interface}' with %s, which is the loopback bus: set "
     with pytest.raises(UserError, match=said % "no endpoint"):
         make(link=link)
     with pytest.raises(UserError, match=said % "endpoint = 'can.*'"):
