@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 PATIENCE_S = 60.0
+# 1 kHz, so that two processors do for both sides and the browser
 RIG = """
 title = "A rig that is told what to do"
 duration = 300.0
-T_s = 1e-3  # so that browser and both sides have two processors' time
+T_s = 1e-3
 mode = "realtime"
 law = "droop-5"
 ready_laws = ["mimo-gfm-deployable", "vsg-2"]
@@ -74,10 +75,10 @@ def addresses(lines: Iterator[str]) -> tuple[str, str]:
 
 
 @contextmanager
-def rig(folder: Path) -> Iterator[Rig]:
+def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
     """Start a run with a scope; ends both."""
     file = folder / "rig.toml"
-    file.write_text(RIG, encoding="utf-8")
+    file.write_text(scenario, encoding="utf-8")
     command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder / "run")]
     process = subprocess.Popen(
         [*command, "--scope", "0", "--quiet", "--no-figures"],

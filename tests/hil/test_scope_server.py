@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import ssl
@@ -90,6 +91,12 @@ def test_page_with_its_policy(served) -> None:
         assert fetch(port, wrong)[0] == 404
 
 
+def test_page_and_server_mean_the_same_by_a_picture() -> None:
+    script = static_files()["/frame.js"][1].decode()
+    listed = script.partition("const HEAD = [")[2].partition("]")[0]
+    assert [name.strip().strip('"') for name in listed.split(",")] == list(HEAD)
+
+
 def test_nothing_is_fetched_from_elsewhere() -> None:
     for path, (_, content) in static_files().items():
         if not path.startswith("/vendor/"):
@@ -118,8 +125,9 @@ def test_others_pages_are_refused(served, headers) -> None:
 def test_sockets_of_others_pages_are_refused(served) -> None:
     port, _, _ = served
     address = f"ws://127.0.0.1:{port}/socket"
-    with pytest.raises(InvalidStatus) as refused:
-        connect(address, origin="http://127.0.0.1:1")  # type: ignore[arg-type]
+    origin = "http://127.0.0.1:1"
+    with pytest.raises(InvalidStatus) as refused, connect(address, origin=origin):  # type: ignore[arg-type]
+        pass
     assert refused.value.response.status_code == 403
     with connect(address, origin=f"http://127.0.0.1:{port}") as socket:  # type: ignore[arg-type]
         assert words(socket, "about")["title"] == "test"
@@ -155,7 +163,7 @@ def test_a_run_that_is_over_can_be_played(served) -> None:
         while len(heads) < 4:
             frame = socket.recv(10)
             if isinstance(frame, bytes):
-                heads.append(np.frombuffer(frame, "<f8", len(HEAD))[HEAD.index("head")])
+                heads.append(np.frombuffer(frame, "<f8", len(HEAD))[list(HEAD).index("head")])
         assert heads == sorted(heads)
         assert 200 <= heads[0] < heads[-1] < 1000
 
@@ -213,14 +221,12 @@ def test_control_needs_the_token(served) -> None:
 def test_pages_beyond_the_limit_are_put_off(served) -> None:
     port, _, _ = served
     address = f"ws://127.0.0.1:{port}/socket"
-    sockets = [connect(address) for _ in range(16)]
-    for socket in sockets:
-        words(socket, "about")
-    with pytest.raises(InvalidStatus) as refused:
-        connect(address)
-    assert refused.value.response.status_code == 503
-    for socket in sockets:
-        socket.close()
+    with contextlib.ExitStack() as stack:
+        for _ in range(16):
+            words(stack.enter_context(connect(address)), "about")
+        with pytest.raises(InvalidStatus) as refused, connect(address):
+            pass
+        assert refused.value.response.status_code == 503
 
 
 @pytest.mark.parametrize(

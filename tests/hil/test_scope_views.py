@@ -214,3 +214,24 @@ def test_a_look_that_cannot_be_is_refused(wrong) -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     with pytest.raises(ValueError, match=r"there is none of that name|trigger: missing"):
         View(pyramid, look(**wrong), 0)
+
+
+@given(
+    st.floats(-3, 3),
+    st.floats(1e-6, 10),
+    st.integers(16, 4096),
+    st.sampled_from(["roll", "held", "trigger"]),
+    st.lists(st.integers(0, TICKS), min_size=1, max_size=4).map(sorted),
+)
+def test_no_look_is_too_odd(start, span, bins, mode, heads) -> None:
+    pyramid = pyramid_of(Growing(noise(TICKS)))
+    pyramid.update()
+    trigger = Trigger(channel="p", level=0.0)
+    view = View(pyramid, look(start=start, span=span, bins=bins, mode=mode, trigger=trigger), 0)
+    for done in heads:
+        frame = view.frame(done)
+        if frame is not None:
+            head, values, _ = taken_apart(frame)
+            assert np.isfinite(values).all()
+            if head["bins"]:
+                assert done - head["first"] - (head["bins"] - 1) * head["width"] >= 0

@@ -56,6 +56,7 @@ class Record:
         self.capacity = round(self.scenario["duration"] / self.T_s)
         self._parts: dict[str, Part] = {}
         self._done = 0
+        self._met = False  # the run's desks
 
     @property
     def f_b(self) -> float:
@@ -102,13 +103,21 @@ class Record:
         whole = self.folder / "events.jsonl"
         return read_log(whole) if whole.is_file() else read_log(*self.folder.glob("events_*.jsonl"))
 
-    def summary(self) -> dict[str, Any] | None:
-        """How the run ended, once it has."""
+    def ended(self) -> dict[str, str] | None:
+        """How the run ended, once it has: ``status`` and ``reason``."""
         try:
-            content: Any = json.loads((self.folder / "summary.json").read_text("utf-8"))
+            content = json.loads((self.folder / "summary.json").read_text("utf-8"))
         except (OSError, ValueError):
-            return None
-        return dict(content)
+            return self._gone()
+        return {key: content[key] for key in ("status", "reason")}
+
+    def _gone(self) -> dict[str, str] | None:
+        """A run of which only the recording is left: both desks were there and are no more."""
+        there = any(self.folder.glob("desk_*.json"))
+        self._met |= there
+        if self._met and not there:
+            return {"status": "over", "reason": ""}
+        return None
 
 
 def begun(folder: Path) -> bool:

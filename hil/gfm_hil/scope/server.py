@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http
+import logging
 import os
 import ssl
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from gfm_hil.errors import UserError
@@ -42,6 +44,9 @@ _TYPES = {
 }
 _SOCKET = "/socket"
 
+_LOG = logging.getLogger("gfmhil.scope")  # what comes to the port and is no browser is no error
+_LOG.addFilter(lambda record: "handshake" not in record.getMessage())
+
 
 def static_files() -> dict[str, tuple[str, bytes]]:
     """Everything that is served, by its path: content type and content."""
@@ -66,7 +71,8 @@ class Scope:
         channels = make_channels(record.T_s, record.f_b)
         self._pyramid = Pyramid(record, channels)
         self._sessions: set[Session] = set()
-        self._events: list[dict[str, Any]] = []
+        self._events = record.events()
+        self._ended = record.ended()
         self._static = static_files()
         self._operator: Operator | None = None
         self._commands = asyncio.Lock()
@@ -105,6 +111,7 @@ class Scope:
                 return await serve(
                     self._page, host, port, ssl=encryption, process_request=self._answer,
                     compression=None, max_size=_LARGEST, max_queue=8, server_header=None,
+                    logger=_LOG,
                 )  # fmt: skip
             except OSError as problem:
                 reason = os.strerror(problem.errno) if problem.errno else str(problem)
@@ -132,7 +139,8 @@ class Scope:
         try:
             await session.say("about", **self._about())
             await session.say("events", **self._happened())
-            await session.listen()
+            with contextlib.suppress(ConnectionClosed):
+                await session.listen()
         finally:
             self._sessions.discard(session)
 
@@ -150,29 +158,26 @@ class Scope:
 
     async def _follow_log(self) -> None:
         """Tell pages what has happened, and see when the run is over."""
+        said = self._happened()
         while True:
-            events = await asyncio.to_thread(self.record.events)
-            over = self.record.live and self.record.summary() is not None
-            if over:
+            self._events = await asyncio.to_thread(self.record.events)
+            self._ended = self.record.ended()
+            if self._ended and self.record.live:
                 self.record.finish()
-            laws = self.record.laws
             self.record.look_up_laws()
-            if over or len(events) != len(self._events) or laws != self.record.laws:
-                self._events = events
+            now = self._happened()
+            if now != said:
                 for session in list(self._sessions):
-                    await session.say("events", **self._happened())
+                    await session.say("events", **now)
+            said = now
             await asyncio.sleep(_LOG_S)
 
     def _happened(self) -> dict[str, Any]:
         return {
             "events": self._events[-_EVENTS:],
-            "summary": self._ended(),
+            "summary": self._ended,
             "labels": self.record.laws,
         }
-
-    def _ended(self) -> dict[str, Any] | None:
-        summary = self.record.summary()
-        return summary and {key: summary[key] for key in ("status", "reason", "expected")}
 
     def _about(self) -> dict[str, Any]:
         """What a page needs to know about the run; no names of files but the scenario's title."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import time
 from collections.abc import Awaitable, Callable
@@ -10,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
 
 from gfm_hil.errors import UserError, lines
 from gfm_hil.scope.access import Access
@@ -94,12 +96,8 @@ class Session:
         await self._send(json.dumps({"kind": kind, **content}))
 
     async def _send(self, message: str | bytes) -> None:
-        from websockets.exceptions import ConnectionClosed
-
-        try:
+        with contextlib.suppress(ConnectionClosed):
             await self._socket.send(message)
-        except ConnectionClosed:
-            return
 
     async def listen(self) -> None:
         """Deal with messages until the page has gone."""

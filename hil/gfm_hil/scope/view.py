@@ -15,24 +15,24 @@ from pydantic import BaseModel, ConfigDict, Field
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.trigger import HELD, IDLE, Acquisition, Trigger
 
-HEAD = (
-    "view",  # which the page asked for
-    "first",  # tick at which the first bin begins
-    "width",  # ticks in a bin
-    "bins",
-    "channels",
-    "start",  # of the window, ticks; may be before the first bin or be no whole number
-    "stop",
-    "head",  # ticks done
-    "edge",  # tick of the trigger's edge, or -1
-    "doing",  # of ``gfm_hil.scope.trigger``
-    "state",  # of the controller, an index into STATES, or -1
-    "law",  # index into the labels, or -1
-    "misses",  # so far
-    "trip",  # code of what the protection saw, 0: nothing
-    "same",  # 1: the bins are those of the frame before and left out
-    "live",
-)
+HEAD = {
+    "view": "the `id` of the `look` that it answers",
+    "first": "tick at which the first bin begins",
+    "width": "ticks in a bin",
+    "bins": "their number; 0 if `same`",
+    "channels": "their number",
+    "start": "tick at which the window begins; may lie before the first one, or between two",
+    "stop": "tick at which it ends",
+    "head": "ticks done",
+    "edge": "tick of the trigger's edge, or -1",
+    "doing": "of the trigger: 0 nothing, 1 armed, 2 its picture fills, 3 auto, 4 held",
+    "state": "of the controller: 0 INIT, 1 READY, 2 RUNNING, 3 SAFE, 4 STOPPED, or -1",
+    "law": "index into the `labels` of `about`, or -1",
+    "misses": "so far",
+    "trip": "code of what the protection saw; 0: nothing",
+    "same": "1: the bins are those of the picture before and left out",
+    "live": "1: the run may still go on",
+}
 _NOW_S = 0.02
 
 

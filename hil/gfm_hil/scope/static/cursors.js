@@ -4,21 +4,26 @@ import { colour } from "./palette.js";
 import { make, seconds, span, symbol, value } from "./text.js";
 
 export class Cursors {
-  // strips(): those to be seen; about: of the channels; redraw(): draws the strips again
-  constructor(table, strips, about, redraw) {
+  // strips(): those to be seen; about: of the channels; origin(): time of the run that the axis
+  // calls 0; redraw(): draws the strips again
+  constructor(table, strips, about, origin, redraw) {
     this.table = table;
     this.strips = strips;
     this.about = about;
+    this.origin = origin;
     this.redraw = redraw;
     this.on = false;
-    this.at = [0.35, 0.65]; // parts of the window; times [s] on its axis while it is held
+    this.at = [0.35, 0.65]; // parts of the window; times of the run, s, while it is held
     this.held = false;
   }
 
   toggle(on, window) {
     this.on = on;
-    this.at = this.held ? [0.35, 0.65].map((part) => window[0] + part * (window[1] - window[0]))
-      : [0.35, 0.65];
+    this.at = [0.35, 0.65];
+    if (this.held) {
+      this.held = false;
+      this.follow(true, window);
+    }
     this.table.hidden = !on;
     this.redraw();
   }
@@ -28,13 +33,14 @@ export class Cursors {
   follow(held, window) {
     if (held === this.held) return;
     const wide = window[1] - window[0];
-    this.at = this.at.map((at) => held ? window[0] + at * wide
-      : Math.min(1, Math.max(0, (at - window[0]) / wide)));
+    const from = window[0] + this.origin();
+    this.at = this.at.map((at) => held ? from + at * wide
+      : Math.min(1, Math.max(0, (at - from) / wide)));
     this.held = held;
   }
 
   times(window) {
-    return this.held ? this.at : this.at.map((part) => window[0] + part * (window[1] - window[0]));
+    return this.held ? this.at.map((t) => t - this.origin()) : this.at.map((part) => window[0] + part * (window[1] - window[0]));
   }
 
   // Makes the plot of a strip take hold of a cursor that is near the pointer.
@@ -62,7 +68,7 @@ export class Cursors {
         const x = e.clientX - over.getBoundingClientRect().left;
         const t = strip.plot.posToVal(Math.min(over.clientWidth, Math.max(0, x)), "x");
         const [from, to] = strip.window;
-        this.at[k] = this.held ? t : (t - from) / (to - from);
+        this.at[k] = this.held ? t + this.origin() : (t - from) / (to - from);
         this.redraw();
       };
       over.addEventListener("pointermove", move);

@@ -32,8 +32,9 @@ export class Look {
     return this.frame ? this.frame.head * this.T_s : 0;
   }
 
-  // The window of the newest frame, s.
+  // The window to be seen, s: the one that is wanted, or wherever the newest frame has got to.
   get window() {
+    if (this.mode === "held") return [this.start, this.start + this.span];
     if (!this.frame) return [0, this.span];
     return [this.frame.start * this.T_s, this.frame.stop * this.T_s];
   }

@@ -17,10 +17,13 @@ const WORDS_MS = 200; // numbers that change faster cannot be read
 
 const events = new Events(document.querySelector("#log ol"));
 let about = null, strips = [], knobs = null, tools = null, cursors = null, x = new Float64Array(0);
-let summary = null, reason = "", control = false, pictures = 0, told = 0;
+let summary = null, reason = "", control = false, pictures = 0, told = 0, later = 0;
 
 const link = new Link({ open: opened, lost, message: heard, frame: seen });
-const look = new Look((message) => link.say(message), () => tools?.show());
+const look = new Look((message) => link.say(message), () => {
+  tools?.show();
+  redraw();
+});
 const map = new OverviewMap(get("map"), look);
 
 function opened() {
@@ -42,6 +45,7 @@ function heard(message) {
     events.set(message.events);
     summary = message.summary;
     if (about) about.labels = message.labels;
+    permit();
     why();
     redraw();
   } else if (message.kind === "error") {
@@ -59,7 +63,7 @@ function begin(message) {
   look.watched = WATCHED;
   knobs = new Knobs(get("knobs"), about, tell);
   tools ??= new Tools(look, about, { signals: layout, cursors: toggleCursors });
-  cursors ??= new Cursors(get("readout"), () => strips, about.byName, redraw);
+  cursors ??= new Cursors(get("readout"), () => strips, about.byName, origin, redraw);
   if (!strips.length && !look.live) look.mode = "held", look.span = about.capacity * about.T_s;
   layout();
   permit();
@@ -97,7 +101,7 @@ function bins() {
   return Math.max(100, Math.min(2000, Math.round(wide)));
 }
 
-// Wheel, two fingers and double click on a plot.
+// Wheel and double click on a plot.
 function hold(over) {
   over.addEventListener("wheel", (event) => {
     event.preventDefault();
@@ -204,7 +208,11 @@ function toggleCursors() {
 // What people read, a few times a second.
 function words(frame) {
   const now = performance.now();
-  if (now - told < WORDS_MS && !frame.same) return;
+  clearTimeout(later);
+  if (now - told < WORDS_MS) {
+    later = setTimeout(() => words(look.frame), WORDS_MS);
+    return;
+  }
   told = now;
   const law = about.labels[frame.law];
   get("law").textContent = law ? [law.label, law.gains].filter(Boolean).join(", ") : "–";
@@ -214,7 +222,8 @@ function words(frame) {
   for (const strip of strips) strip.tell(frame);
   const running = about.states[frame.state] ?? "";
   if (frame.live) state(running || "running", running);
-  else state(summary ? `over: ${summary.status}` : "over", summary?.status ?? "over");
+  else state(summary && summary.status !== "over" ? `over: ${summary.status}` : "over",
+    summary?.status ?? "over");
   knobs.show(frame.now);
   why();
   knobs.condition(running === "SAFE", law?.gains ? "" : law?.name, reason || WORDS[running] || "");
@@ -246,7 +255,7 @@ function permit() {
   get("permission").textContent = text;
   get("permission").hidden = !text;
   get("panel").classList.toggle("barred", Boolean(text));
-  get("panel").classList.toggle("ended", !look.live && summary?.status !== "completed");
+  get("panel").classList.toggle("ended", !look.live && Boolean(summary?.reason));
   knobs.allow(!text);
 }
 

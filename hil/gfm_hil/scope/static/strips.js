@@ -145,9 +145,8 @@ export class Strip {
     }
     const least = this.about[this.spec.traces[0]].least;
     this.range = calm(this.range, low, high, least);
-    const empty = new Float32Array(0);
-    const data = [x, ...this.names.map((name) =>
-      points(frame.low[name] ?? empty, frame.high[name] ?? empty, frame.width))];
+    const data = [x, ...this.names.map((name) => name in frame.low
+      ? points(frame.low[name], frame.high[name], frame.width) : new Array(x.length).fill(null))];
     const [min, max] = this.held ?? this.range;
     this.plot.batch(() => {
       this.plot.setData(data, false);

@@ -86,6 +86,7 @@ export class Tools {
 
   key(event) {
     if (event.target.closest("input, select, summary") || event.ctrlKey || event.metaKey) return;
+    if (event.key === " " && event.target.closest("button")) return;
     const act = {
       " ": () => get("run").click(), c: () => get("cursors").click(), 0: () => this.look.whole(),
       "+": () => this.step(-1), "-": () => this.step(1), s: () => {
