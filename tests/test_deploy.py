@@ -183,6 +183,14 @@ def test_compose_file_keeps_to_the_specification_and_a_wrong_one_does_not():
         reader.from_yaml(text.replace("cap_drop", "cap_dorp")).validate()
 
 
+def test_the_bench_of_the_compose_file_is_one_that_there_is():
+    yaml = pytest.importorskip("yaml")
+    bench = yaml.safe_load(interpolated(COMPOSE.read_text()))["services"]["bench"]
+    options = parser("run").parse_args(bench["command"])
+    assert None not in (options.scope, options.stream, options.modbus)
+    assert f"{options.scenario}:ro" in " ".join(bench["volumes"])
+
+
 def test_containerfile_passes_its_linter():
     done = call(tool("hadolint"), CONTAINERFILE)
     assert (done.returncode, done.stdout) == (0, "")

@@ -51,10 +51,11 @@ def call(options: argparse.Namespace) -> int:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     began = time.monotonic()
     run_side(side, scenario, folder, notice)
     wall_s = time.monotonic() - began
-    (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     run = finish(scenario, folder, make_bench(scenario).controller.labels, wall_s)
     if not options.quiet:
         print_summary(run.summary, folder)

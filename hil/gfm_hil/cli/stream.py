@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
         "--blocks", type=int, metavar="PORT", help="of blocks; the next by default"
     )
     command.add_argument(
-        "--rate", type=float, default=1000.0, metavar="HZ", help="samples a second (%(default)g)"
+        "--rate", type=float, default=500.0, metavar="HZ", help="samples a second (%(default)g)"
     )
     command.add_argument(
         "--prometheus", type=int, metavar="PORT", help="serve metrics at /metrics, 0: any port"

@@ -16,8 +16,16 @@ import numpy as np
 
 from gfm_hil.telemetry.follow import COLUMNS, Rows, missed, slack_us
 
-#: prefixes that become objects
-_GROUPS = ("y", "u", "true", "ref")
+_GROUPS = ("y", "u", "true", "ref")  # prefixes that become objects
+
+
+def _place(column: str) -> tuple[str, str]:
+    """Object and name of a column in a sample; no object for one that stands by itself."""
+    group, _, rest = column.partition("_")
+    return (group, rest) if group in _GROUPS else ("", column)
+
+
+_PLACES = {side: [_place(name) for name in names] for side, names in COLUMNS.items()}
 
 
 class Sampler:
@@ -69,11 +77,7 @@ class Sampler:
         """One tick's numbers; JSON has none that are not finite."""
         tick = rows.first + k
         sample: dict[str, Any] = {"timestamp": round(tick * self.T_s, 9), "tick": tick}
-        for name, value in zip(COLUMNS[rows.side], values, strict=True):
+        for (group, name), value in zip(_PLACES[rows.side], values, strict=True):
             if math.isfinite(value):
-                group, _, rest = name.partition("_")
-                if group in _GROUPS:
-                    sample.setdefault(group, {})[rest] = value
-                else:
-                    sample[name] = value
+                (sample.setdefault(group, {}) if group else sample)[name] = value
         return sample
