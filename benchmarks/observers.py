@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import select
 import socket
+import statistics
 import struct
 import subprocess
 import sys
@@ -79,9 +81,10 @@ class Found:
 
 
 def poll(pipe: Connection, port: int, clients: int) -> None:
-    """In a process of its own: at each message of the pipe begin or stop polling."""
+    """In a process of its own: at each message of the pipe begin or stop polling, and say so."""
     host, request = ("127.0.0.1", port), struct.pack(">HHHBBHH", 0, 0, 6, 1, 3, *_READ)
     whole = 9 + 2 * _READ[1]  # bytes of an answer
+    pipe.send("ready")
     while pipe.recv() == "go":
         connections = {
             s.fileno(): s for s in (socket.create_connection(host) for _ in range(clients))
@@ -90,6 +93,7 @@ def poll(pipe: Connection, port: int, clients: int) -> None:
         for number, connection in connections.items():
             waits.register(number, select.EPOLLIN)
             connection.sendall(request)
+        pipe.send("going")
         while not pipe.poll():
             for number, _ in waits.poll(0.1):
                 due[number] -= len(connections[number].recv(due[number]))
@@ -113,8 +117,9 @@ def measure(clients: int, seconds: float, turns: int) -> dict[str, Any]:
         kind: _count(timing, [s for s in stretches if s.kind == kind]) for kind in (_NONE, _MANY)
     }
     trip = float(np.median(np.concatenate(found[_NONE].trips)))
-    gone = [len(lost(each, T_S * 1e9 - trip)) for each in late]
-    ticks = sum(each.shape[1] for each in late)
+    pieces = [piece for each in late for piece in np.array_split(each, (turns + 1) // 2, axis=1)]
+    gone = [len(lost(piece, T_S * 1e9 - trip)) for piece in pieces]
+    ticks = sum(piece.shape[1] for piece in pieces)
     rows = [{"what": "bare pacing", "ticks": ticks, "missed": sum(gone),
              "missed_pct": 100 * sum(gone) / ticks, "by_turn": gone}]  # fmt: skip
     for kind, one in found.items():
@@ -129,8 +134,7 @@ def measure(clients: int, seconds: float, turns: int) -> dict[str, Any]:
     more = np.subtract(found[_MANY].missed, found[_NONE].missed)
     return {
         "clients": clients, "seconds": seconds * turns, "policy": policy, "rows": rows,
-        "more_by_turn": more.tolist(), "more_per_million": 1e6 * more.sum() / found[_MANY].ticks,
-        "environment": environment(),
+        "more_by_turn": more.tolist(), "environment": environment(),
     }  # fmt: skip
 
 
@@ -162,7 +166,7 @@ def _run(place: Path, clients: int, seconds: float, turns: int) -> tuple[Timing,
             if not line:
                 raise SystemExit("the run did not start")
         pollers.start()
-        time.sleep(2.0)
+        ours.recv()
         stretches = []
         for turn in range(turns):
             for kind in (_NONE, _MANY)[:: -1 if turn % 2 else 1]:
@@ -191,6 +195,7 @@ def _times(folder: Path) -> Timing:
 def _turn(kind: str, seconds: float, pipe: Any) -> Turn:
     if kind == _MANY:
         pipe.send("go")
+        pipe.recv()
     time.sleep(_SETTLE_S)
     begin = time.monotonic_ns()
     time.sleep(seconds)
@@ -228,9 +233,10 @@ def _table(found: dict[str, Any]) -> str:
         lines.append(f"| {name} | {' | '.join(cells)} |")
 
     line("ticks", [f"{row['ticks']}" for row in kinds])
-    line("missed", [f"{row['missed']}" for row in kinds])
-    line("missed, %", [f"{row['missed_pct']:.4f}" for row in kinds])
-    line("missed, turn by turn", [", ".join(map(str, row["by_turn"])) for row in kinds])
+    line("ticks missed", [f"{row['missed']}" for row in kinds])
+    line("%", [f"{row['missed_pct']:.4f}" for row in kinds])
+    line("in the median turn", [f"{statistics.median(row['by_turn']):g}" for row in kinds])
+    line("turn by turn", [", ".join(map(str, row["by_turn"])) for row in kinds])
     for name, words in (("p50", "50"), ("p1", "99"), ("p01", "99.9")):
         cells = [f"{row['slack_us'][name]:g}" if "slack_us" in row else "–" for row in kinds]
         line(f"slack that {words} % have, µs", cells)
@@ -239,11 +245,14 @@ def _table(found: dict[str, Any]) -> str:
         line(f"missed for {cause}", cells)
     cells = [f"{row['answers_per_s']:.0f}" if row.get("answers_per_s") else "–" for row in kinds]
     line("answers a second", cells)
-    more = ", ".join(f"{each:+d}" for each in found["more_by_turn"])
+    by_turn = found["more_by_turn"]
+    more = ", ".join(f"{each:+d}" for each in by_turn)
+    error = np.std(by_turn, ddof=1) / len(by_turn) ** 0.5 if len(by_turn) > 1 else math.nan
     return "\n".join([
         *lines, "",
         f"{found['clients']} clients for {found['seconds']:g} s, {found['policy']}: "
-        f"{found['more_per_million']:+.0f} misses in a million ticks; turn by turn {more}",
+        f"{np.mean(by_turn):+.0f} ± {error:.0f} misses a turn (mean and its standard error); "
+        f"turn by turn {more}",
     ])  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from _ext import (
     design_pages,
     law_pages,
+    modbus_pages,
     outputs,
     scenario_pages,
     stream_pages,
@@ -32,6 +33,8 @@ MAKERS: dict[str, Callable[..., str]] = {
     "scenario-mistakes": outputs.scenario_mistakes,
     "event-keys": scenario_pages.event_tables,
     "command": outputs.command,
+    "modbus-droops": modbus_pages.droops,
+    "modbus-registers": modbus_pages.registers,
     "frame-layout": testing_pages.frame_layout,
     "testing-calls": testing_pages.calls,
     "export-formats": stream_pages.export_formats,

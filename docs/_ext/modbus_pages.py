@@ -1,0 +1,81 @@
+"""The register reference of the Modbus server, from the image that it serves."""
+
+from __future__ import annotations
+
+from gfm_hil.modbus.device import Device
+from gfm_hil.modbus.gains import Gains
+from gfm_hil.modbus.image import Point, definition
+from gfm_hil.modbus.view import Slack, View
+from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.scenario import load_scenario
+from gfm_runtime import law_names
+from gfm_runtime.controller import RUNNING
+
+_LAWS = ["mimo-gfm", "vsg-2"]
+_START = {"y_v_dc": 1.0, "y_V": 1.0, "y_omega_u": 1.0, "y_p": 0.5, "y_q": 0.1, "ref_V_ref": 1.0}
+
+
+def registers() -> str:
+    """Every implemented point of every model: address, registers, type, unit, access, meaning."""
+    device = _device()
+    points = list(device.image.points.values())
+    parts = []
+    for model in dict.fromkeys(p.path.partition(".")[0] for p in points):
+        group = definition(int(model))["group"]
+        mine = [p for p in points if p.path.partition(".")[0] == model]
+        rows = [_row(device, p) for p in mine if _is_there(device, p)]
+        absent = [f"`{p.name}`" for p in mine if not _is_there(device, p)]
+        parts += [f"## {model}: {group['label']}", "", *_HEAD, *rows, ""]
+        if absent:
+            parts += [f"Not implemented: {', '.join(absent)}.", ""]
+    return "\n".join(parts)
+
+
+def droops() -> str:
+    """Which laws have the droops that models 711 and 705 speak of."""
+    gains = Gains(law_names())
+    rows = ["| law | $D_p$ (711) | $D_q$ (705) |", "|---|---|---|"]
+    for law in law_names():
+        found = gains.droops(law, {})
+        cells = ["–" if v is None else f"{v:g}" for v in (found.D_p, found.D_q)]
+        rows.append(f"| `{law}` | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+_HEAD = (
+    "| address | registers | point | type | unit | access | |",
+    "|---|---|---|---|---|---|---|",
+)
+
+
+def _device() -> Device:
+    row = dict.fromkeys((*PLANT_COLUMNS, *CONTROLLER_COLUMNS), 0.0) | _START
+    view = View(row | {"state": float(RUNNING)}, 0, 0, RUNNING, _LAWS[0], {}, "in a word")
+    device = Device(
+        load_scenario("pref_step"), _LAWS, lambda: view, lambda event: None, 5000, lambda: 0.0
+    )
+    device.slack = Slack(1.0, 1.0, 1.0, 1.0)
+    device.refresh()
+    return device
+
+
+def _is_there(device: Device, point: Point) -> bool:
+    """Implemented; some that are have no value before something has happened."""
+    later = ("HbLate", "Refd", "MnAlrmInfo")
+    return point.name in later or point.type == "pad" or device.image.get(point.path) is not None
+
+
+def _row(device: Device, point: Point) -> str:
+    unit = str(point.definition.get("units", "")).replace("%", "% ")
+    if point.exponent:
+        unit = f"{unit} · 10^{point.exponent}^".strip()
+    access = "RW" if device.writable(point) else "R"
+    note = ", settable by the standard, not here" if access != point.standard_access else ""
+    symbols = point.definition.get("symbols", [])
+    named = ", ".join(f"{s['value']} {s['name']}" for s in symbols) if len(symbols) < 9 else ""
+    text = point.definition.get("desc", point.definition.get("label", "")).rstrip(".")
+    text = f"{text}{note}" + (f": {named}" if named else "")
+    return (
+        f"| {point.address} | {point.length} | `{point.name}` | {point.type} | {unit} | {access} "
+        f"| {text} |"
+    )
