@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 import itertools
 import math
 import struct
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -384,3 +386,29 @@ def test_the_droops_of_every_law_are_those_of_its_file_or_none(law):
         if getattr(found, name) is not None:
             gains.event(law, {}, {name: 0.03})
             assert getattr(gains.droops(law, {name: 0.03}), name) == 0.03
+
+
+def test_scale_factors_are_constant_and_everything_fits():
+    bench = Bench()
+    scale = {p.path for p in bench.device.image.points.values() if p.type == "sunssf"}
+    before = {path: bench.read(path) for path in scale}
+    for sign in (1.0, -1.0):  # the ends of the signal table's ranges
+        bench.row |= {"y_p": 6.0 * sign, "y_q": -6.0 * sign, "y_V": 3.0, "u_i_u": 6.0 * sign}
+        bench.row |= {"y_v_dc": 3.0, "y_omega_u": 1.3}
+        assert bench.read("701.W") == 6 * S_N * sign and bench.read("701.Var") == -6 * S_N * sign
+        assert bench.read("701.LLV") == 3 * 380 and bench.read("701.Hz") == pytest.approx(65)
+        assert bench.read("714.Prt1.DCV") == 3 * 700
+        assert bench.read("714.DCW") == pytest.approx(18 * S_N * sign, rel=1e-3)
+    assert {path: bench.read(path) for path in scale} == before
+
+
+def test_the_reference_page_says_what_may_be_written():
+    path = Path(__file__).resolve().parents[2] / "docs" / "_ext" / "modbus_pages.py"
+    spec = importlib.util.spec_from_file_location("modbus_pages", path)
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    rows = [line.split(" | ") for line in pages.registers().splitlines() if line.startswith("| 4")]
+    said = {int(r[0].strip("| ")): r[5] for r in rows}
+    device = Bench().device
+    ours = {p.address for p in device.image.points.values() if device.writable(p)}
+    assert {address for address, access in said.items() if access == "RW"} == ours
