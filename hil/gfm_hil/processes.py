@@ -72,6 +72,7 @@ class Processes:
             if self.scenario.mode == "realtime":
                 keep_in_memory(self.folder, self.scenario.ticks, self.notice)
             self.notice("starting controller and plant …")
+            self._told: set[Side] = set()  # by a signal of ours to end
             self._sides = {side: self._start(side, endpoint) for side in SIDES}
             try:
                 began = self._watch()
@@ -148,8 +149,9 @@ class Processes:
         return began
 
     def _send(self, number: signal.Signals) -> None:
-        for process in self._sides.values():
+        for side, process in self._sides.items():
             if process.poll() is None:
+                self._told.add(side)
                 process.send_signal(number)
 
     def _crash(self, side: Side) -> str:
@@ -167,7 +169,9 @@ class Processes:
         for side, text in said.items():
             if not text:
                 self._log(side).unlink()
-        crashes = [self._crash(side) for side in SIDES if self._crash(side)]
+        crashed = [side for side in SIDES if self._crash(side)]
+        first = [side for side in crashed if side not in self._told]  # not by our own signal
+        crashes = [self._crash(side) for side in first or crashed]
         if crashes and self.interrupt.came:
             return self._interrupted
         return Outcome("safe", "; ".join(crashes), 0) if crashes else None
