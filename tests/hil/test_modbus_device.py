@@ -13,8 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymodbus.constants import ExcCodes
+from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gfm_hil.errors import UserError
+from gfm_hil.modbus.connection import Server
 from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE, VENDOR, Image
 from gfm_hil.modbus.measures import Measures
@@ -412,3 +414,22 @@ def test_the_reference_page_says_what_may_be_written():
     device = Bench().device
     ours = {p.address for p in device.image.points.values() if device.writable(p)}
     assert {address for address, access in said.items() if access == "RW"} == ours
+
+
+def test_a_fault_of_ours_is_an_exception_for_the_client_and_not_silence(caplog):
+    async def broken(*request):
+        raise RuntimeError("of ours")
+
+    async def ask() -> bytes:
+        block = SimData(BASE, values=[0] * 4, datatype=DataType.REGISTERS)
+        server = Server(SimDevice(id=1, simdata=[block], action=broken), ("127.0.0.1", 0), None)
+        await server.serve_forever(background=True)
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(struct.pack(">HHHBBHH", 5, 0, 6, 1, 3, BASE, 2))
+        answer = await reader.readexactly(9)
+        writer.close()
+        await server.shutdown()
+        return answer
+
+    assert asyncio.run(ask()) == struct.pack(">HHHBBB", 5, 0, 3, 1, 0x83, 4)
+    assert "of ours" in caplog.text

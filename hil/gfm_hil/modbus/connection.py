@@ -7,6 +7,7 @@ which mixes up answers to a client that does not wait. Here they queue.
 from __future__ import annotations
 
 import asyncio
+import logging
 import ssl
 import struct
 from typing import Any
@@ -63,7 +64,11 @@ class Connection(ServerRequestHandler):
         """Answer one request after the other until the connection is closed."""
         while (request := await self._waiting.get()) is not None:
             transaction, unit, frame = request
-            answer = await self._answer(unit, frame)
+            try:
+                answer = await self._answer(unit, frame)
+            except Exception:  # whatever it is, the client shall not wait for ever
+                logging.getLogger(__name__).exception("request %s", frame.hex())
+                answer = ExceptionResponse(frame[0] & 0x7F, ExcCodes.DEVICE_FAILURE)
             answer.transaction_id, answer.dev_id = transaction, unit
             if self.transport is not None:
                 self.server_send(answer, None)

@@ -94,6 +94,8 @@ class Watcher:
         if code != self._code or now >= self._asked + _NAMES_S:  # takes the reading of files
             self._said = {**self._said, **self._operator.snapshot()}
             self._code, self._asked = code, now
+        if "active" not in self._said:  # the controller's desk is not there yet
+            return None
         progress = self._parts["plant"].progress
         return View(
             row=row,
