@@ -6,6 +6,7 @@ import json
 import subprocess
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -64,6 +65,20 @@ class PlotJuggler:
             self.series[path].append((t, float(value)))
 
 
+@pytest.fixture
+def listen() -> Iterator[Callable[[str], PlotJuggler]]:
+    """Makes subscribers; none is left to the garbage collector, which would wait for its socket."""
+    made = []
+
+    def call(port: str) -> PlotJuggler:
+        made.append(PlotJuggler(port))
+        return made[-1]
+
+    yield call
+    for juggler in made:
+        juggler.context.destroy(linger=0)
+
+
 def run_and_stream(start, folder: Path, mode: str, *options: str):
     """A run and its stream; returns both processes and the ports of samples and blocks."""
     file = folder.parent / "sent.toml"
@@ -81,6 +96,9 @@ def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[
         assert time.monotonic() < until
         time.sleep(0.05)
     operator = Operator(folder)
+    while operator.snapshot().get("tick", 0) < 10:
+        assert time.monotonic() < until
+        time.sleep(0.05)
     operator.stop()
     operator.close()
     run.communicate(timeout=PATIENCE_S)
@@ -91,10 +109,10 @@ def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[
         return {**signals, **times}
 
 
-def test_plotjuggler_reads_what_was_recorded(start, tmp_path):
+def test_plotjuggler_reads_what_was_recorded(start, listen, tmp_path):
     folder = tmp_path / "run"
     run, stream, (port, _) = run_and_stream(start, folder, "lockstep", "--rate", "500")
-    juggler = PlotJuggler(port)
+    juggler = listen(port)
     until = time.monotonic() + PATIENCE_S
     while any(len(juggler.series[f"gfmhil/{s}/tick"]) < 200 for s in ("plant", "controller")):
         assert time.monotonic() < until
@@ -138,10 +156,10 @@ def test_blocks_have_every_tick(start, tmp_path):
             np.testing.assert_array_equal(rows[name], whole[ticks], err_msg=name)
 
 
-def test_samples_of_a_run_in_real_time_tell_misses_and_slack(start, tmp_path):
+def test_samples_of_a_run_in_real_time_tell_misses_and_slack(start, listen, tmp_path):
     folder = tmp_path / "run"
     run, stream, (port, _) = run_and_stream(start, folder, "realtime")
-    juggler = PlotJuggler(port)
+    juggler = listen(port)
     until = time.monotonic() + PATIENCE_S
     while len(juggler.series["gfmhil/plant/slack_us"]) < 100:
         assert time.monotonic() < until
@@ -232,7 +250,7 @@ def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, wo
     assert error.count("\n") == 1
 
 
-def test_a_run_streams_itself(start, tmp_path):
+def test_a_run_streams_itself(start, listen, tmp_path):
     file = tmp_path / "short.toml"
     file.write_text('title = "short"\nduration = 0.5\n[link]\ntype = "shm"\n', encoding="utf-8")
     with zmq.Context() as context, context.socket(zmq.REP) as socket:
@@ -244,13 +262,31 @@ def test_a_run_streams_itself(start, tmp_path):
     assert (refused.returncode, (tmp_path / "run").exists()) == (2, False)
     run = start(*words, "0")
     ports = [run.stderr.readline().split()[1].rpartition(":")[2] for _ in range(2)]
-    juggler = PlotJuggler(ports[0])
+    juggler = listen(ports[0])
     until = time.monotonic() + PATIENCE_S
     while not juggler.series:
         assert time.monotonic() < until
         juggler.receive(1.0)
     run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0
+
+
+def test_a_side_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):
+    file = tmp_path / "sent.toml"
+    file.write_text(SCENARIO.format(mode="lockstep").replace("shm", "zmq"), encoding="utf-8")
+    words = [str(file), "--endpoint", endpoint, "--quiet", "--out"]
+    sides = [start(side, *words, side) for side in ("controller", "plant")]
+    stream = start("stream", "controller", "--wait", "--port", "0")
+    juggler = listen(stream.stdout.readline().split()[1].rpartition(":")[2])
+    until = time.monotonic() + PATIENCE_S
+    while not juggler.series:
+        assert time.monotonic() < until
+        juggler.receive(1.0)
+    assert {path.split("/")[1] for path in juggler.series} == {"controller"}
+    sides[0].terminate()
+    for process in (*sides, stream):
+        process.communicate(timeout=PATIENCE_S)
+    assert [process.returncode for process in (*sides, stream)] == [130, 130, 0]
 
 
 def test_a_port_that_is_taken_is_named(start, tmp_path):
