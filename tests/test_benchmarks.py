@@ -17,3 +17,17 @@ def test_versus_motulator() -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["gfmhil"]["median"] > found["motulator"]["median"] > 0
+
+
+@pytest.mark.slow
+def test_observers() -> None:
+    command = [sys.executable, "-m", "benchmarks.observers", "--clients", "3", "--turns", "1"]
+    done = subprocess.run(
+        [*command, "--seconds", "0.3", "--json"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    bare, none, many = json.loads(done.stdout)["rows"]
+    assert [row["what"] for row in (bare, none, many)] == ["bare pacing", "no client", "clients"]
+    assert min(row["ticks"] for row in (bare, none, many)) > 1000
+    assert none["answers_per_s"] == 0 < many["answers_per_s"]
