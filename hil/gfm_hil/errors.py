@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from typing import Any
 
 from pydantic import ValidationError
@@ -13,6 +14,12 @@ class UserError(Exception):
 
 class PeerLost(Exception):
     """The other side never came, stopped answering, or does not fit this side."""
+
+
+def need(module: str, package: str, what: str, extra: str) -> None:
+    """Raise UserError if the package that ``what`` needs is not installed."""
+    if importlib.util.find_spec(module) is None:
+        raise UserError(f"{what} needs {package}: pip install 'gfmhil[{extra}]'")
 
 
 def lines(problem: ValidationError) -> list[str]:

@@ -8,6 +8,7 @@ import json
 import sys
 from typing import Any
 
+from gfm_hil.beside import beside
 from gfm_hil.cli.common import (
     add_scenario_options,
     exit_code,
@@ -17,14 +18,13 @@ from gfm_hil.cli.common import (
     resolve,
 )
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
+from gfm_hil.cli.modbus import need_pysunspec2
+from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.errors import UserError
-from gfm_hil.modbus.beside import modbus_beside
 from gfm_hil.runner import run_scenario
 from gfm_hil.scenario import find_scenario
 from gfm_hil.scenario_model import INPROC
-from gfm_hil.scope.beside import scope_beside
-from gfm_hil.telemetry.beside import stream_beside
 
 
 def add(commands: Any) -> None:
@@ -58,14 +58,16 @@ def call(options: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         scope = None
         if options.scope is not None:
+            need_websockets()
             port = None if options.scope < 0 else options.scope
-            scope = stack.enter_context(scope_beside(folder, port))
+            scope = stack.enter_context(beside("scope", folder, port, ends_itself=False))
         if options.stream is not None:
-            stack.enter_context(stream_beside(folder, options.stream))
+            stack.enter_context(beside("stream", folder, options.stream))
         if options.modbus is not None:
             if scenario.link.type == INPROC:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
-            stack.enter_context(modbus_beside(folder, options.modbus))
+            need_pysunspec2()
+            stack.enter_context(beside("modbus", folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
             run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
         if options.json:

@@ -10,9 +10,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError
+from gfm_hil.errors import UserError, need
 from gfm_hil.links.zeromq.reach import beyond_loopback
-from gfm_hil.scope.beside import check_websockets
 from gfm_hil.stopping import end_with_parent
 
 PORT = 8470
@@ -48,7 +47,7 @@ def add(commands: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
     encryption, ports = check(options)
-    check_websockets()
+    need_websockets()
     from gfm_hil.scope.access import Access
     from gfm_hil.scope.record import begun, open_record
     from gfm_hil.scope.server import Scope, run_scope
@@ -70,6 +69,11 @@ def call(options: argparse.Namespace) -> int:
 
     run_scope(scope, options.host, ports, encryption, ready)
     return 0
+
+
+def need_websockets() -> None:
+    """Raise UserError if what the scope needs is not installed."""
+    need("websockets", "websockets", "the scope", "scope")
 
 
 def check(options: argparse.Namespace) -> tuple[ssl.SSLContext | None, list[int]]:
