@@ -18,7 +18,7 @@ _GRACE_S = 5.0
 
 @contextlib.contextmanager
 def beside(
-    command: str, folder: Path, port: int | None, ends_itself: bool = True
+    command: str, folder: Path, port: int | None, ready: int = 0, ends_itself: bool = True
 ) -> Iterator[subprocess.Popen[str]]:
     """Start ``gfmhil COMMAND`` for a run folder that is not there yet.
 
@@ -29,10 +29,12 @@ def beside(
         command: one that takes a folder, ``--wait``, ``--port`` and ``--part``.
         folder: where the run will be recorded.
         port: to serve at; the command's own choice if None.
+        ready: lines that it says once it serves, to be waited for; 0 if it does so only when
+            there is a run.
         ends_itself: it ends soon after the run; if not, it is ended in the end.
 
     Raises:
-        UserError: the port is not to be had.
+        UserError: the port is not to be had, or it ended, having said why on stderr.
     """
     if port:
         _check_free(command, port)
@@ -40,8 +42,11 @@ def beside(
     argv += ["--part", str(os.getpid()), *([] if port is None else ["--port", str(port)])]
     # own session: the first Ctrl-C is for the run
     process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    threading.Thread(target=_pass_on, args=(process,), daemon=True).start()
     try:
+        for _ in range(ready):
+            if not _pass_on_line(process):
+                raise UserError(f"--{command}: it ended before the run began")
+        threading.Thread(target=_pass_on, args=(process,), daemon=True).start()
         yield process
         if ends_itself:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -56,9 +61,15 @@ def beside(
 
 
 def _pass_on(process: subprocess.Popen[str]) -> None:
+    while _pass_on_line(process):
+        pass
+
+
+def _pass_on_line(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
-    for line in process.stdout:
-        print(line, end="", file=sys.stderr, flush=True)
+    line = process.stdout.readline()
+    print(line, end="", file=sys.stderr, flush=True)
+    return line
 
 
 def _check_free(command: str, port: int) -> None:

@@ -62,7 +62,7 @@ def call(options: argparse.Namespace) -> int:
             port = None if options.scope < 0 else options.scope
             scope = stack.enter_context(beside("scope", folder, port, ends_itself=False))
         if options.stream is not None:
-            stack.enter_context(beside("stream", folder, options.stream))
+            stack.enter_context(beside("stream", folder, options.stream, ready=2))
         if options.modbus is not None:
             if scenario.link.type == INPROC:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
