@@ -16,7 +16,7 @@ from benchmarks.scope_server import measure
 from tests.hil.scope_pages import RIG, Browser, Rig, rig, wait_for
 
 HERE = Path(__file__).resolve().parent
-AT_10_KHZ = RIG.replace("T_s = 1e-3", "T_s = 1e-4").replace("that is told what to do", "in the lab")
+IN_THE_LAB = RIG.replace("that is told what to do", "in the lab")
 
 
 def save(page: Browser, name: str) -> None:
@@ -94,7 +94,7 @@ def costs() -> None:
 
 
 def main() -> None:
-    with TemporaryDirectory() as place, rig(Path(place), AT_10_KHZ) as run:
+    with TemporaryDirectory() as place, rig(Path(place), IN_THE_LAB) as run:
         for picture in (dark, light, phone):
             picture(run)
     costs()

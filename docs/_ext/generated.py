@@ -36,6 +36,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "modbus-droops": modbus_pages.droops,
     "modbus-registers": modbus_pages.registers,
     "frame-layout": testing_pages.frame_layout,
+    "scope-head": testing_pages.scope_head,
     "testing-calls": testing_pages.calls,
     "export-formats": stream_pages.export_formats,
     "columns": stream_pages.columns,

@@ -7,6 +7,7 @@ import re
 
 from gfm_hil.codec import MAGIC
 from gfm_hil.frames import DATA_IDS, frame_dtype
+from gfm_hil.scope.view import HEAD
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.steps import Steps
 from gfm_runtime.signals import TABLE_VERSION
@@ -23,6 +24,12 @@ _MEANING = {
     "tick": "$k$; of $u$: that of the $y$ it answers",
     "crc": "CRC-32 of zlib and Ethernet over all bytes before it",
 }
+
+
+def scope_head() -> str:
+    """The numbers that a picture of the scope begins with, a row each."""
+    rows = [f"| {k} | {name} | {text} |" for k, (name, text) in enumerate(HEAD.items())]
+    return "\n".join(["| | | |", "|---|---|---|", *rows])
 
 
 def frame_layout() -> str:

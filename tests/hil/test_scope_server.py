@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import shutil
 import ssl
 import subprocess
 import threading
@@ -265,6 +266,7 @@ def test_run_refuses_a_port_in_use_before_anything_starts(served, tmp_path, caps
     assert not out.exists()
 
 
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")
 def test_encrypted(run, start, tmp_path) -> None:
     folder = run(duration=0.01).folder
     subprocess.run(
