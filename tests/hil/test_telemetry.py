@@ -250,25 +250,27 @@ def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, wo
     assert error.count("\n") == 1
 
 
+@pytest.mark.timeout(300)
 def test_a_run_streams_itself(start, listen, tmp_path):
-    file = tmp_path / "short.toml"
-    file.write_text('title = "short"\nduration = 0.5\n[link]\ntype = "shm"\n', encoding="utf-8")
+    file = tmp_path / "sent.toml"
+    file.write_text(SCENARIO.format(mode="lockstep"), encoding="utf-8")
     with zmq.Context() as context, context.socket(zmq.REP) as socket:
         taken = socket.bind_to_random_port("tcp://127.0.0.1")
         words = ["run", str(file), "--out", "run", "--quiet", "--no-figures", "--stream"]
         refused = start(*words, str(taken))
         _, error = refused.communicate(timeout=PATIENCE_S)
-    assert error == f"gfmhil: --port {taken}: tcp://127.0.0.1:{taken}: Address already in use\n"
+    assert error == f"gfmhil: --stream {taken}: Address already in use\n"
     assert (refused.returncode, (tmp_path / "run").exists()) == (2, False)
     run = start(*words, "0")
-    ports = [run.stderr.readline().split()[1].rpartition(":")[2] for _ in range(2)]
-    juggler = listen(ports[0])
+    juggler = listen(run.stderr.readline().split()[1].rpartition(":")[2])
     until = time.monotonic() + PATIENCE_S
     while not juggler.series:
         assert time.monotonic() < until
         juggler.receive(1.0)
-    run.communicate(timeout=PATIENCE_S)
-    assert run.returncode == 0
+    run.terminate()
+    _, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 130
+    assert said.endswith(" ticks sent on\n")
 
 
 def test_a_side_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):
