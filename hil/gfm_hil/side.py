@@ -28,6 +28,7 @@ from gfm_hil.scenario import Scenario
 from gfm_hil.sd_notify import Watched, notify
 from gfm_hil.stopping import Interrupt
 from gfm_hil.timeline import Outcome, Timeline
+from gfm_hil.toml_out import scenario_toml
 from gfm_plant import plant_go_on, plant_sample, plant_take
 from gfm_runtime.assembly import warm_up
 
@@ -60,6 +61,8 @@ def _run(
 ) -> Outcome:
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "scenario.toml").exists():  # a side alone; observers want to know what it runs
+        (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     if scenario.mode == "realtime":
         keep_in_memory(folder, scenario.ticks, notice)
     part = Part.create(folder, side, scenario.ticks)

@@ -27,7 +27,13 @@ def call(options: argparse.Namespace) -> int:
                 for n, s in found.items()]  # fmt: skip
         print(json.dumps(rows, indent=2))
         return 0
-    columns = (Column("scenario", no_wrap=True), "mode", "laws", "s", "title")
+    columns = (
+        Column("scenario", no_wrap=True),
+        "mode",
+        Column("laws", overflow="fold"),
+        "s",
+        "title",
+    )
     table = Table(*columns, box=None, pad_edge=False)
     for name, s in found.items():
         table.add_row(name, s.mode, ", ".join(s.laws()), f"{s.duration:g}", s.title)

@@ -16,7 +16,6 @@ from gfm_hil.run_folder import check_free, finish
 from gfm_hil.scenario_model import INPROC
 from gfm_hil.side import run_side
 from gfm_hil.stopping import end_with_parent
-from gfm_hil.toml_out import scenario_toml
 
 
 def add(commands: Any) -> None:
@@ -51,8 +50,6 @@ def call(options: argparse.Namespace) -> int:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     began = time.monotonic()
     run_side(side, scenario, folder, notice)
     wall_s = time.monotonic() - began
