@@ -61,6 +61,7 @@ def light(run: Rig) -> None:
     """A change of law that the rig does not bear."""
     with Browser() as page:
         opened(page, run)
+        page.choose("#span", "5")
         set_power(page, "0.7")
         time.sleep(0.3)
         page.click("[data-law=vsg-2]")

@@ -2,7 +2,7 @@
 
 import { points } from "./frame.js";
 import { colour } from "./palette.js";
-import { make, seconds, symbol, value } from "./text.js";
+import { make, seconds, symbol, tick, value } from "./text.js";
 
 // `references` are dashed, in the colour of the trace that they are for.
 export const STRIPS = [
@@ -105,8 +105,7 @@ export class Strip {
         { ...axis, size: this.last ? 24 : 0, space: narrow ? 64 : 90, gap: 4,
           values: (_, at, __, ___, step) => at.map((t) => (this.last ? seconds(t, step) : "")) },
         { ...axis, size: narrow ? 44 : 56, space: 24, gap: 6,
-          values: (_, at, __, ___, step) => at.map((v) => v
-            .toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-6))).replace("-", "−")) },
+          values: (_, at, __, ___, step) => at.map((v) => tick(v, step)) },
       ],
       cursor: { sync: { key: "scope" }, y: false, points: { show: false },
         drag: { setScale: false, x: true, y: true, uni: 30 } },

@@ -8,6 +8,14 @@ export function value(number, unit) {
   return +text === 0 ? text.replace("-", "") : text.replace("-", "−");
 }
 
+// A value on an axis whose marks are `step` apart.
+export function tick(v, step) {
+  const thousands = step >= 1e3;
+  const digits = Math.max(0, -Math.floor(Math.log10(thousands ? step / 1e3 : step) + 1e-6));
+  const text = (thousands ? v / 1e3 : v).toFixed(digits).replace("-", "−");
+  return thousands && v !== 0 ? `${text} k` : text;
+}
+
 // A time with as many digits as `step` [s] needs.
 export function seconds(t, step) {
   const milli = step < 2e-3;
