@@ -145,6 +145,7 @@ def processes_with(mark: str) -> int:
     return found
 
 
+@pytest.mark.timeout(400)
 @pytest.mark.parametrize(
     ("kind", "everyone"),  # with the parent: two processes, hogs; the product's two sides
     [("latency", 3 + len(os.sched_getaffinity(0))), ("loop", 5 + len(os.sched_getaffinity(0)))],
@@ -163,7 +164,7 @@ def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) 
             assert process.poll() is None, process.communicate()
             time.sleep(0.2)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-        said = process.communicate(timeout=60)
+        said = process.communicate(timeout=180)
     finally:
         process.kill()
     assert process.returncode == 130, said

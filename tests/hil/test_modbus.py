@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 import signal
 import socket
 import ssl
 import struct
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,42 +19,10 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP, SunSpecModbusClientException
 from sunspec2.modbus.modbus import ModbusClientException
 
-import gfm_hil.modbus
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
-SCENARIO = """
-title = "served"
-duration = 600.0
-mode = "realtime"
-law = "vsg-2-tuned"
-ready_laws = ["vsg-5-tuned", "droop-3-tuned"]
-after_trip = "wait"
-[link]
-type = "shm"
-peer_timeout_s = 30.0
-[late_policy]
-hold = 10000000
-"""
-PATIENCE_S = 100.0
-GFMHIL = [sys.executable, "-m", "gfm_hil"]
-MODELS = str(Path(gfm_hil.modbus.__file__).parent / "models")
-SUNS = 40000
-
-
-def wait_for(condition):
-    """What the condition gives, once it gives something."""
-    until = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    return found
-
-
-def end(process: subprocess.Popen) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.communicate()
+from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +39,6 @@ def run(tmp_path_factory) -> Iterator[Path]:
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(PATIENCE_S)
-
-
-def start(folder: Path, *options: str) -> tuple[subprocess.Popen, int]:
-    """A server and its port."""
-    command = [*GFMHIL, "modbus", str(folder), "--port", "0", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    said = process.stdout.readline()
-    return process, int(re.search(r":(\d+), unit 1", said).group(1))
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +169,7 @@ def test_the_client_s_heartbeat_and_ours(device, run):
         wait_for(lambda lost=lost: read(device, VENDOR, "HbLost") > lost)
         seen_ms = (time.monotonic() - before) * 1e3
         wait_for(lambda: last(run)["ref_P_ref"] == 0.5)
-        assert read(device, 704, "WSetEna") == 0
+        wait_for(lambda: read(device, 704, "WSetEna") == 0)  # once the run has answered
         late.append(read(device, VENDOR, "HbLate") - timeout_ms)
         assert seen_ms >= timeout_ms and late[-1] >= -1  # of the rounding to ms
     assert min(late) <= 10 + 1  # a tick of the clock; a machine that is busy only adds to it
@@ -261,11 +219,6 @@ def answer(connection: socket.socket) -> tuple[int, bytes]:
         return -1, b""
     transaction, _, length, _ = struct.unpack(">HHHB", header)
     return transaction, exactly(length - 1)
-
-
-def at(device, model: int, name: str) -> int:
-    target = device.models[model][0]
-    return target.model_addr + target.points[name].offset
 
 
 def test_bad_writes_get_exceptions_and_change_nothing(device, run, port):
@@ -406,68 +359,3 @@ def test_wrong_options(run, options, words):
     )
     assert done.returncode == 2 and words in done.stderr
     assert len(done.stderr.splitlines()) == 1
-
-
-def test_a_folder_without_a_run(tmp_path):
-    done = subprocess.run([*GFMHIL, "modbus", str(tmp_path)], capture_output=True, text=True)
-    assert done.returncode == 2 and "no run is going on there" in done.stderr
-
-
-def test_the_vendor_model_is_a_file_for_clients():
-    done = subprocess.run([*GFMHIL, "modbus", "--vendor-model"], capture_output=True, text=True)
-    assert json.loads(done.stdout)["id"] == VENDOR
-
-
-def test_stop_ends_the_run_and_the_server_with_it(tmp_path):
-    (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
-    folder = tmp_path / "run"
-    command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(folder), "--quiet"]
-    going = subprocess.Popen([*command, "--no-figures"], stdout=subprocess.DEVNULL)
-    try:
-        wait_for(lambda: all((folder / f"desk_{s}.json").exists() for s in ("plant", "controller")))
-        server, port = start(folder)
-        with ModbusTcpClient("127.0.0.1", port=port) as plain:
-            sunspec.set_model_defs_path([MODELS, sunspec.models_dir])
-            device = SunSpecModbusClientDeviceTCP(slave_id=1, ipport=port, timeout=20)
-            device.scan()
-            plain.write_register(at(device, 715, "OpCtl"), 0, device_id=1)
-        assert going.wait(PATIENCE_S) == 130
-        assert server.wait(PATIENCE_S) == 0
-    finally:
-        end(going)
-    assert json.loads((folder / "summary.json").read_text())["status"] == "interrupted"
-
-
-def test_a_server_beside_a_run_begins_and_ends_with_it(tmp_path):
-    (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(tmp_path / "run")]
-    options = ["--modbus", str(port), "--no-figures", "--quiet"]
-    run = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    try:
-        assert f"Modbus/TCP on 127.0.0.1:{port}" in run.stderr.readline().decode()
-        with ModbusTcpClient("127.0.0.1", port=port) as plain:
-            assert plain.read_holding_registers(SUNS, count=2, device_id=1).registers[0] == 0x5375
-        run.send_signal(signal.SIGINT)
-        assert run.wait(PATIENCE_S) == 130
-        with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(("127.0.0.1", port), timeout=20)
-    finally:
-        end(run)
-
-
-def test_a_run_in_process_cannot_be_served():
-    command = [*GFMHIL, "run", "pref_step", "--link", "inproc", "--modbus"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and "--modbus: a run in process takes no commands" in done.stderr
-
-
-def test_a_port_in_use_is_refused_before_anything_starts(tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        command = [*GFMHIL, "run", "pref_step", "--out", str(tmp_path / "run"), "--modbus"]
-        done = subprocess.run([*command, str(port)], capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and f"--modbus {port}: Address already in use" in done.stderr
-    assert not (tmp_path / "run").exists()

@@ -1,0 +1,57 @@
+"""What the tests of the Modbus server start and wait for."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gfm_hil.modbus
+
+SCENARIO = """
+title = "served"
+duration = 600.0
+mode = "realtime"
+law = "vsg-2-tuned"
+ready_laws = ["vsg-5-tuned", "droop-3-tuned"]
+after_trip = "wait"
+[link]
+type = "shm"
+peer_timeout_s = 30.0
+[late_policy]
+hold = 10000000
+"""
+PATIENCE_S = 100.0
+GFMHIL = [sys.executable, "-m", "gfm_hil"]
+MODELS = str(Path(gfm_hil.modbus.__file__).parent / "models")
+SUNS = 40000
+
+
+def wait_for(condition):
+    """What the condition gives, once it gives something."""
+    until = time.monotonic() + PATIENCE_S
+    while not (found := condition()):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    return found
+
+
+def end(process: subprocess.Popen) -> None:
+    if process.poll() is None:
+        process.kill()
+    process.communicate()
+
+
+def start(folder: Path, *options: str) -> tuple[subprocess.Popen, int]:
+    """A server and its port."""
+    command = [*GFMHIL, "modbus", str(folder), "--port", "0", *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    said = process.stdout.readline()
+    return process, int(re.search(r":(\d+), unit 1", said).group(1))
+
+
+def at(device, model: int, name: str) -> int:
+    target = device.models[model][0]
+    return target.model_addr + target.points[name].offset
