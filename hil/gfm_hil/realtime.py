@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import struct
 from typing import Any
 
 from gfm_hil.links.base import Side
@@ -14,7 +13,6 @@ PRIORITY = 50  # of SCHED_FIFO: above what a desktop runs, below the kernel's ow
 _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 
 
-_awake = 0  # the file by which processors are kept awake
 _before: set[int] = set()  # processors that this process might use before it chose one
 
 
@@ -27,13 +25,12 @@ def ask_for_real_time(side: Side) -> dict[str, Any]:
 
     Returns:
         What was granted, for the log: ``policy`` ("fifo 50", "nice -20" or "as given"),
-        ``processor`` (or None), ``memory_locked`` and ``kept_awake``.
+        ``processor`` (or None) and ``memory_locked``.
     """
     return {
         "policy": _fifo() or ordinary_priority(),
         "processor": own_processor(side),
         "memory_locked": _lock_memory(),
-        "kept_awake": _keep_awake(),
     }
 
 
@@ -74,19 +71,6 @@ def _lock_memory() -> bool:
     try:
         return bool(ctypes.CDLL(None).mlockall(_LOCK_NOW_AND_LATER) == 0)
     except (AttributeError, OSError):
-        return False
-
-
-def _keep_awake() -> bool:
-    """Have idle processors poll rather than sleep, from which they would come back late.
-
-    The kernel heeds the wish for as long as the file is open: until this process ends.
-    """
-    global _awake
-    try:
-        _awake = _awake or os.open("/dev/cpu_dma_latency", os.O_WRONLY | os.O_CLOEXEC)
-        return os.write(_awake, struct.pack("i", 0)) == 4
-    except OSError:
         return False
 
 
