@@ -118,7 +118,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         (report.nodeid, value)
         for outcome in ("failed", "error")
         for report in terminalreporter.stats.get(outcome, ())
-        for name, value in report.user_properties
+        for name, value in getattr(report, "user_properties", ())  # a collection error has none
         if name == _FIGURE
     ]
     if figures:

@@ -106,6 +106,14 @@ def test_passing_test_passes_and_is_marked_by_its_link(pytester: pytest.Pytester
     )
 
 
+def test_a_file_that_cannot_be_imported_is_told_by_pytest_alone(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("import nowhere_to_be_found")
+    result = pytester.runpytest()
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(["*No module named 'nowhere_to_be_found'"])
+    assert result.ret == pytest.ExitCode.INTERRUPTED
+
+
 def test_what_is_not_looked_at_is_run_all_the_same(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
