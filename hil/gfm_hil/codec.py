@@ -61,15 +61,18 @@ def make_reader() -> np.ndarray:
     return reader
 
 
+_AT_ONCE = 16  # bytes
+
+
 def _tables() -> np.ndarray:
-    """Eight tables of the reflected polynomial, to take eight bytes at a time."""
-    tables = np.zeros((8, 256), np.uint32)
+    """Tables of the reflected polynomial: what a byte becomes that 0, 1, … bytes follow."""
+    tables = np.zeros((_AT_ONCE, 256), np.uint32)
     for byte in range(256):
         crc = byte
         for _ in range(8):
             crc = (crc >> 1) ^ (0xEDB88320 if crc & 1 else 0)
         tables[0, byte] = crc
-    for k in range(1, 8):
+    for k in range(1, _AT_ONCE):
         before = tables[k - 1]
         tables[k] = (before >> np.uint32(8)) ^ tables[0][before & 0xFF]
     return tables
@@ -78,29 +81,41 @@ def _tables() -> np.ndarray:
 _T = _tables()
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _word(message, k):
+    return (
+        np.uint32(message[k])
+        | np.uint32(message[k + 1]) << np.uint32(8)
+        | np.uint32(message[k + 2]) << np.uint32(16)
+        | np.uint32(message[k + 3]) << np.uint32(24)
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _four(word, after):
+    """What four bytes become that ``after`` more of the same step follow."""
+    return (
+        _T[after + 3, word & 0xFF]
+        ^ _T[after + 2, (word >> np.uint32(8)) & 0xFF]
+        ^ _T[after + 1, (word >> np.uint32(16)) & 0xFF]
+        ^ _T[after, word >> np.uint32(24)]
+    )
+
+
 @njit(cache=True, nogil=True)
 def crc32(message, count):
     """CRC-32 of the first ``count`` bytes."""
     crc = np.uint32(0xFFFFFFFF)
     k = 0
-    while k + 8 <= count:
-        low = crc ^ (
-            np.uint32(message[k])
-            | np.uint32(message[k + 1]) << np.uint32(8)
-            | np.uint32(message[k + 2]) << np.uint32(16)
-            | np.uint32(message[k + 3]) << np.uint32(24)
-        )
-        crc = (
-            _T[7, low & 0xFF]
-            ^ _T[6, (low >> np.uint32(8)) & 0xFF]
-            ^ _T[5, (low >> np.uint32(16)) & 0xFF]
-            ^ _T[4, low >> np.uint32(24)]
-            ^ _T[3, message[k + 4]]
-            ^ _T[2, message[k + 5]]
-            ^ _T[1, message[k + 6]]
-            ^ _T[0, message[k + 7]]
-        )
-        k += 8
+    while k + _AT_ONCE <= count:
+        # what does not wait for the step before comes first
+        later = _four(_word(message, k + 12), 0) ^ _four(_word(message, k + 8), 4)
+        later ^= _four(_word(message, k + 4), 8)
+        crc = later ^ _four(crc ^ _word(message, k), 12)
+        k += _AT_ONCE
+    while k + 4 <= count:
+        crc = _four(crc ^ _word(message, k), 0)
+        k += 4
     while k < count:
         crc = _T[0, (crc ^ message[k]) & 0xFF] ^ (crc >> np.uint32(8))
         k += 1
@@ -119,7 +134,9 @@ def pack(sequence, frame, message, tick, state, reason, values):
         values: p.u., in the order of the signal table.
     """
     f = frame[0]
-    f.state, f.reason, f.tick = state, reason, tick
+    if f.state != state or f.reason != reason:  # a store just before the CRC reads it holds that up
+        f.state, f.reason = state, reason
+    f.tick = tick
     f.sequence = sequence[0]
     sequence[0] = (sequence[0] + 1) % _WRAP
     for j in range(len(values)):

@@ -49,6 +49,21 @@ def temporary(prefix: str) -> Iterator[Path]:
         let_go(handle)
 
 
+def held(place: Path) -> bool:
+    """Whether somebody uses a folder."""
+    try:
+        handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:  # it is gone
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+    return False
+
+
 def left_behind(prefix: str, where: Path) -> Iterator[tuple[Path, int]]:
     """Folders of ours that nobody uses any more, each with a hold that keeps others from it."""
     for place in sorted(where.glob(f"{prefix}*")):

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gfm_hil import scratch
 from gfm_hil.errors import UserError
-from gfm_hil.operator import Operator
+from gfm_hil.operator import Operator, present
 from gfm_hil.timeline import read_log
 
 SCENARIO = """
@@ -164,3 +165,19 @@ def test_the_command(going):
     assert process.wait(PATIENCE_S) == 130
     over = tell("P_ref=0.7")
     assert over.returncode == 2 and "no run is going on there" in over.stderr
+
+
+def test_what_a_killed_run_has_announced_is_not_going_on(tmp_path):
+    with scratch.temporary("gfmhil-desk-") as place:
+        endpoint = {"endpoint": f"ipc://{place}/plant"}
+        (tmp_path / "desk_plant.json").write_text(json.dumps(endpoint), encoding="utf-8")
+        assert present(tmp_path) == ["plant"]
+        Operator(tmp_path).close()
+    place.mkdir()  # as SIGKILL leaves it
+    try:
+        assert present(tmp_path) == []
+        with pytest.raises(UserError, match="no run is going on there"):
+            Operator(tmp_path)
+    finally:
+        place.rmdir()
+    assert present(tmp_path) == []

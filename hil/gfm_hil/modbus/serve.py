@@ -24,7 +24,7 @@ from gfm_hil.modbus.connection import UNIT, Server
 from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE
 from gfm_hil.modbus.view import Watcher
-from gfm_hil.operator import Operator
+from gfm_hil.operator import Operator, present
 from gfm_hil.scenario import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
@@ -180,11 +180,11 @@ async def _clock(
 
 def begun(folder: Path) -> bool:
     """Whether both sides of a run are there."""
-    return all((folder / f"desk_{side}.json").exists() for side in SIDES)
+    return len(present(folder)) == len(SIDES)
 
 
 def _going(folder: Path) -> bool:
-    return any((folder / f"desk_{side}.json").exists() for side in SIDES)
+    return bool(present(folder))
 
 
 def _until_told() -> asyncio.Event:

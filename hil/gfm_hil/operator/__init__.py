@@ -1,6 +1,7 @@
 """The operator's hand on a run: commands to a side that is running, and a look at what it does."""
 
+from gfm_hil.operator.announced import announced, present
 from gfm_hil.operator.client import Operator
 from gfm_hil.operator.desk import Desk
 
-__all__ = ["Desk", "Operator"]
+__all__ = ["Desk", "Operator", "announced", "present"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,7 +9,8 @@ import zmq
 
 from gfm_hil.errors import UserError
 from gfm_hil.events import CONTROLLER_EVENTS
-from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.base import Side
+from gfm_hil.operator.announced import announced, present
 from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
 from gfm_plant import TRIP_REASONS
 from gfm_runtime.controller import REASONS, STATES
@@ -32,7 +32,7 @@ class Operator:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._context = zmq.Context()
-        if not any(self._desk(side) for side in SIDES):
+        if not present(folder):
             raise UserError(f"{folder}: no run is going on there")
 
     def close(self) -> None:
@@ -53,10 +53,9 @@ class Operator:
 
     def stop(self) -> None:
         """End the run as Ctrl-C would."""
-        for side in SIDES:
-            if self._desk(side):
-                self._ask(side, {"type": "stop"})
-                return
+        for side in present(self._folder):
+            self._ask(side, {"type": "stop"})
+            return
 
     def snapshot(self) -> dict[str, Any]:
         """The newest recorded tick: every column of the recording by name, and in words.
@@ -84,22 +83,14 @@ class Operator:
             else:
                 found["state"] = STATES[int(found["state"])]
                 found["reason"] = REASONS[int(part.progress[1])]
-                if (desk := self._desk(side)) is not None:
+                if (desk := announced(self._folder, side)) is not None:
                     law = desk["laws"][int(found["law"])]
                     found["active"], found["gains"] = law["name"], law["gains"]
                     found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found
 
-    def _desk(self, side: Side) -> dict[str, Any] | None:
-        """What a side's desk announces, or None if there is none."""
-        try:
-            found = json.loads((self._folder / f"desk_{side}.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return None
-        return dict(found)
-
     def _ask(self, side: Side, content: dict[str, Any]) -> dict[str, Any]:
-        desk = self._desk(side)
+        desk = announced(self._folder, side)
         if desk is None:
             raise UserError(f"{self._folder}: the {side} is not running")
         with self._context.socket(zmq.REQ) as socket:

@@ -31,6 +31,7 @@ from gfm_hil.events import (
     apply_grid_event,
 )
 from gfm_hil.links.base import Side
+from gfm_hil.operator.announced import SCHEME, announcement
 from gfm_hil.retune import retuned
 from gfm_hil.timeline import Timeline
 
@@ -61,7 +62,7 @@ class Desk:
         stop: Callable[[], None],
     ) -> None:
         self._side, self._bench, self._timeline = side, bench, timeline
-        self._announcement = folder / f"desk_{side}.json"
+        self._announcement = announcement(folder, side)
         self._ring, self._stop = ring, stop
         self._over = threading.Event()
 
@@ -72,7 +73,7 @@ class Desk:
         with contextlib.ExitStack() as stack:
             stack.callback(self._context.destroy, linger=0)
             place = stack.enter_context(scratch.temporary("gfmhil-desk-"))
-            endpoint = f"ipc://{place}/{self._side}"
+            endpoint = f"{SCHEME}{place}/{self._side}"
             try:
                 self._socket.bind(endpoint)
             except zmq.ZMQError as problem:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.errors import UserError
+from gfm_hil.operator import announced, present
 from gfm_hil.recording import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
@@ -92,9 +93,8 @@ class Record:
 
     def look_up_laws(self) -> None:
         """See what indices in column ``law`` mean now: gains may have been changed."""
-        try:
-            desk = json.loads((self.folder / "desk_controller.json").read_text("utf-8"))
-        except (OSError, ValueError):  # no controller of ours, or it is over
+        desk = announced(self.folder, "controller")
+        if desk is None:  # no controller of ours, or it is over
             return
         self.laws = [_law(law["label"], law["name"], law["gains"]) for law in desk["laws"]]
 
@@ -113,7 +113,7 @@ class Record:
 
     def _gone(self) -> dict[str, str] | None:
         """A run of which only the recording is left: both desks were there and are no more."""
-        there = any(self.folder.glob("desk_*.json"))
+        there = bool(present(self.folder))
         self._met |= there
         if self._met and not there:
             return {"status": "over", "reason": ""}
