@@ -120,6 +120,7 @@ def test_loop_runs_the_product_over_a_link(tmp_path: Path, capsys: Any) -> None:
 
 def test_loop_that_trips_is_not_timed(tmp_path: Path, capsys: Any) -> None:
     line = ["bench", "loop", "--laws", "dvoc", "--mode", "lockstep", "--rounds", "1"]
+    line += ["--links", "shm", "--seconds", "0.1"]
     assert main([*line, "--out", str(tmp_path / "bench")]) == 2
     assert capsys.readouterr().err.startswith("gfmhil: dvoc: tripped or safe at tick ")
 
