@@ -153,7 +153,7 @@ def processes_with(mark: str) -> int:
 )
 def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) -> None:
     mark = f"GFMHIL_TEST={uuid.uuid4()}"
-    line = ["bench", kind, "--links", "shm", "--seconds", "30", "--mode", "realtime"]
+    line = ["bench", kind, "--links", "shm", "--seconds", "8", "--mode", "realtime"]
     process = subprocess.Popen(
         [sys.executable, "-m", "gfm_hil", *line, "--out", str(tmp_path / "bench")],
         env={**os.environ, **dict([mark.split("=")])}, start_new_session=True,
