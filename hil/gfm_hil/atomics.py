@@ -58,6 +58,23 @@ def pause(typingctx):
 
 
 @intrinsic
+def prefetch(typingctx, address):
+    """Have the line at an address fetched to be written to, while other work goes on."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        i32 = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [_BYTES, i32, i32, i32])
+        name = "llvm.prefetch.p0i8"
+        known = builder.module.globals.get(name)
+        function = known or ir.Function(builder.module, kind, name)
+        write, soon, data = i32(1), i32(3), i32(1)
+        builder.call(function, [builder.inttoptr(arguments[0], _BYTES), write, soon, data])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), make
+
+
+@intrinsic
 def copy(typingctx, to, origin, size):
     """Copy ``size`` bytes from one address to another."""
 

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from numba import njit
-
 from gfm_hil.bench import Bench
 from gfm_hil.recording import Part, record_command, record_controller, record_sample
 from gfm_hil.timeline import Timeline
 from gfm_plant import plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.protection import CONTROLLER, SAFE_STATE, trip
+from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import READY, SAFE, control, heed
 
 CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run_ticks(
     par, st, ctl, laws, states, est, y, u, plant_rows, controller_rows, start, stop, waits
 ):

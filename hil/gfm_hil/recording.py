@@ -17,14 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil import scratch
+from gfm_hil.atomics import prefetch
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.assembly import SPARE
+from gfm_runtime.compiled import compiled
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
 
 PLANT_COLUMNS = (
@@ -43,30 +44,33 @@ PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
 CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
 _TRUE = NY + NU
+_SOON = 8  # rows; a page that is new to the processor would hold up the tick that begins it
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
 _HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
 _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
 
 
-@njit(cache=True)
+@compiled
 def record_sample(row, y, par, st):
     """What a row of PLANT_COLUMNS knows when the plant is sampled."""
+    prefetch(row.ctypes.data + _SOON * row.nbytes)
     for j in range(NY):
         row[j] = y[j]
     plant_truth(par, st, row[_TRUE:])
 
 
-@njit(cache=True)
+@compiled
 def record_command(row, u):
     """The rest of the row, once u is in hand."""
     for j in range(NU):
         row[NY + j] = u[j]
 
 
-@njit(cache=True)
+@compiled
 def record_controller(row, ctl, est):
     """One row of CONTROLLER_COLUMNS."""
+    prefetch(row.ctypes.data + _SOON * row.nbytes)
     c = ctl[0]
     for j in range(NY):
         row[j] = c.ref[j]

@@ -10,9 +10,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from gfm_plant.compiled import compiled
 from gfm_plant.grid import advance_grid
 from gfm_plant.integrator import Held, Vector, integrate
 from gfm_plant.model import DELTA, V_DC, rates, terminal
@@ -26,7 +26,7 @@ TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 
 
-@njit(cache=True)
+@compiled
 def plant_init(
     par: PlantRecord, st: PlantRecord, x0: NDArray[np.float64], u0: NDArray[np.float64]
 ) -> None:
@@ -52,7 +52,7 @@ def plant_init(
         s.i_load[0], s.i_load[1] = i_load.real, i_load.imag
 
 
-@njit(cache=True)
+@compiled
 def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
     """Take the command u[k] (3,) of this tick and go on to the next.
 
@@ -68,7 +68,7 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
         plant_go_on(par, st)
 
 
-@njit(cache=True)
+@compiled
 def plant_ahead(par: PlantRecord) -> bool:
     """Whether a plant goes on first and takes the command then: nothing of u[k] acts in period k.
 
@@ -77,7 +77,7 @@ def plant_ahead(par: PlantRecord) -> bool:
     return bool(par[0].delay > 0)
 
 
-@njit(cache=True)
+@compiled
 def plant_take(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
     """Put u (3,) through the D/A into the delay line."""
     r, s = par[0], st[0]
@@ -90,7 +90,7 @@ def plant_take(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> Non
             trip(s, BAD_COMMAND, u[j])
 
 
-@njit(cache=True)
+@compiled
 def plant_go_on(par: PlantRecord, st: PlantRecord) -> None:
     """Go on by one sampling period under the commands in the delay line."""
     r, s = par[0], st[0]
@@ -121,7 +121,7 @@ def plant_go_on(par: PlantRecord, st: PlantRecord) -> None:
     advance_grid(r, s)
 
 
-@njit(cache=True)
+@compiled
 def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> None:
     """Write the true values at this tick to out (10,), in the order of `TRUTH`."""
     s = st[0]
@@ -135,7 +135,7 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[9] = s.trip
 
 
-@njit(cache=True)
+@compiled
 def _stretch(
     r: Any, s: Any, v: Vector, delta: float, age: int, steps: int, h: float
 ) -> tuple[Vector, float]:

@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
-
 from gfm_plant.build import check_sub_step
+from gfm_plant.compiled import compiled
 from gfm_plant.model import DELTA
 from gfm_plant.records import PlantRecord
 
@@ -108,7 +107,7 @@ def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
     _connect(par, st)
 
 
-@njit(cache=True)
+@compiled
 def advance_grid(r: Any, s: Any) -> None:
     """Move ramps and sags on by one tick."""
     T_s = r.T_s
@@ -121,7 +120,7 @@ def advance_grid(r: Any, s: Any) -> None:
             s.V_g = s.V_g_to = s.V_g_after
 
 
-@njit(cache=True)
+@compiled
 def _towards(value: float, goal: float, most: float) -> float:
     """Move `value` towards `goal` by at most `most`."""
     return min(value + most, goal) if value < goal else max(value - most, goal)

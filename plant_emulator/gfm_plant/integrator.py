@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from numba import njit
-
+from gfm_plant.compiled import compiled
 from gfm_plant.model import Rates, circuit, terminal
 
 Vector = tuple[Any, ...]
@@ -34,7 +33,7 @@ class Held(NamedTuple):
     omega_s: float  # sensor bandwidth, rad/s
 
 
-@njit(cache=True)
+@compiled
 def integrate(s: Vector, delta: float, steps: int, h: float, c: Rates, held: Held) -> Vector:
     """Return the Vector `s` after `steps` RK4 steps of `h` seconds from the angle `delta`.
 
@@ -56,7 +55,7 @@ def integrate(s: Vector, delta: float, steps: int, h: float, c: Rates, held: Hel
     return s
 
 
-@njit(cache=True)
+@compiled
 def _slope(s: Vector, v_gd: float, v_gq: float, c: Rates, held: Held) -> Vector:
     i_d, i_q, v_d, v_q, i_od, i_oq, v_dc, i_reg, i_ld, i_lq, s_vdc, s_p, s_q, s_V = s
 
@@ -80,7 +79,7 @@ def _slope(s: Vector, v_gd: float, v_gq: float, c: Rates, held: Held) -> Vector:
     return (*dx, di_reg, di_ld, di_lq, *sensed)
 
 
-@njit(cache=True)
+@compiled
 def _along(s: Vector, h: float, k: Vector) -> Vector:
     """Return s + h k, written out because compiled tuples have no comprehension."""
     return (

@@ -17,6 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gfm_plant.compiled import compiled
+
 N_X, N_U, N_Y = 8, 3, 5
 DELTA, V_DC = 6, 7  # where the angle and the DC voltage sit in x
 
@@ -36,7 +38,7 @@ class Rates(NamedTuple):
     per_C_dc: float
 
 
-@njit(cache=True)
+@compiled
 def rates(r: Any, bridge: float) -> Rates:
     """Return the rates of `r`, one entry of `plant_par_dtype`.
 
@@ -47,7 +49,7 @@ def rates(r: Any, bridge: float) -> Rates:
     return Rates(w, bridge * w / r.L_f, r.R_f, w / r.C_f, w / r.L_g, r.R_g, w / r.C_dc)
 
 
-@njit(cache=True)
+@compiled
 def circuit(
     i_d: Any, i_q: Any, v_d: Any, v_q: Any, i_od: Any, i_oq: Any, v_dc: Any,
     i_dc: Any, omega_u: Any, E_u: Any, v_gd: Any, v_gq: Any, c: Rates,
@@ -69,7 +71,7 @@ def circuit(
     )
 
 
-@njit(cache=True)
+@compiled
 def terminal(v_d: Any, v_q: Any, i_od: Any, i_oq: Any) -> tuple[Any, Any, Any]:
     """Return p, q and V at the filter capacitor in p.u., Eq. (9)-(11)."""
     p = v_d * i_od + v_q * i_oq

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from gfm_plant.compiled import compiled
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -19,7 +20,7 @@ _TWO, _ONE = np.uint64(2), np.uint64(1)
 _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 
 
-@njit(cache=True)
+@compiled
 def _splitmix(counter: np.uint64) -> np.uint64:
     """Return the output of splitmix64 (Steele, Lea, Flood 2014) for one state."""
     z = counter
@@ -28,7 +29,7 @@ def _splitmix(counter: np.uint64) -> np.uint64:
     return z ^ (z >> _S31)
 
 
-@njit(cache=True)
+@compiled
 def gaussian(seed: int, tick: int, channel: int) -> float:
     """Return a sample of N(0, 1), by Box-Muller from two uniform numbers; 0 <= channel < 8."""
     key = _splitmix(np.uint64(seed) + _GOLDEN)

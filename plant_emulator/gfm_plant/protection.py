@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
-
+from gfm_plant.compiled import compiled
 from gfm_plant.records import PlantRecord
 
 TRIPS = (
@@ -40,7 +39,7 @@ CONTROLLER_SAFE = "the controller is in its safe state"
 NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 
 
-@njit(cache=True)
+@compiled
 def trip(s: Any, reason: int, value: float) -> None:
     """Latch a trip, if none is latched: the bridge blocks and the DC source turns off.
 
@@ -55,7 +54,7 @@ def trip(s: Any, reason: int, value: float) -> None:
         s.u_now[0], s.u_now[1], s.u_now[2] = 0.0, s.omega_g, 0.0
 
 
-@njit(cache=True)
+@compiled
 def protect(r: Any, s: Any) -> None:
     """Check every threshold on the true values of this tick."""
     i = math.hypot(s.x[0], s.x[1])
@@ -71,7 +70,7 @@ def protect(r: Any, s: Any) -> None:
     _watch(r, s, 6, omega_u, -1.0)
 
 
-@njit(cache=True)
+@compiled
 def _watch(r: Any, s: Any, k: int, value: float, sign: float) -> None:
     if r.trip_ticks[k] < 0 or sign * (value - r.trip_limit[k]) <= 0.0:
         s.crossed[k] = 0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from gfm_plant.compiled import compiled
 
 
-@njit(cache=True)
+@compiled
 def quantise(value: float, lo: float, hi: float, lsb: float) -> float:
     """Return `value` clamped to [lo, hi] and rounded to the codes lo + n lsb.
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from gfm_plant.compiled import compiled
 from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussian
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecord
 
 
-@njit(cache=True)
+@compiled
 def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> None:
     """Write what the A/D reads at this tick to y (5,): (v_dc, p, omega_u, q, V).
 
@@ -33,7 +33,7 @@ def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> N
     y[4] = _measure(r, s, 3, V)
 
 
-@njit(cache=True)
+@compiled
 def _measure(r: Any, s: Any, j: int, value: float) -> float:
     """Return a quantity as channel j reads it."""
     value = r.gain[j] * value + r.offset[j]

@@ -14,9 +14,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from gfm_runtime.compiled import compiled
 from gfm_runtime.impedance import estimate
 from gfm_runtime.kernel import step
 from gfm_runtime.signals import NU, NY, group
@@ -89,13 +89,13 @@ def set_reference(ctl: NDArray[Any], index: int, value: float, per_tick: float =
     ctl["ref_rate"][0, index] = abs(per_tick)
 
 
-@njit(cache=True)
+@compiled
 def _go_safe(ctl, reason, channel):
     if ctl.state != SAFE:
         ctl.state, ctl.reason, ctl.channel = SAFE, reason, channel
 
 
-@njit(cache=True)
+@compiled
 def missed(ctl):
     """Count a tick without a fresh measurement; SAFE when there were too many in a row.
 
@@ -107,7 +107,7 @@ def missed(ctl):
         _go_safe(c, STALE, -1)
 
 
-@njit(cache=True)
+@compiled
 def heed(ctl, tripped):
     """Take in what the plant's frame says of it: a trip takes a running controller to SAFE, and a
     plant that is well again a READY one to RUNNING."""
@@ -119,7 +119,7 @@ def heed(ctl, tripped):
         c.state = RUNNING
 
 
-@njit(cache=True)
+@compiled
 def _schedule(ctl, est, y):
     """Pick the stage for the estimated reactance, with hysteresis and a least dwell."""
     X = estimate(est, y[1], y[2], y[4])
@@ -139,7 +139,7 @@ def _schedule(ctl, est, y):
         ctl.request, ctl.since = ctl.stage_law[wanted], 0
 
 
-@njit(cache=True)
+@compiled
 def control(ctl, laws, states, est, y, u):
     """One tick: y[k] in, u[k] out.
 

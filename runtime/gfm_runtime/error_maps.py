@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from gfm_runtime.compiled import inlined
 
 LINEAR, DC_ENERGY, DVOC, HYBRID_ANGLE = 0, 1, 2, 3
 
@@ -31,9 +31,6 @@ ERROR_MAPS = {
     "dvoc": DVOC,
     "hybrid-angle": HYBRID_ANGLE,
 }
-
-#: for all parts of the kernel's step: left to itself the compiler calls them, and saves registers
-inlined = njit(cache=True, forceinline=True)
 
 V_MIN = 1e-3  # p.u.; a dead bus must not divide by zero
 

@@ -18,8 +18,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from gfm_runtime.compiled import compiled
 
 COHERENT = 0.7
 X_MIN = 1e-3  # p.u.; no line is shorter
@@ -98,7 +99,7 @@ def make_impedance(
     return out
 
 
-@njit(cache=True)
+@compiled
 def estimate(est, p, omega_u, V):
     """One tick of the estimator from p, omega_u and V (p.u.); returns X in p.u."""
     if est.age == 0:

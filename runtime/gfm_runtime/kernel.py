@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from gfm_runtime.compiled import inlined
 from gfm_runtime.discretise import DiscreteLaw
-from gfm_runtime.error_maps import ERROR_MAPS, inlined, map_errors
+from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY
 

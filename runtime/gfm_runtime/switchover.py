@@ -8,13 +8,12 @@ there it goes into ``state.offset``, which decays with the law's T_off.
 
 from __future__ import annotations
 
-from numba import njit
-
+from gfm_runtime.compiled import compiled
 from gfm_runtime.kernel import output, set_inputs
 from gfm_runtime.signals import NU, NY
 
 
-@njit(cache=True)
+@compiled
 def settle_into(law, state, ref, y, u, trend):
     """Set a law's state so that its output at (ref, y) is u (3,) p.u. and goes on by trend (3,).
 
@@ -49,7 +48,7 @@ def settle_into(law, state, ref, y, u, trend):
     output(law, state, u)
 
 
-@njit(cache=True)
+@compiled
 def change_law(old, old_state, new, new_state, ref, y, u):
     """u[k] under the new law, prepared so that it equals the old law's u[k]; returns the bump.
 

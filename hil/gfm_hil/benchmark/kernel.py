@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
 from gfm_hil.benchmark.c_code import FLAGS, NoCompiler
 from gfm_hil.benchmark.kernel_twin import Drive, compile_twin
 from gfm_hil.benchmark.turns import Spread, quickest, ratio, seconds, take_turns
 from gfm_runtime import discretise, get_law
+from gfm_runtime.compiled import compiled
 from gfm_runtime.kernel import pack_law, state_dtype, step
 from gfm_runtime.signals import NU, NY, group
 
@@ -36,7 +36,7 @@ def io_dtype(real: DTypeLike) -> np.dtype[Any]:
     return np.dtype([("ref", f, (NY,)), ("y", f, (NY,)), ("u", f, (NU,))], align=True)
 
 
-@njit(cache=True)
+@compiled
 def drive(law, state, io, inputs, outputs, steps, feedback):
     """``steps`` steps on the rows of ``inputs`` in turn; the last u of each row in ``outputs``.
 

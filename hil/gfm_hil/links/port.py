@@ -14,6 +14,8 @@ import numpy as np
 from numba import cfunc, types
 from numpy.typing import NDArray
 
+from gfm_runtime.compiled import FREE
+
 #: what both functions look like: (handle, message) -> number
 PORT_CALL = types.int64(types.int64[::1], types.uint8[::1])
 
@@ -49,3 +51,9 @@ class Port:
 def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> Any:
     """Compile a function of (handle, message) for a ``Port``; kept on disk unless told not to."""
     return cfunc(PORT_CALL, cache=cached)(function)
+
+
+def free_port_function(function: Callable[[Any, Any], int]) -> Any:
+    """The same for one that does without numba's runtime, see ``gfm_runtime.compiled``: quicker,
+    and all that it calls has to do without as well."""
+    return cfunc(PORT_CALL, **FREE)(function)

@@ -8,10 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
 from gfm_hil.atomics import pause as _pause
+from gfm_runtime.compiled import compiled
 
 _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
 _NS = 1_000_000_000
@@ -96,7 +97,7 @@ def end_this_process(typingctx):
     return types.int32(), make
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def wait_until(deadline_ns, spins):
     """Sleep until shortly before a deadline, then spin; returns the longest gap in the spin, ns.
 
@@ -117,7 +118,7 @@ def wait_until(deadline_ns, spins):
     return gap
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def between_looks(looks, spins):
     """What a waiting loop does after its ``looks``-th look in vain: at first it spins, where the
     peer itself delivers (``spins`` looks), then it yields."""

@@ -7,8 +7,6 @@ received so far foretells: it needs no clock in common with the plant.
 
 from __future__ import annotations
 
-from numba import njit
-
 from gfm_hil.codec import OUT_OF_SEQUENCE, pack, unpack
 from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until
 from gfm_hil.loops.records import (
@@ -24,6 +22,7 @@ from gfm_hil.loops.records import (
     STOPPED_HERE,
 )
 from gfm_hil.recording import record_controller
+from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.controller import SAFE, STOPPED, control, heed, missed
 
 _Y_ID = 1
@@ -32,7 +31,7 @@ _LEAK = 2e-4  # of a tick, in each: how much slower than ours the plant's clock 
 _EARLIER = 0.05  # of a tick
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def controller_ticks(
     send, receive, patient, handle, spins, out, into, reader, loop, told, ctl, laws, states, est,
     y, u, rows, times, progress, event,
@@ -86,7 +85,7 @@ def controller_ticks(
             return EVENT
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _next_frame(
     receive, patient, handle, spins, into, reader, r, told, ctl, y, times, ticks
 ):  # fmt: skip
@@ -152,7 +151,7 @@ def _next_frame(
     return -1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _lock(r, k, now, seen, slept):
     """Learn from frame k when the next one will come.
 

@@ -75,7 +75,7 @@ class _Loop:
         Raises:
             PeerLost: the link is gone.
         """
-        why = int(self._call(*self._arguments, until))  # type: ignore[call-arg]
+        why = int(self._call(*self._arguments, until))
         if why == GONE:
             self.link.receive()  # which knows more
             raise PeerLost("the link is gone")

@@ -13,7 +13,8 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.atomics import copy, load_acquire, pause, store_release
-from gfm_hil.links.port import PORT_CALL, port_function
+from gfm_hil.links.port import PORT_CALL, free_port_function
+from gfm_runtime.compiled import FREE
 
 SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
 SLOT = 512  # bytes
@@ -30,7 +31,7 @@ _LENGTH = (1 << LENGTH_BITS) - 1
 OUT, OUT_HEAD, SENT, SEEN, IN, IN_HEAD, TAKEN, HANDLE = range(8)
 
 
-@njit(PORT_CALL, cache=True, nogil=True)
+@njit(PORT_CALL, **FREE)
 def put(handle, message):
     """Write a message to the ring: 1, or 0 if it is full, closed, or the message does not fit."""
     size = message.size
@@ -48,7 +49,7 @@ def put(handle, message):
     return 1
 
 
-@njit(PORT_CALL, cache=True, nogil=True)
+@njit(PORT_CALL, **FREE)
 def take(handle, message):
     """Read the next message: its bytes, or 0 if none has come. A longer one is gone."""
     room, to = message.size, message.ctypes.data  # here: in a branch numba would count references
@@ -68,7 +69,7 @@ def take(handle, message):
     return size
 
 
-@njit("boolean(int64[::1])", cache=True, nogil=True)
+@njit("boolean(int64[::1])", **FREE)
 def waiting(handle):
     """Whether a message has come."""
     taken = handle[TAKEN]
@@ -77,11 +78,11 @@ def waiting(handle):
     return load_acquire(handle[IN] + taken % SLOTS * SLOT) >> LENGTH_BITS == taken + 1
 
 
-@port_function
+@free_port_function
 def port_send(handle, message):
     return put(handle, message)
 
 
-@port_function
+@free_port_function
 def port_receive(handle, message):
     return take(handle, message)

@@ -15,7 +15,8 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from gfm_hil.links.port import Port, port_function
+from gfm_hil.links.port import Port, free_port_function
+from gfm_runtime.compiled import FREE
 
 #: elements of a port's handle: zmq_send, zmq_recv and the socket, as addresses; 0 once closed
 _SEND, _RECEIVE, _SOCKET = range(3)
@@ -72,7 +73,7 @@ def _make_transfer(typingctx, address, socket, message, size, flags):
 _transfer: Any = intrinsic(_make_transfer)
 
 
-@port_function
+@free_port_function
 def _send(handle, message):
     if handle[_SOCKET] == 0:
         return 0
@@ -80,7 +81,7 @@ def _send(handle, message):
     return 1 if sent == message.size else 0
 
 
-@njit(nogil=True)
+@njit(**{**FREE, "cache": False})
 def _take(handle, message, flags):
     if handle[_SOCKET] == 0:
         return 0
@@ -88,11 +89,11 @@ def _take(handle, message, flags):
     return max(0, got)
 
 
-@port_function
+@free_port_function
 def _receive(handle, message):
     return _take(handle, message, _DONTWAIT)
 
 
-@port_function
+@free_port_function
 def _await(handle, message):
     return _take(handle, message, 0)
