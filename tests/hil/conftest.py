@@ -31,6 +31,13 @@ def home_plant(law: str) -> dict[str, Any]:
 
 
 @pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder of short path, for an ipc endpoint."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
 def make() -> Make:
     """A checked scenario of a tenth of a second in process, with whatever is given instead."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -36,13 +35,6 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "pause": {"pause_at": 700, "pause": 0.05},
     "all": {"loss": 0.005, "burst": 2.0, "corrupt": 0.005, "duplicate": 0.005, "reorder": 0.005},
 }
-
-
-@pytest.fixture
-def place() -> Iterator[Path]:
-    """A folder of short path, for an ipc endpoint."""
-    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
-        yield Path(folder)
 
 
 def lockstep(place: Path, link: str, ticks: int, impairment: dict[str, Any] | None) -> Pair:

@@ -6,9 +6,8 @@ the rules must hold for it.
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,13 +37,6 @@ from .test_frames import resealed
 from .test_links import RIG, assert_same
 
 PORTS = ("shm", "zmq")
-
-
-@pytest.fixture
-def place() -> Iterator[Path]:
-    """A folder of short path, for an ipc endpoint."""
-    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
-        yield Path(folder)
 
 
 def three_ways(content: dict[str, Any], link: str, make: Any, run: Any, place: Path) -> Any:

@@ -1,0 +1,24 @@
+"""What timing.npz says of a run in lockstep over a link with a port."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from .pairs import run_pair
+from .test_loops import PATIENT, PORTS
+
+
+@pytest.mark.parametrize("link", PORTS)
+@pytest.mark.parametrize("samples", [0, 1])
+def test_lockstep_tells_when_answers_came(samples, link, make, place):
+    """A sample late the next frame follows at once, and one look at the clock does for both."""
+    content = {"duration": 0.03, "link": PATIENT, "plant": {"delay": {"samples": samples}}}
+    content["events"] = [{"tick": 50, "type": "grid-frequency", "f_hz": 49.99}]
+    times = run_pair(make(**content), place, link).timing
+    sent, received = times["plant_sent"], times["plant_received"]
+    assert (np.diff(sent) > 0).all()
+    assert (received > sent).all()
+    assert (received[:-1] <= sent[1:]).all()
+    same = received[:-1] == sent[1:]
+    assert same.mean() > 0.9 if samples else not same.any()
