@@ -111,6 +111,8 @@ def test_loop_runs_the_product_over_a_link(tmp_path: Path, capsys: Any) -> None:
     assert row["ticks"] == 3_000
     assert row["n"] == row["ticks"] - row["missed"]
     assert sum(row["causes"].values()) == row["missed"]
+    ours = row["causes"]["own work"] + row["causes"]["link"]
+    assert row["by_work_or_link_pct"] == pytest.approx(100 * ours / row["ticks"], abs=1e-4)
     assert sum(length * count for length, count in row["bursts"]) == row["missed"]
     assert {r["law"] for r in loop["laws"]} == {"mimo-gfm", "mimo-gfm, rig"}
     for row in loop["laws"]:

@@ -58,6 +58,7 @@ def content() -> dict[str, Any]:
             "realtime": [
                 {"link": "shm", "load": "idle", "ticks": 9000, "missed": 9, "missed_pct": 0.1,
                  "host_pct": 0.05, "beyond_host_pct": 0.05, "bursts": [(1, 4), (5, 1)],
+                 "by_work_or_link_pct": 0.0333,
                  "causes": {"own work": 1, "link": 2, "late wake-up": 3, "stalled host": 3},
                  **times(2.0, 3)},
             ],

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.attribution import attribute, bursts, counts, missed_ticks
+from gfm_hil.benchmark.attribution import OURS, attribute, bursts, counts, missed_ticks
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.hogs import Load, hogs
 from gfm_hil.benchmark.inproc_loop import Loop
@@ -221,6 +221,7 @@ def _row(cell: _Cell) -> dict[str, Any]:
         host += len(lost(run.late, allowed))
         host_ticks += run.late.shape[1]
     percent = 100 * missed / ticks if ticks else None
+    ours = sum(causes[cause] for cause in OURS)
     host_percent = 100 * host / host_ticks
     return {
         "link": cell.link,
@@ -233,6 +234,7 @@ def _row(cell: _Cell) -> dict[str, Any]:
         "missed_pct": None if percent is None else round(percent, 4),
         "host_pct": round(host_percent, 4),
         "beyond_host_pct": None if percent is None else round(percent - host_percent, 4),
+        "by_work_or_link_pct": round(100 * ours / ticks, 4) if ticks else None,
         "causes": dict(causes),
         "bursts": sorted(lengths.items()),
         **summary(trips),

@@ -95,12 +95,15 @@ def realtime_table(rows: list[dict[str, Any]]) -> Table:
     """Misses in real time."""
     return Table(
         "The product in real time, 10 kHz",
-        ("", "load", "ticks", "missed", "the host's own", "beyond it", "trip p50 [µs]", "p99 [µs]"),
+        (
+            "", "load", "ticks", "missed", "the host's own", "beyond it", "by work or link",
+            "trip p50 [µs]", "p99 [µs]",
+        ),
         [
             (
                 r["link"], r["load"], f"{r['ticks']:,}", percent(r["missed_pct"]),
-                percent(r["host_pct"]), percent(r["beyond_host_pct"]), micro(r["p50_us"]),
-                micro(r["p99_us"]),
+                percent(r["host_pct"]), percent(r["beyond_host_pct"]),
+                percent(r["by_work_or_link_pct"]), micro(r["p50_us"]), micro(r["p99_us"]),
             )
             for r in rows
         ],
