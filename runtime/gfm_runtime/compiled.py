@@ -3,7 +3,7 @@
 Without numba's runtime: what would allocate does not compile, and no call counts references to the
 arrays that it is given. Each count is a locked instruction, and a tick had dozens.
 Arrays belong to whoever calls from Python, and outlive the call. numba compiles helpers of its own
-this way; the option begins with an underscore, so the versions that are known to have it are pinned.
+this way; the option begins with an underscore, so versions that are known to have it are pinned.
 """
 
 from __future__ import annotations
