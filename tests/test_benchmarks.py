@@ -31,3 +31,18 @@ def test_observers() -> None:
     assert [row["what"] for row in (bare, none, many)] == ["bare pacing", "no client", "clients"]
     assert min(row["ticks"] for row in (bare, none, many)) > 1000
     assert none["answers_per_s"] == 0 < many["answers_per_s"]
+
+
+@pytest.mark.slow
+def test_keep_awake() -> None:
+    command = [sys.executable, "-m", "benchmarks.keep_awake", "--links", "shm", "--turns", "1"]
+    done = subprocess.run(
+        [*command, "--seconds", "0.3", "--json"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)
+    assert [(row["keep_awake"], row["ticks"]) for row in rows] == [
+        ("never", 3000),
+        ("always", 3000),
+    ]

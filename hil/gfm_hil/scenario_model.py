@@ -129,6 +129,11 @@ class Scenario(_Model):
         description="wait: a trip or a safe state does not end the run; the plant stays blocked "
         "until an event, or an operator, resets both sides to the scenario's start",
     )
+    keep_awake: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="real time: a thread of idle priority keeps each side's processor from "
+        "resting; auto: on a virtual machine, whose host returns late what has rested",
+    )
     ready_laws: list[str] = Field(
         default_factory=list,
         description="laws made ready besides those that events name, for an operator to change to",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.awake import kept_awake
 from gfm_hil.bench import Bench, make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import PeerLost, UserError
@@ -110,12 +112,16 @@ def _meet_and_run(
     def stopped() -> bool:
         return interrupt.came
 
+    resources = ExitStack()
     try:
         if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
             link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: not after START
         if rights is not None:
             if link.port is None:  # a loop in Python never sleeps
                 rights["policy"] = ordinary_priority()
+            else:
+                awake = kept_awake(rights["processor"], scenario.keep_awake)
+                rights["kept_awake"] = resources.enter_context(awake)
             timeline.write(0, "scheduling", side=side, **rights)
         no_collector_pauses()
         notify(f"STATUS=waiting for the other side at {endpoint}")
@@ -127,6 +133,7 @@ def _meet_and_run(
                 run = run_controller if side == "controller" else run_plant
                 reader = run(bench, link, part, timeline, start.t0_ns, stopped)
     finally:
+        resources.close()
         link.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link that sees more than whole messages

@@ -1,0 +1,65 @@
+"""A processor that is kept from resting, and let go again."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from gfm_hil import awake
+from gfm_hil.awake import kept_awake
+
+HERE = sorted(os.sched_getaffinity(0))[0]
+_IDLE = 5  # SCHED_IDLE
+
+
+def spinner() -> threading.Thread | None:
+    return next((t for t in threading.enumerate() if t.name == "awake"), None)
+
+
+def used_s(thread: threading.Thread) -> float:
+    """Processor time of a thread, proc_pid_stat(5) fields 14 and 15."""
+    stat = Path(f"/proc/self/task/{thread.native_id}/stat").read_text().rpartition(")")[2].split()
+    return (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
+    policy, affinity = os.sched_getscheduler(0), os.sched_getaffinity(0)
+    with kept_awake(HERE, "always") as kept:
+        assert kept
+        thread = spinner()
+        assert thread is not None and thread.native_id is not None
+        assert os.sched_getscheduler(thread.native_id) == _IDLE
+        assert os.sched_getaffinity(thread.native_id) == {HERE}
+        until = time.monotonic() + 60
+        while used_s(thread) < 0.05:  # on a crowded machine it hardly gets to run
+            assert time.monotonic() < until
+            time.sleep(0.05)
+    thread.join(60)
+    assert not thread.is_alive()
+    assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == (policy, affinity)
+
+
+@pytest.mark.parametrize(
+    ("processor", "wanted", "machine", "kept"),
+    [
+        (HERE, "auto", "KVM", True),
+        (HERE, "auto", "no", False),
+        (HERE, "never", "KVM", False),
+        (None, "always", "KVM", False),
+    ],
+)
+def test_where_it_is_wanted(processor, wanted, machine, kept, monkeypatch) -> None:
+    monkeypatch.setattr(awake, "virtual_machine", lambda: machine)
+    with kept_awake(processor, wanted) as found:
+        assert found is kept
+        assert (spinner() is not None) is kept
+
+
+def test_without_the_policy_it_goes_on_without(monkeypatch) -> None:
+    monkeypatch.setattr(awake, "_never_rest", lambda flags: None)  # as if refused
+    with kept_awake(HERE, "always") as kept:
+        assert kept is False
