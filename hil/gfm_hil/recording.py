@@ -39,7 +39,8 @@ CONTROLLER_COLUMNS = (
     "state",  # of the controller, gfm_runtime.controller.STATES
     "X_est",  # estimated grid reactance of a scheduled law, p.u.
 )
-# ns of CLOCK_MONOTONIC, -1: never; "stall" is the longest gap between two looks at the clock
+# ns of CLOCK_MONOTONIC, -1: never; in lockstep a sample late, an answer is "received" at the look
+# that finds the next frame "sent"; "stall" is the longest gap between two looks at the clock
 PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
 CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 

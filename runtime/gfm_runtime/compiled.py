@@ -1,4 +1,4 @@
-"""How everything that runs in a tick is compiled.
+"""How what runs in a tick is compiled: laws, loops, frames, the quick links.
 
 Without numba's runtime: what would allocate does not compile, and no call counts references to the
 arrays that it is given. Each count is a locked instruction, and a tick had dozens.

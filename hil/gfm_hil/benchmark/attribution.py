@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 CAUSES = ("own work", "link", "late wake-up", "stalled host")
 _OWN, _LINK, _WAKE, _STALL = range(len(CAUSES))
-#: what no idle machine would take away
+#: what is neither the kernel's nor the host's doing
 OURS = (CAUSES[_OWN], CAUSES[_LINK])
 
 _INTERRUPTED = 10.0  # times what one tick in a hundred computes: it was not the computing
