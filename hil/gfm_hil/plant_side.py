@@ -97,7 +97,7 @@ class _Plant:
             if frame is None:
                 if again >= deadline or self.stopped():
                     break
-                again += self.repeat_ns  # y[k] or u[k] was lost: ask again
+                again = time.monotonic_ns() + self.repeat_ns  # y[k] or u[k] was lost: ask again
                 self.link.send(self.frame(tick))
                 continue
             # a controller that leaves says so under the last tick it saw

@@ -15,6 +15,7 @@ from gfm_hil.awake import kept_awake
 from gfm_hil.bench import Bench, make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import PeerLost, UserError
+from gfm_hil.frames import DATA_IDS, FrameReader, FrameWriter
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import Side
@@ -33,6 +34,7 @@ from gfm_hil.timeline import Outcome, Timeline
 from gfm_hil.toml_out import scenario_toml
 from gfm_plant import plant_go_on, plant_sample, plant_take
 from gfm_runtime.assembly import warm_up
+from gfm_runtime.signals import names
 
 
 def run_side(
@@ -148,6 +150,9 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
     plant_go_on(par, st)
     plant_take(par, st, u)
     warm_up(bench.controller)
+    for group in DATA_IDS:
+        values = np.zeros(len(names(group)))
+        FrameReader(group).unpack(FrameWriter(group).pack(0, 0, 0, values), values)
     compile_loops(side, bench, part)
     if side == "plant":
         record_sample(part.signals[0].copy(), y, par, st)

@@ -16,6 +16,7 @@ from gfm_runtime.controller import (
     RUNNING,
     STATES,
     control,
+    heed,
     make_controller,
     missed,
     set_reference,
@@ -174,5 +175,6 @@ def warm_up(controller: Controller) -> None:
     ctl, states = controller.ctl.copy(), controller.states.copy()
     ctl["state"], ctl["request"] = RUNNING, ctl["active"]
     y, u = np.ones(NY), np.ones(NU)
+    heed(ctl, False)
     control(ctl, controller.laws, states, controller.est.copy(), y, u)
     missed(ctl)

@@ -14,7 +14,7 @@ import pytest
 from gfm_hil.bench import make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import UserError
-from gfm_hil.frames import FrameReader, FrameWriter
+from gfm_hil.frames import FrameReader, FrameWriter, frame_dtype
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import SIDES, Side
@@ -133,9 +133,13 @@ def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
 
 
 def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint):
+    def damage(k: int, message: bytes) -> bytes:
+        tick = np.frombuffer(message, frame_dtype("u"))["tick"][0]  # not k: a slow plant asks again
+        return message if tick < 20 else message[:30] + b"\xff\xff" + message[32:]
+
     def touch(side: Side, link: Link) -> Any:
         if side == "controller":
-            return Tampering(link, lambda k, m: m if k < 20 else m[:30] + b"\xff\xff" + m[32:])
+            return Tampering(link, damage)
         return link
 
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})

@@ -96,7 +96,7 @@ def realtime_table(rows: list[dict[str, Any]]) -> Table:
     return Table(
         "The product in real time, 10 kHz",
         (
-            "", "load", "ticks", "missed", "the host's own", "beyond it", "by work or link",
+            "", "load", "ticks", "missed", "the host's own", "beyond it, median", "by work or link",
             "trip p50 [µs]", "p99 [µs]",
         ),
         [

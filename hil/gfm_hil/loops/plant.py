@@ -6,7 +6,7 @@ The same rules as ``gfm_hil.plant_side``, which does it in Python for links with
 from __future__ import annotations
 
 from gfm_hil.codec import pack, unpack
-from gfm_hil.loops.clock import AHEAD_NS, between_looks, now_ns, sleep_until, wait_until
+from gfm_hil.loops.clock import AHEAD_NS, between_looks, give_way, now_ns, sleep_until, wait_until
 from gfm_hil.loops.records import (
     BELL,
     DONE,
@@ -81,6 +81,8 @@ def plant_ticks(
         send(handle, message)
         sent = now_ns()
         times[k, 2] = sent
+        if r.realtime and spins == 0:
+            give_way()  # to the link's own thread, before a look in vain
         if unseen >= 0:
             times[unseen, 3] = sent
             unseen = -1
@@ -98,7 +100,7 @@ def plant_ticks(
             )  # fmt: skip
             if came != OVERDUE or again >= until:
                 break
-            again += r.repeat
+            again = now_ns() + r.repeat
             r.repeats += 1
             pack(sequence, frame, message, k, state, reason, y)
             send(handle, message)
