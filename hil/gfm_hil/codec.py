@@ -1,12 +1,13 @@
 """Packing and checking frames, compiled: the one implementation that both kinds of loop use.
 
-The layout is ``gfm_hil.frames.frame_dtype``; the CRC-32 is that of zlib and Ethernet.
+The layout is ``gfm_hil.frames.frame_dtype``.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from gfm_hil.crc import crc32
 from gfm_runtime.compiled import inlined
 from gfm_runtime.signals import TABLE_VERSION
 
@@ -59,71 +60,6 @@ def make_reader() -> np.ndarray:
     reader = np.zeros(1, reader_dtype)
     reader["tick"] = -1
     return reader
-
-
-_AT_ONCE = 16  # bytes
-
-
-def _tables() -> np.ndarray:
-    """Tables of the reflected polynomial: what a byte becomes that 0, 1, … bytes follow."""
-    tables = np.zeros((_AT_ONCE, 256), np.uint32)
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ (0xEDB88320 if crc & 1 else 0)
-        tables[0, byte] = crc
-    for k in range(1, _AT_ONCE):
-        before = tables[k - 1]
-        tables[k] = (before >> np.uint32(8)) ^ tables[0][before & 0xFF]
-    return tables
-
-
-_T = _tables()
-
-
-@inlined
-def _word(message, k):
-    return (
-        np.uint32(message[k])
-        | np.uint32(message[k + 1]) << np.uint32(8)
-        | np.uint32(message[k + 2]) << np.uint32(16)
-        | np.uint32(message[k + 3]) << np.uint32(24)
-    )
-
-
-@inlined
-def _four(word, after):
-    """What four bytes become that ``after`` more of the same step follow."""
-    return (
-        _T[after + 3, word & 0xFF]
-        ^ _T[after + 2, (word >> np.uint32(8)) & 0xFF]
-        ^ _T[after + 1, (word >> np.uint32(16)) & 0xFF]
-        ^ _T[after, word >> np.uint32(24)]
-    )
-
-
-@inlined
-def crc32(message, count):
-    """CRC-32 of the first ``count`` bytes."""
-    crc = np.uint32(0xFFFFFFFF)
-    k = 0
-    while k + _AT_ONCE <= count:
-        # what does not wait for the step before comes first
-        later = _four(_word(message, k + 12), 0) ^ _four(_word(message, k + 8), 4)
-        later ^= _four(_word(message, k + 4), 8)
-        crc = later ^ _four(crc ^ _word(message, k), 12)
-        k += _AT_ONCE
-    if k + 12 <= count:  # as both frames end
-        later = _four(_word(message, k + 8), 0) ^ _four(_word(message, k + 4), 4)
-        crc = later ^ _four(crc ^ _word(message, k), 8)
-        k += 12
-    while k + 4 <= count:
-        crc = _four(crc ^ _word(message, k), 0)
-        k += 4
-    while k < count:
-        crc = _T[0, (crc ^ message[k]) & 0xFF] ^ (crc >> np.uint32(8))
-        k += 1
-    return crc ^ np.uint32(0xFFFFFFFF)
 
 
 @inlined

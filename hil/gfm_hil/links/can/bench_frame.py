@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gfm_hil.codec import buffer, crc32, wire_dtype
+from gfm_hil.codec import buffer, wire_dtype
+from gfm_hil.crc import crc32
 from gfm_hil.frames import DATA_IDS
 from gfm_runtime.signals import NU, NY, Group, names
 

@@ -14,7 +14,7 @@ import zlib
 import numpy as np
 from numba import njit
 
-from gfm_hil.codec import crc32
+from gfm_hil.crc import crc32
 from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.can.bench_frame import number
 from gfm_hil.links.can.layout import Plan
