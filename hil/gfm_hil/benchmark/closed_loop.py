@@ -106,19 +106,22 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
 
     Over a link with and without a sample of loop delay: with one, as a real loop has it, the plant
     goes on while u[k] comes. The share of what the plant's half of the loop alone allows is that
-    of the quickest stretch, as the half itself is timed: a stop of the machine is neither's.
+    of the quickest stretch, as the half itself is timed, right before and after and in at least as
+    many stretches: a stop of the machine is neither's, nor a change of its speed.
     """
     remarks: list[str] = []
     names = [(INPROC, 0), *((link, delay) for link in plan.links for delay in (0, 1))]
     rates: dict[tuple[str, int], list[float]] = {name: [] for name in names}
     shares: dict[tuple[str, int], list[float]] = {name: [] for name in names}
+    ticks = round(plan.lockstep_s / T_S)
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
         for number in rounds(plan.rounds, plan.until):
-            half_ns = quickest(alone.plants_half)
             for k, name in enumerate(names[:: -1 if number % 2 else 1]):
                 link, delay = name
+                half = partial(quickest, alone.plants_half, max(RUNS, ticks // _SHORT))
+                half_ns = half()
                 tell(f"lockstep, {link}", (number + k / len(names)) / plan.rounds)
                 if link == INPROC:
                     stretches = [alone.whole() for _ in range(RUNS)]
@@ -130,6 +133,7 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
                         remarks.append(f"{link}, lockstep: a run ended early: {ended}")
                         continue
                     tick_ns, stretches = _pace(timing["plant_sent"])
+                half_ns = min(half_ns, half())
                 rates[name].append(1e9 / tick_ns)
                 shares[name].append(half_ns / min(stretches))
     rows = [
