@@ -58,8 +58,8 @@ def _everything(options: Namespace) -> list[Step]:
         _latency(with_(seconds=0.1, rounds=5, until=begin + 45.0)),
         _jitter(with_(seconds=0.1, rounds=5, until=begin + 62.0)),
         _kernel(with_(rounds=2)),
-        _loop(with_(mode="lockstep", seconds=3.0, rounds=2, until=begin + 95.0, laws=few)),
-        _loop(with_(mode="realtime", seconds=1.5, rounds=2, until=begin + 140.0)),
+        _loop(with_(mode="lockstep", seconds=3.0, rounds=5, until=begin + 115.0, laws=few)),
+        _loop(with_(mode="realtime", seconds=1.5, rounds=2, until=begin + 150.0)),
     ]
 
 
