@@ -26,6 +26,8 @@ pause: Any = _pause
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _TIMESPEC = ir.LiteralStructType([_I64, _I64])
 
+_SPINS_A_YIELD = 16
+
 #: woken this long before a deadline, the rest is spun: a sleep ends up to this late
 AHEAD_NS = 40_000
 
@@ -121,8 +123,9 @@ def wait_until(deadline_ns, spins):
 @compiled
 def between_looks(looks, spins):
     """What a waiting loop does after its ``looks``-th look in vain: at first it spins, where the
-    peer itself delivers (``spins`` looks), then it yields."""
-    if looks <= spins:
+    peer itself delivers (``spins`` looks), then it yields, there only now and then: a yield takes
+    as long as the message."""
+    if looks <= spins or (spins > 0 and looks % _SPINS_A_YIELD != 0):
         pause()
     else:
         give_way()
