@@ -15,10 +15,12 @@ from typing import Any
 
 import pytest
 
+from gfm_hil.benchmark.contenders import FRAME, Contender
 from gfm_hil.benchmark.kernel import compare
 from gfm_hil.benchmark.kernel_twin import compile_twin
 from gfm_hil.benchmark.peers import has_iceoryx2
 from gfm_hil.cli import main
+from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
 
 KEYS = {
@@ -58,6 +60,14 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path: Path, capsys: Any) -
 
 
 @pytest.mark.apt
+def test_the_message_is_the_frame_unless_told_otherwise() -> None:
+    payload = parser("bench").parse_args(["bench", "latency"]).payload
+    there, back = (Contender.messages(side, payload) for side in ("plant", "controller"))
+    assert (there.shape[1], back.shape[1]) == (payload, 48) == (FRAME, 48)
+    assert bytes(there[0, :2]) == bytes(back[0, :2]) == b"GF"
+    assert Contender.messages("controller", 100).shape[1] == 100
+
+
 def test_kernel_is_its_twin_in_c_bit_for_bit(tmp_path: Path) -> None:
     """All laws, float64 and float32, on inputs that drive each output into its limits."""
     limited: list[tuple[int, ...]] = []

@@ -46,7 +46,7 @@ def test_holm_by_hand() -> None:
 def result(p50s: dict[str, Any], limit: float = 1.0) -> dict[str, Any]:
     rows = [
         {
-            "name": name, "mode": "lockstep", "load": "idle", "policy": "fifo", "payload": 84,
+            "name": name, "mode": "lockstep", "load": "idle", "policy": "fifo", "payload": 64,
             "peer": "ours", "rounds_p50_us": list(values),
             "rounds_ratio": [value / limit for value in values],
         }

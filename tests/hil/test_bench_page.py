@@ -31,7 +31,7 @@ def content() -> dict[str, Any]:
     latency = [
         {
             "name": name, "link": link, "peer": peer, "code": code, "mode": mode, "load": load,
-            "policy": "fifo", "payload": 84, "baseline": "C shm", "silent_rounds": 0,
+            "policy": "fifo", "payload": 64, "baseline": "C shm", "silent_rounds": 0,
             "ratio_to_baseline_p50": ratio, **times(median, k),
         }
         for mode in ("lockstep", "realtime")

@@ -38,7 +38,7 @@ class Plan:
         modes: lockstep: one round trip after the other; realtime: one every 100 µs.
         loads: idle, or beside a hog on each processor.
         policy: how the two processes are scheduled.
-        payload: bytes there; 84 stands for the bench's frames, 84 there and 68 back.
+        payload: bytes there; ``FRAME`` stands for the bench's frames, 64 there and 48 back.
         seconds: of one round.
         rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
     """

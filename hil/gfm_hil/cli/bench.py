@@ -108,8 +108,8 @@ def _add_policy(command: argparse.ArgumentParser) -> None:
 
 def _add_payload(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--payload", type=int, default=84,
-        help="bytes there; 84: the bench's frames, 84 there and 68 back (default: %(default)s)",
+        "--payload", type=int, default=64,
+        help="bytes there; 64: the bench's frames, 64 there and 48 back (default: %(default)s)",
     )  # fmt: skip
 
 
