@@ -17,7 +17,7 @@ LOADS: tuple[Load, ...] = ("idle", "hogs")
 _HOG = (
     "import os, sys\n"
     "from gfm_hil.stopping import end_with_parent\n"
-    "end_with_parent()\n"
+    "end_with_parent(int(sys.argv[2]))\n"
     "os.sched_setaffinity(0, {int(sys.argv[1])})\n"
     "while True:\n"
     "    pass\n"
@@ -30,7 +30,7 @@ def hogs() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
     """Start them, halted; yields a context that lets them go for ``hogs`` and not for ``idle``."""
     started = [
         subprocess.Popen(  # own session: Ctrl-C is the parent's to handle
-            [sys.executable, "-c", _HOG, str(cpu)], start_new_session=True
+            [sys.executable, "-c", _HOG, str(cpu), str(os.getpid())], start_new_session=True
         )
         for cpu in sorted(os.sched_getaffinity(0))
     ]
