@@ -117,10 +117,10 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
+        half = partial(quickest, alone.plants_half, max(RUNS, ticks // _SHORT))
         for number in rounds(plan.rounds, plan.until):
             for k, name in enumerate(names[:: -1 if number % 2 else 1]):
                 link, delay = name
-                half = partial(quickest, alone.plants_half, max(RUNS, ticks // _SHORT))
                 half_ns = half()
                 tell(f"lockstep, {link}", (number + k / len(names)) / plan.rounds)
                 if link == INPROC:

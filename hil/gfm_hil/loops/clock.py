@@ -26,7 +26,7 @@ pause: Any = _pause
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _TIMESPEC = ir.LiteralStructType([_I64, _I64])
 
-_SPINS_A_YIELD = 16
+_SPINS_A_YIELD = 16  # looks in vain, once a peer that delivers by itself is late
 
 #: woken this long before a deadline, the rest is spun: a sleep ends up to this late
 AHEAD_NS = 40_000
