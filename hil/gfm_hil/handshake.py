@@ -1,7 +1,8 @@
 """The start: both sides show what they are about to run, and refuse what does not fit.
 
 Plant: HELLO every 100 ms until answered. Controller: HELLO back. Plant: START with the time of
-tick 0. Messages are JSON; frames begin only after START.
+tick 0. Messages are JSON; frames begin only after START. START is said once: where a link has lost
+it, the plant's first frame that gets through says when tick 0 was.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gfm_hil.errors import PeerLost
+from gfm_hil.frames import FrameError, FrameReader
 from gfm_hil.links import Link
 from gfm_hil.links.base import Side
 from gfm_hil.scenario import Scenario
 from gfm_hil.waiting import await_message
-from gfm_runtime.signals import TABLE_VERSION, table_hash
+from gfm_runtime.signals import NY, TABLE_VERSION, table_hash
 
 _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
@@ -93,6 +97,10 @@ def shake_hands(
                     return Start(start, one_clock)
             elif met:
                 return Start(content["t0"] if one_clock else now + _LEAD_NS, one_clock)
+        elif message is not None and met:
+            tick = _tick(message)
+            if tick is not None:  # it runs: START was lost
+                return Start(now - round(tick * scenario.T_s * 1e9), one_clock)
         if now >= deadline:
             break
         if now >= again_at and not met:
@@ -131,6 +139,14 @@ def _boot() -> str:
         return _BOOT.read_text("ascii").strip()
     except OSError:
         return ""
+
+
+def _tick(message: bytes) -> int | None:
+    """Of a frame of the plant; None if it is none."""
+    try:
+        return FrameReader("y").unpack(message, np.empty(NY))
+    except FrameError:
+        return None
 
 
 def _read(message: bytes) -> dict[str, Any]:

@@ -14,6 +14,7 @@ SCENARIO = """
 title = "served"
 duration = 600.0
 mode = "realtime"
+T_s = 5e-4
 law = "vsg-2-tuned"
 ready_laws = ["vsg-5-tuned", "droop-3-tuned"]
 after_trip = "wait"

@@ -11,12 +11,17 @@ import pytest
 
 from gfm_hil import handshake
 from gfm_hil.errors import PeerLost
+from gfm_hil.frames import FrameWriter
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.can.link import CanLink
+from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.scenario import Scenario
 from gfm_hil.summary import clock_drift
+from gfm_runtime.signals import NU, NY
 
+from .pairs import run_pair
 from .test_links import PATIENT, in_threads
 
 
@@ -113,6 +118,57 @@ def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
     finally:
         link.close()
         controller.close()
+
+
+def test_a_frame_says_that_the_plant_has_started(make, endpoint):
+    """And when, if START was lost; whatever else comes does not."""
+    link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
+    scenario, frames = make(link=PATIENT), FrameWriter("y")
+    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    k, T_ns, y = 7, 100_000, np.ones(NY)
+    spoilt = bytearray(frames.pack(k, 0, 0, y))
+    spoilt[30] ^= 1
+    messages = [frames.pack(k, 0, 0, y), b"GFMHIL " + json.dumps(hello).encode(), bytes(spoilt)]
+    try:
+        for message in [*messages, FrameWriter("u").pack(k, 0, 0, np.ones(NU))]:
+            link.send(message)
+        before = time.monotonic_ns()
+        link.send(frames.pack(k, 0, 0, y))
+        found = shake_hands("controller", controller, scenario, lambda: False, print)
+    finally:
+        link.close()
+        controller.close()
+    assert before - k * T_ns <= found.t0_ns <= time.monotonic_ns() - k * T_ns
+
+
+@pytest.mark.parametrize(
+    ("kind", "end", "options"),
+    [
+        ("shm", ShmLink, {}),
+        ("zmq", ZmqLink, {}),
+        ("zmq", ZmqLink, {"portable": True}),
+        ("can", CanLink, {}),
+    ],
+)
+def test_a_run_does_without_START(kind, end, options, make, tmp_path, monkeypatch):
+    """In lockstep nothing is lost by it."""
+    send = end.send
+    dropped: list[bytes] = []
+
+    def drop(self: Any, message: bytes) -> bool:
+        if b'"start"' not in message:
+            return send(self, message)
+        dropped.append(message)
+        return True
+
+    content = {"law": "vsg-2", "duration": 0.02, "link": PATIENT}
+    as_it_is = run_pair(make(**content), tmp_path / "with", kind, options)
+    monkeypatch.setattr(end, "send", drop)
+    found = run_pair(make(**content), tmp_path / "without", kind, options)
+    assert len(dropped) == 1
+    assert {end[0] for end in found.ends().values()} == {"completed"}
+    for name, column in as_it_is.signals.items():
+        assert found.signals[name].tobytes() == column.tobytes(), name
 
 
 @pytest.mark.parametrize(
