@@ -1,6 +1,6 @@
 """kill -9 and SIGSTOP at any moment: the other side is safe in time, and nothing is left behind.
 
-8 rounds by default; GFMHIL_KILLS=100 for as many as the acceptance test asks for,
+5 rounds by default; GFMHIL_KILLS=100 for as many as the acceptance test asks for,
 GFMHIL_KILLS_SEED for others, and GFMHIL_KILLS_REPORT=file for a line a round: link, mode, who was
 killed, ticks recorded, and the time in s from the last frame of the killed side to the end of the
 other.
@@ -25,7 +25,7 @@ from gfm_hil.links.base import SIDES
 
 from .test_processes import end, has_run, sides_of, signals, summary, wait_for, write
 
-ROUNDS = int(os.environ.get("GFMHIL_KILLS", "8"))
+ROUNDS = int(os.environ.get("GFMHIL_KILLS", "5"))
 SEED = int(os.environ.get("GFMHIL_KILLS_SEED", "4"))
 REPORT = os.environ.get("GFMHIL_KILLS_REPORT")
 PEER_TIMEOUT_S, HOLD = 0.5, 2000
