@@ -44,7 +44,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write(name: str, link: dict[str, Any], **content: Any) -> str:
-    text = {"title": "test", "duration": 0.3, "events": EVENTS, "link": {**LINK, **link}, **content}
+    text = {"title": "test", "duration": 0.1, "events": EVENTS, "link": {**LINK, **link}, **content}
     Path(name).write_text(toml_text(text))
     return name
 
@@ -70,7 +70,7 @@ def run_while(scenario: str, ticks: int, meanwhile: Callable[[], None]) -> dict[
 
 
 def assert_as_in_process(scenario: str, summary: dict[str, Any]) -> None:
-    assert (summary["status"], summary["ticks"]) == ("completed", 3000), summary
+    assert (summary["status"], summary["ticks"]) == ("completed", 1000), summary
     found = load_scenario(scenario)
     expected = quantised_run(found, Path(), found.link.options.get("every", 1))
     with np.load("out/signals.npz") as signals:

@@ -117,6 +117,30 @@ def test_frames_lost_while_the_controller_stood_still_are_not_the_links() -> Non
     assert found(timing) == ["stalled host"] * 6
 
 
+def test_answer_that_was_held_up_with_its_sender_is_not_the_links() -> None:
+    """The controller stands still once it has sent u, before the link's own thread has done so."""
+    timing = good()
+    back = timing["plant_scheduled"][9] + 80_000
+    for k in (8, 9):
+        timing["controller_received"][k] = back + 900 * (k - 8)
+        timing["controller_sent"][k] = back + 900 * (k - 8) + 800
+    timing["controller_stall"][8] = back - timing["controller_sent"][7]
+    timing["plant_received"][[7, 8]] = -1
+    assert found(timing) == ["stalled host"] * 2
+
+
+def test_wait_that_was_longer_than_the_gap_in_it() -> None:
+    """y comes 50 µs after a gap of 600 µs: of nine ticks all were lost by the gap."""
+    timing = good()
+    back = timing["plant_scheduled"][7] + 750_000
+    for k in range(7, 16):
+        timing["controller_received"][k] = max(back, timing["plant_sent"][k] + 15_000) + 900 * k
+        timing["controller_sent"][k] = timing["controller_received"][k] + 800
+    timing["controller_stall"][7] = 600_000
+    timing["plant_received"][7:15] = -1
+    assert found(timing) == ["stalled host"] * 8
+
+
 def test_plant_that_is_behind_does_not_blame_its_timer() -> None:
     timing = good()
     timing["plant_stall"][7] = 2 * T

@@ -87,19 +87,25 @@ def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
 
 
 def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How long the controller did not look between two times of each tick, ns.
+    """How long the controller may not have looked between two times of each tick, ns.
 
-    Its gap is recorded with the frame that it took next, whichever that was.
+    Its longest gap since the frame before is recorded with the frame that it took next, whichever
+    that was. Where between the two it lay is not known: it counts as far as it fits.
     """
     heard = timing["controller_received"]
     gap = timing.get("controller_stall", np.zeros(len(heard), np.int64))
+    away = np.zeros(len(heard), np.int64)
     taken = np.flatnonzero(heard >= 0)
     if not len(taken):
-        return np.zeros(len(heard), np.int64)
+        return away
     back = heard[taken]  # ascending: frames arrive in order
-    after = np.minimum(np.searchsorted(back, begin, side="right"), len(back) - 1)
-    away = back[after] - gap[taken][after]
-    return (np.minimum(back[after], end) - np.maximum(away, begin)).clip(min=0)
+    since = np.concatenate([[0], back[:-1]])
+    first = np.searchsorted(back, begin, side="right")
+    for wait in (first, first + 1):  # the one that the tick meets, and the one after its y
+        k = np.minimum(wait, len(back) - 1)
+        fits = np.minimum(back[k], end) - np.maximum(since[k], begin)
+        away += np.where(wait < len(back), np.minimum(gap[taken][k], fits).clip(min=0), 0)
+    return away
 
 
 def counts(causes: NDArray[np.int64]) -> dict[str, int]:

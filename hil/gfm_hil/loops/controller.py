@@ -50,12 +50,14 @@ def controller_ticks(
     """
     r = loop[0]
     sequence, frame, message = out
+    sent = 0  # when the last answer left, in this call
     while True:
         if not r.pending:
             before = r.tick
             why = _next_frame(
-                receive, patient, handle, spins, into, reader, r, told, ctl, y, times, len(rows)
-            )
+                receive, patient, handle, spins, into, reader, r, told, ctl, y, times, len(rows),
+                sent,
+            )  # fmt: skip
             if why >= 0:
                 return why
             if r.tick <= before:  # the plant asks again: our answer was lost
@@ -74,7 +76,7 @@ def controller_ticks(
         times[k, 2] = now_ns()
         pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
         send(handle, message)
-        times[k, 3] = now_ns()
+        times[k, 3] = sent = now_ns()
         if r.realtime and spins == 0:
             give_way()  # to the link's own thread: a sleep takes 9 µs before it leaves
         record_controller(rows[k], ctl, est)
@@ -89,16 +91,20 @@ def controller_ticks(
 
 @inlined
 def _next_frame(
-    receive, patient, handle, spins, into, reader, r, told, ctl, y, times, ticks
+    receive, patient, handle, spins, into, reader, r, told, ctl, y, times, ticks, sent
 ):  # fmt: skip
-    """Wait for a good frame of the plant: -1, its tick in ``r``; or why to come back."""
+    """Wait for a good frame of the plant: -1, its tick in ``r``; or why to come back.
+
+    What the link's own thread took after the last answer was ``sent`` (0: there was none) is a
+    gap between two looks like any other.
+    """
     got, got_bytes = into
     if told[RING] != r.bell:
         r.bell = told[RING]
         return BELL
-    gap = 0
     slept = False
     before = now_ns()
+    gap = before - sent if r.realtime and sent > 0 else 0
     if r.realtime and r.done > 0 and told[STOP] == 0:
         wake = min(r.t0 + (r.tick + 1) * r.T + int(r.phase) - AHEAD_NS, before + r.T)
         if wake > before:
