@@ -2,7 +2,7 @@
 
 Lockstep: ticks a second, beside what the plant's arithmetic alone allows. Real time: ticks without
 a fresh u, why, and how many a loop that only paces would have lost on the same machine right
-before.
+before and after.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Plan:
 
 @dataclass
 class _Run:
-    """What one run in real time showed, and the bare loop before it."""
+    """What one run in real time showed, and the bare loop before and after it."""
 
     timing: Timing
     begin: int  # tick from which on it counts
@@ -170,11 +170,14 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
             for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
                 share = (number + k / len(cells)) / plan.rounds
                 tell(f"real time, {cell.link}, {cell.load}", share)
-                with load_is(cell.load):
-                    late = pace_both(two, round(T_S * 1e9), HYBRID, plan.realtime_s)
+
+                def pace(load: Load = cell.load) -> NDArray[np.int64]:
+                    with load_is(load):
+                        return pace_both(two, round(T_S * 1e9), HYBRID, plan.realtime_s / 2)
+
                 scenario = _scenario(cell.link, "realtime", plan.realtime_s)
                 beside = partial(load_is, cell.load) if cell.load != "idle" else None
-                cell.runs.append(_observe(scenario, place, late, beside))
+                cell.runs.append(_observe(scenario, place, pace, beside))
     remarks = [
         f"{cell.link}, real time, {cell.load}: a run ended early: {run.ended}"
         for cell in cells
@@ -189,11 +192,12 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
 def _observe(
     scenario: Scenario,
     place: Path,
-    late: NDArray[np.int64],
+    pace: Callable[[], NDArray[np.int64]],
     beside: Callable[[], AbstractContextManager[None]] | None,
 ) -> _Run:
-    """One run in real time; ``beside`` begins with its first ticks, not while it starts."""
-    begin = 0
+    """One run in real time between two halves of a bare loop, so that a host that slowly takes
+    more or less is in both; ``beside`` begins with the run's first ticks, not while it starts."""
+    begin, before = 0, pace()
     with ExitStack() as during:
 
         def progress(ticks: int, misses: int) -> None:
@@ -203,7 +207,7 @@ def _observe(
                 begin = ticks + _SETTLE
 
         timing, scheduling, ended = _run(scenario, place, progress)
-    return _Run(timing, begin, scheduling, ended, late)
+    return _Run(timing, begin, scheduling, ended, np.concatenate([before, pace()], axis=1))
 
 
 def _row(cell: _Cell) -> dict[str, Any]:

@@ -52,8 +52,8 @@ _SECTIONS = {
     "misses": (
         "Real time",
         "The product at 10 kHz: ticks whose answer had not come by the next deadline, and why. The "
-        "mark is what a loop that does nothing but pace lost on the same processors right before: "
-        "what no link can win back.",
+        "mark is what a loop that does nothing but pace lost on the same processors right before "
+        "and after: what no link can win back.",
     ),
     "jitter": (
         "Pacing",
