@@ -52,7 +52,7 @@ class Kernel:
         lines = [
             *(f"export {name}={shlex.quote(value)}" for name, value in inside.items()),
             f"cd {shlex.quote(str(source))}",
-            shlex.join([*test, "--basetemp", "/dev/shm/inside", "--durations=0"])
+            shlex.join([*test, "--basetemp", "/dev/shm/inside"])
             + f" >{shlex.quote(str(self._log))} 2>&1",
         ]
         job.write_text("\n".join(lines) + "\n")
