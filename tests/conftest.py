@@ -4,6 +4,8 @@ import os
 
 from hypothesis import settings
 
+pytest_plugins = ["tests.attacks"]
+
 # One thread in BLAS: small matrices, and both processors are busy (see gfm_hil.blas).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
