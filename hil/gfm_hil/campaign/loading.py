@@ -51,7 +51,7 @@ def load_campaign(name: str) -> Campaign:
         raise UserError("\n".join(f"{path}: {_line(e)}" for e in problem.errors())) from None
     base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
     content = base.model_dump(mode="json")
-    content.update(compare=[], expect="completed")
+    content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
     _check_paths(path, file, content)
     for target, value in file.set.items():
         put(content, target, value)
