@@ -47,7 +47,9 @@ class Link(_Model):
         0.002, gt=0, le=60, description="lockstep: silence after which the plant sends y[k] again"
     )
     impairment: Impairment | None = Field(None, description="faults on purpose")
-    start_timeout_s: float = Field(60.0, gt=0, description="how long to wait for it at the start")
+    start_timeout_s: float = Field(
+        60.0, gt=0, le=604800, description="how long to wait for it at the start"
+    )
 
     @model_validator(mode="after")
     def _known(self) -> Link:
@@ -95,7 +97,9 @@ class References(_Model):
 class LatePolicy(_Model):
     """Real time: what to do about frames that are not there at their deadline."""
 
-    hold: int = Field(200, ge=0, description="ticks in a row to hold the last value, then SAFE")
+    hold: int = Field(
+        200, ge=0, le=10**9, description="ticks in a row to hold the last value, then SAFE"
+    )
     extrapolate: int = Field(
         0,
         ge=0,
@@ -152,7 +156,7 @@ class Scenario(_Model):
     link: Link = Link()
     late_policy: LatePolicy = LatePolicy()
     plant: Plant = Plant()
-    events: list[Event] = Field(default_factory=list)
+    events: list[Event] = Field(default_factory=list, max_length=10_000)
 
     @property
     def ticks(self) -> int:
