@@ -37,6 +37,7 @@ MODULES = {
     "doctor": "doctor",
     "scenarios": "scenarios",
     "keys": "keys",
+    "deploy": "deploy",
     "controller": "sides",
     "plant": "sides",
 }
