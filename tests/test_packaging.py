@@ -1,14 +1,22 @@
 """The packages: who imports whom, what a wheel holds, what no file may hold."""
 
 import ast
+import json
+import os
 import re
 import subprocess
 import sys
+import tomllib
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from gfm_hil.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = {
@@ -108,6 +116,91 @@ def test_no_machine_paths() -> None:
     assert not wrong
 
 
+def committed(folder: str) -> set[str]:
+    """The files of a folder that git knows."""
+    done = subprocess.run(
+        ["git", "ls-files", folder], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.split())
+
+
+@pytest.mark.attack(
+    "10.6", "deploying from a wheel", "deploy/ was not in it: units and scripts only by a checkout"
+)
+def test_deploy_writes_what_is_committed_and_keeps_what_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], attack_now: Callable[[str], None]
+) -> None:
+    out = tmp_path / "deploy"
+    assert main(["deploy", "--out", str(out)]) == 0
+    written = {p.relative_to(tmp_path).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert written == committed("deploy")
+    for name in written:
+        assert (tmp_path / name).read_bytes() == (ROOT / name).read_bytes()
+    assert os.access(out / "tune-realtime", os.X_OK)
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "compose.yaml").write_text("mine")
+    for place in (mine, mine / "compose.yaml"):
+        assert main(["deploy", "--out", str(place)]) == 2
+    assert [p.name for p in mine.iterdir()] == ["compose.yaml"]
+    assert capsys.readouterr().err.count("is not an empty folder") == 2
+    attack_now(f"`gfmhil deploy --out DIR` writes {len(written)} files and replaces none")
+
+
+def pins(name: str) -> dict[str, str]:
+    """Package to the lines that follow it in a lock file; each package once a Python version."""
+    text = (ROOT / "requirements" / name).read_text(encoding="utf-8")
+    return {k + rest.split("\n")[0]: rest for k, rest in re.findall(LOCKED, text)}
+
+
+LOCKED = re.compile(r"^([a-z0-9][a-z0-9._-]*)(==[^ ]+(?:.|\n(?=    --))*)", re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("name", "extras"),
+    [("ci.txt", ("test", "docs")), ("container.txt", ("can", "modbus", "scope", "metrics"))],
+)
+@pytest.mark.attack(
+    "10.7",
+    "a package of the same version but other content, in CI and in the image",
+    "it was installed: no version was fixed and no hash checked",
+)
+def test_the_locks_fit_the_project_and_every_line_has_hashes(
+    name: str, extras: tuple[str, ...], attack_now: Callable[[str], None]
+) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = [*project["dependencies"], "hatchling>=1.27"]
+    wanted += [line for extra in extras for line in project["optional-dependencies"][extra]]
+    locked: dict[str, set[str]] = {}
+    lines = pins(name)
+    for line, rest in lines.items():
+        assert "--hash=sha256:" in rest, line
+        requirement = Requirement(line.rstrip(" \\"))
+        versions = locked.setdefault(canonicalize_name(requirement.name), set())
+        versions.add(str(requirement.specifier).removeprefix("=="))
+    for line in wanted:
+        requirement = Requirement(line)
+        found = locked[canonicalize_name(requirement.name)]
+        assert all(requirement.specifier.contains(version) for version in found), line
+    assert "--only-binary :all:" in (ROOT / "requirements" / name).read_text(encoding="utf-8")
+    attack_now(f"refused by pip: {len(lines)} packages of {name} carry their hashes")
+
+
+def test_the_bill_of_materials_names_versions_and_licences(tmp_path: Path) -> None:
+    pytest.importorskip("cyclonedx_py")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    command = [ROOT / ".ci" / "sbom", tmp_path / "sbom.json", sys.executable]
+    done = subprocess.run(command, env={**os.environ, "PATH": path}, check=False,
+                          capture_output=True, text=True)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    bill = json.loads((tmp_path / "sbom.json").read_text(encoding="utf-8"))
+    assert (bill["bomFormat"], bill["metadata"]["component"]["name"]) == ("CycloneDX", "gfmhil")
+    parts = {part["name"]: part for part in bill["components"]}
+    for name in ("numpy", "numba", "pyzmq"):
+        assert parts[name]["version"] == version(name)
+        assert parts[name]["licenses"]
+
+
 def test_wheel_holds_packages_and_scenarios(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -124,6 +217,8 @@ def test_wheel_holds_packages_and_scenarios(tmp_path: Path) -> None:
         f"gfm_hil/{path.relative_to(ROOT).as_posix()}"
         for path in (ROOT / "scenarios").rglob("*.toml")
     }
+    wanted |= {f"gfm_hil/{name}" for name in committed("deploy")}
+    assert {name for name in held if name.startswith("gfm_hil/deploy/")} <= wanted  # and no key
     assert wanted - held == set()
     tops = {name.split("/")[0] for name in held}
     assert {top for top in tops if not top.endswith(".dist-info")} <= set(FOLDERS)

@@ -30,6 +30,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "law-keys": scenario_pages.law_tables,
     "law-mistakes": outputs.mistakes,
     "scenario-keys": scenario_pages.scenario_tables,
+    "end-reasons": scenario_pages.end_reasons,
     "scenario-mistakes": outputs.scenario_mistakes,
     "event-keys": scenario_pages.event_tables,
     "command": outputs.command,

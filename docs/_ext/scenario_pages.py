@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from gfm_hil import events, scenario
+from gfm_hil.expectation import END_REASONS
 from gfm_hil.links.impaired import Impairment
 from gfm_plant import options
 from gfm_runtime import lawfile
@@ -210,6 +211,15 @@ def scenario_tables() -> str:
     tables: tuple[tuple[str, type[BaseModel]], ...] = (*TABLES, TRIP)
     for title, model in tables:
         lines += [f"**{title if title[0] != '[' else f'`{title}`'}**", "", *table(model), ""]
+    return "\n".join(lines)
+
+
+def end_reasons() -> str:
+    """The names that ``expect_reason`` may give, by status."""
+    lines = ["| `expect` | `expect_reason` |", "|---|---|"]
+    for status, names in END_REASONS.items():
+        if names:
+            lines.append(f"| `{status}` | {', '.join(f'`{name}`' for name in names)} |")
     return "\n".join(lines)
 
 

@@ -38,7 +38,7 @@ def beside(
     """
     if port:
         _check_free(command, port)
-    argv = [sys.executable, "-P", "-m", "gfm_hil", command, str(folder), "--wait"]
+    argv = [sys.executable, "-P", "-m", "gfm_hil", command, str(folder.absolute()), "--wait"]
     argv += ["--part", str(os.getpid()), *([] if port is None else ["--port", str(port)])]
     # own session: the first Ctrl-C is for the run
     process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, start_new_session=True)

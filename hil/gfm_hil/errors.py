@@ -7,6 +7,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from gfm_runtime.errors import printable
+
 
 class UserError(Exception):
     """Wrong input or a bench that cannot start; the message names the field, value and remedy."""
@@ -28,7 +30,7 @@ def lines(problem: ValidationError) -> list[str]:
 
 
 def _line(error: Any) -> str:
-    path = ".".join(str(part) for part in error["loc"])
+    path = printable(".".join(str(part) for part in error["loc"]))
     text = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{path}: {text}" if path else text

@@ -21,8 +21,8 @@ class _Event(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    t: float | None = Field(None, ge=0, description="s")
-    tick: int | None = Field(None, ge=0)
+    t: float | None = Field(None, ge=0, le=86400, description="s")
+    tick: int | None = Field(None, ge=0, le=86_400_000_000)  # 86400 s of 1 us
 
     @model_validator(mode="after")
     def _one_time(self) -> _Event:
@@ -141,8 +141,8 @@ class GridImpedance(_Event):
     """The line becomes ``L_g`` and ``R_g`` times its nominal elements."""
 
     type: Literal["grid-impedance"]
-    L_g: float = Field(gt=0)
-    R_g: float = Field(ge=0)
+    L_g: float = Field(gt=0, le=1e12)
+    R_g: float = Field(ge=0, le=1e12)
 
     def label(self) -> str:
         return f"line L × {self.L_g:g}, R × {self.R_g:g}"

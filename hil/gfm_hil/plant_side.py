@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gfm_hil.bench import Bench
+from gfm_hil.expectation import CONTROLLER_GONE
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_hil.recording import Part, record_command, record_sample
@@ -107,7 +108,7 @@ class _Plant:
                 self.advance(tick, True)
                 return
         if not self.stopped():
-            self.timeline.end("safe", "the controller's process is gone", tick)
+            self.timeline.end("safe", CONTROLLER_GONE, tick)
 
     def realtime(self, tick: int, deadline: int) -> None:
         times = self.part.times[tick]
@@ -136,7 +137,7 @@ class _Plant:
         while time.monotonic_ns() < until:
             os.sched_yield()
         if self.late * self.T_ns >= self.patience_ns:
-            self.timeline.end("safe", "the controller's process is gone", tick)
+            self.timeline.end("safe", CONTROLLER_GONE, tick)
         elif self.late > self.bench.scenario.late_policy.hold and not self.waits:
             self.timeline.end("safe", NO_FRESH_U, tick)
 

@@ -96,10 +96,11 @@ class Processes:
                 compile_side(side, bench, Part.create(place, side, 1))
 
     def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
-        scenario = str(self.folder / "scenario.toml")
+        folder = self.folder.absolute()  # a name such as "--" must not look like an option
+        scenario = str(folder / "scenario.toml")
         # -P: a file of the operator's folder must not stand in for a module
         command = [sys.executable, "-P", "-m", "gfm_hil", side, scenario]
-        command += ["--endpoint", endpoint, "--out", str(self.folder), "--quiet"]
+        command += ["--endpoint", endpoint, "--out", str(folder), "--quiet"]
         command += ["--part", str(os.getpid())]
         if side == "controller" and self.controller_command:
             command = [

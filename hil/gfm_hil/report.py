@@ -18,6 +18,7 @@ border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums} td.n,th.n{tex
 img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
 .status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
 .completed{background:#00734f} .tripped,.safe{background:#b34500}
+.unmet{color:#b34500}
 pre{background:#f6f6f6;padding:1rem;overflow-x:auto;font-size:13px}
 """
 
@@ -87,6 +88,9 @@ def write_report(
         facts.append(("frames refused or lost", str(summary["faults"])))
     rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
     images = "".join(f'<img alt="{p.stem}" src="{_inline(p)}">' for p in pictures)
+    unmet = "".join(
+        f'<p class="unmet">not as expected: {html.escape(part)}</p>' for part in summary["unmet"]
+    )
     resolved = html.escape((folder / "scenario.toml").read_text("utf-8"))
     path = folder / "report.html"
     path.write_text(
@@ -95,6 +99,7 @@ def write_report(
 <title>{html.escape(scenario.title)}</title><style>{_STYLE}</style>
 <h1>{html.escape(scenario.title)}</h1>
 <p><span class="status {status}">{status}</span> {html.escape(summary["reason"])}</p>
+{unmet}
 <p>{html.escape(scenario.description)}</p>
 <table>{rows}</table>
 {images}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from gfm_hil.events import GridImpedance, apply_grid_event
 from gfm_hil.scenario_model import INPROC, LatePolicy, Link, References, Scenario
 from gfm_plant import make_plant
 from gfm_runtime import LawError, discretise, load_law
+from gfm_runtime.toml_file import read_toml
 
 __all__ = [
     "LatePolicy",
@@ -37,19 +37,35 @@ def find_scenario(name: str) -> Path:
     Raises:
         UserError: neither exists.
     """
-    given = Path(name)
-    if given.is_file():
+    return find_file("scenario", name, "*.toml")
+
+
+def find_file(kind: str, name: str, pattern: str) -> Path:
+    """The file of that path, or the shipped one of that name; ``kind`` is for the message.
+
+    Raises:
+        UserError: neither exists.
+    """
+    given, shipped = Path(name), _shipped(pattern)
+    try:
+        is_file, exists = given.is_file(), given.exists()
+    except OSError as problem:  # such as a name of 300 characters
+        raise UserError(f"{kind} {name}: {problem.strerror}") from None
+    if is_file:
         return given
-    for folder in SCENARIO_FOLDERS:
-        for candidate in (folder / given.name, folder / f"{given.name}.toml"):
-            if candidate.is_file():
-                return candidate
-    raise UserError(f"scenario {name}: no such file; shipped are {shipped_scenarios()}")
+    if given.name.removesuffix(".toml") in shipped:
+        return shipped[given.name.removesuffix(".toml")]
+    what = "is not a regular file" if exists else "no such file"
+    raise UserError(f"{kind} {name}: {what}; shipped are {sorted(shipped)}")
+
+
+def _shipped(pattern: str) -> dict[str, Path]:
+    return {p.stem: p for folder in SCENARIO_FOLDERS for p in folder.glob(pattern)}
 
 
 def shipped_scenarios() -> list[str]:
     """Names of the scenarios that come with gfmhil."""
-    return sorted({p.stem for folder in SCENARIO_FOLDERS for p in folder.glob("*.toml")})
+    return sorted(_shipped("*.toml"))
 
 
 def load_scenario(name: str, **changed: Any) -> Scenario:
@@ -66,8 +82,8 @@ def load_scenario(name: str, **changed: Any) -> Scenario:
     """
     path = find_scenario(name)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
+        content = read_toml(path)
+    except ValueError as problem:
         raise UserError(f"{path}: {problem}") from None
     link, chosen = content.get("link"), changed.get("link__type")
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
@@ -107,14 +123,15 @@ def check_scenario(content: dict[str, Any], where: str) -> Scenario:
 def _try_plant(scenario: Scenario) -> None:
     """Make the plant and every line that its events give it, which may be too fast to resolve."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
+    if scenario.plant.converter.endswith(".toml"):
+        try:
+            read_toml(scenario.plant.converter)
+        except ValueError as problem:
+            raise UserError(f"{converter}: {problem}") from None
     try:
         par, st = make_plant(scenario.plant, scenario.T_s)
     except ValidationError as problem:
         raise UserError("; ".join(f"{converter}: {line}" for line in lines(problem))) from None
-    except OSError as problem:
-        raise UserError(f"{converter}: {problem.strerror}") from None
-    except tomllib.TOMLDecodeError as problem:
-        raise UserError(f"{converter}: not TOML: {problem}") from None
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):

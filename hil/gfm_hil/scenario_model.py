@@ -16,6 +16,7 @@ from gfm_hil.events import (
     Reset,
     check_reference,
 )
+from gfm_hil.expectation import check_expectation
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired.settings import Impairment
 from gfm_plant import Plant, load_converter
@@ -46,7 +47,9 @@ class Link(_Model):
         0.002, gt=0, le=60, description="lockstep: silence after which the plant sends y[k] again"
     )
     impairment: Impairment | None = Field(None, description="faults on purpose")
-    start_timeout_s: float = Field(60.0, gt=0, description="how long to wait for it at the start")
+    start_timeout_s: float = Field(
+        60.0, gt=0, le=604800, description="how long to wait for it at the start"
+    )
 
     @model_validator(mode="after")
     def _known(self) -> Link:
@@ -94,7 +97,9 @@ class References(_Model):
 class LatePolicy(_Model):
     """Real time: what to do about frames that are not there at their deadline."""
 
-    hold: int = Field(200, ge=0, description="ticks in a row to hold the last value, then SAFE")
+    hold: int = Field(
+        200, ge=0, le=10**9, description="ticks in a row to hold the last value, then SAFE"
+    )
     extrapolate: int = Field(
         0,
         ge=0,
@@ -124,6 +129,14 @@ class Scenario(_Model):
     expect: Literal["completed", "tripped", "safe"] = Field(
         "completed", description="status with which the run counts as passed (exit code 0)"
     )
+    expect_reason: str | None = Field(
+        None,
+        description="name of the trip or safe reason, which must be the cause of the end; any if "
+        "none",
+    )
+    expect_after: float | None = Field(
+        None, gt=0, description="s; the trip or safe state must not come before; any time if none"
+    )
     after_trip: Literal["end", "wait"] = Field(
         "end",
         description="wait: a trip or a safe state does not end the run; the plant stays blocked "
@@ -143,7 +156,7 @@ class Scenario(_Model):
     link: Link = Link()
     late_policy: LatePolicy = LatePolicy()
     plant: Plant = Plant()
-    events: list[Event] = Field(default_factory=list)
+    events: list[Event] = Field(default_factory=list, max_length=10_000)
 
     @property
     def ticks(self) -> int:
@@ -162,7 +175,8 @@ class Scenario(_Model):
     def digest(self) -> str:
         """Hash over what both sides must agree on: scenario, signal table, and what is in the
         law and converter files, wherever each machine keeps them."""
-        about = {"link", "title", "description", "expect", "compare"}
+        about = {"link", "title", "description", "compare"}
+        about |= {"expect", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
@@ -178,7 +192,7 @@ class Scenario(_Model):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:
-        problems = []
+        problems = check_expectation(self)
         if self.ticks < 1:
             problems.append(f"duration = {self.duration:g} s: not one tick of T_s = {self.T_s:g} s")
         for k, event in enumerate(self.events):

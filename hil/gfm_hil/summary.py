@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.expectation import unmet
 from gfm_hil.metrics import event_metrics
 from gfm_hil.scenario import Scenario
 from gfm_hil.timeline import Outcome
@@ -51,6 +52,7 @@ def summarise(
         "status": outcome.status,
         "reason": outcome.reason,
         "expected": scenario.expect,
+        "unmet": unmet(scenario, outcome, log, done),
         "laws": [scenario.law, *[e["law"] for e in changes]],
         "link": scenario.link.type,
         "mode": scenario.mode,

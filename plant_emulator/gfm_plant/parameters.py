@@ -8,12 +8,22 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gfm_plant.bases import Bases
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+LEAST, MOST = 1e-12, 1e12
+"""Of any quantity, in SI units or p.u.; beyond them products overflow before they are checked."""
+
+
+def _not_tiny(value: float) -> float:
+    if value < LEAST:
+        raise ValueError(f"{value:g}: must be at least {LEAST:g}")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, le=MOST), AfterValidator(_not_tiny)]
+NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 
 Element = Literal["L_f", "R_f", "C_f", "L_g", "R_g", "C_dc"]
 
@@ -58,7 +68,7 @@ class ConverterParameters(BaseModel):
                 nominal, since the controller and its references know only those.
 
         Raises:
-            ValueError: If a factor names no element, or makes L or C <= 0 or R < 0.
+            ValueError: As ``check_factors``.
         """
         factors = factors or {}
         check_factors(factors)
@@ -70,12 +80,14 @@ class ConverterParameters(BaseModel):
 
 
 def check_factors(factors: Mapping[Element, float]) -> None:
-    """Raise ValueError if a factor names no element, or makes L or C <= 0 or R < 0."""
+    """Raise ValueError if a factor names no element, makes L or C <= 0 or R < 0, or is absurd."""
     for name, factor in factors.items():
         if name not in ELEMENTS:
             raise ValueError(f"factors.{name}: must be one of {', '.join(ELEMENTS)}")
         if not (factor > 0 or (factor == 0 and ELEMENTS[name] == "R")):
             raise ValueError(f"factors.{name} = {factor}: must be > 0 (>= 0 for a resistor)")
+        if factor and not LEAST <= factor <= MOST:
+            raise ValueError(f"factors.{name} = {factor}: must lie in [{LEAST:g}, {MOST:g}]")
 
 
 def load_converter(name_or_path: str | Path) -> ConverterParameters:

@@ -6,7 +6,6 @@ and the same checks. ``docs/law-files.md`` shows one line by line.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -25,10 +24,11 @@ from pydantic_core import PydanticCustomError
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
-from gfm_runtime.errors import LawError
+from gfm_runtime.errors import LawError, printable
 from gfm_runtime.expressions import evaluate
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.signals import U_NAMES
+from gfm_runtime.toml_file import parse_toml, read_text
 
 
 def _number(value: Any) -> float | str:
@@ -254,21 +254,24 @@ def parse_law(text: str, where: str = "law file") -> LawFile:
         LawError: every mistake found, each with its path in the file.
     """
     try:
-        return LawFile.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as problem:
-        raise LawError(where, f"not TOML: {problem}") from None
+        return LawFile.model_validate(parse_toml(text))
     except ValidationError as problem:
         raise LawError(where, "; ".join(_lines(problem.errors()))) from None
+    except ValueError as problem:
+        raise LawError(where, str(problem)) from None
 
 
 def read_law_file(path: str | Path) -> LawFile:
     """Read a law file; errors as ``parse_law``, and LawError for a file that cannot be read."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as problem:
-        raise LawError(f"law file {path}", f"cannot be read: {problem}") from None
+        text = read_text(path)
+    except ValueError as problem:
+        raise LawError(f"law file {path}", str(problem)) from None
     return parse_law(text, f"law file {path}")
 
 
 def _lines(errors: list[Any]) -> list[str]:
-    return [f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in errors]
+    return [
+        f"{printable('.'.join(map(str, e['loc'])))}: {e['msg']} (got {e['input']!r:.200})"
+        for e in errors
+    ]

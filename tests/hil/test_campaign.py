@@ -353,3 +353,24 @@ def test_wrong_options(
 def test_unknown_campaign_names_those_that_ship() -> None:
     with pytest.raises(UserError, match=r"no such file; shipped are .*'rig_mimo_gfm'"):
         load_campaign("rig")
+
+
+@pytest.mark.attack(
+    "9.5", "a campaign whose checks take seconds", "not a word on the terminal until they end"
+)
+def test_checks_that_take_long_show_how_far_they_are(
+    file: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    attack_now: Callable[[str], None],
+) -> None:
+    path, seen = str(file()), []
+    load_campaign(path, lambda done, of: seen.append((done, of)))
+    assert seen == [(k, 18) for k in range(18)]  # 4 times 2 ends, 10 runs
+    monkeypatch.setattr("gfm_hil.cli.campaign._PATIENCE_S", 0.0)
+    wrong = [path, "--only", "10"]
+    main(["campaign", *wrong])
+    assert capsys.readouterr().err.splitlines()[0] == "checking the runs: 0 of 18 done …"
+    main(["campaign", *wrong, "--quiet"])
+    assert "checking" not in capsys.readouterr().err
+    attack_now(f"after a second a bar or a line says how many of the {len(seen)} checks are done")

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import copy
-import tomllib
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from gfm_hil.campaign.draw import Distribution
 from gfm_hil.campaign.paths import put
 from gfm_hil.campaign.spec import Campaign, CampaignFile
 from gfm_hil.errors import UserError
-from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario
+from gfm_hil.scenario import check_scenario, find_file, load_scenario
 from gfm_plant import make_plant
+from gfm_runtime.errors import printable
+from gfm_runtime.toml_file import parse_toml, read_text
 
 # what a campaign decides itself; [set] may fix the last two
 _OWN = ("law", "seed", "mode", "link", "compare", "duration", "T_s")
@@ -27,31 +31,30 @@ def find_campaign(name: str) -> Path:
     Raises:
         UserError: neither exists.
     """
-    if Path(name).is_file():
-        return Path(name)
-    shipped = {p.stem: p for f in SCENARIO_FOLDERS for p in (f / "campaigns").glob("*.toml")}
-    if name.removesuffix(".toml") in shipped:
-        return shipped[name.removesuffix(".toml")]
-    raise UserError(f"campaign {name}: no such file; shipped are {sorted(shipped)}")
+    return find_file("campaign", name, "campaigns/*.toml")
 
 
-def load_campaign(name: str) -> Campaign:
+def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of: None) -> Campaign:
     """Read and check a campaign, its runs included.
+
+    Args:
+        name: path or shipped name.
+        tell: told the checks done and how many there are, as they go on; there may be thousands.
 
     Raises:
         UserError: one line a mistake, each with its path, the value and what is allowed.
     """
     path = find_campaign(name)
     try:
-        text = path.read_text(encoding="utf-8")
-        file = CampaignFile.model_validate(tomllib.loads(text))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
-        raise UserError(f"{path}: {problem}") from None
+        text = read_text(path)
+        file = CampaignFile.model_validate(parse_toml(text))
     except ValidationError as problem:
         raise UserError("\n".join(f"{path}: {_line(e)}" for e in problem.errors())) from None
+    except ValueError as problem:
+        raise UserError(f"{path}: {problem}") from None
     base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
     content = base.model_dump(mode="json")
-    content.update(compare=[], expect="completed")
+    content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
     _check_paths(path, file, content)
     for target, value in file.set.items():
         put(content, target, value)
@@ -59,8 +62,10 @@ def load_campaign(name: str) -> Campaign:
     for label, law in laws.items():
         check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
     campaign = Campaign(path.stem, text, file, content, laws)
-    _check_ends(path, campaign)
-    _check_runs(path, campaign)
+    checks = [*_end_checks(path, campaign), *_run_checks(path, campaign)]
+    for k, check in enumerate(checks):
+        tell(k, len(checks))
+        check()
     return campaign
 
 
@@ -93,20 +98,24 @@ def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> Non
         raise UserError("\n".join(f"{path}: {p}" for p in problems))
 
 
-def _check_ends(path: Path, campaign: Campaign) -> None:
+def _end_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
     """Try every distribution's extremes, one at a time, on the scenario as it is."""
+
+    def check(k: int, d: Distribution, value: Any) -> None:
+        content = copy.deepcopy(campaign.base)
+        for target in d.paths():
+            put(content, target, value)
+        check_scenario(content, f"{path}: draw.{k}, {d.path} = {value}")
+
     for k, d in enumerate(campaign.file.draw):
-        for value in d.ends():
-            content = copy.deepcopy(campaign.base)
-            for target in d.paths():
-                put(content, target, value)
-            check_scenario(content, f"{path}: draw.{k}, {d.path} = {value}")
+        yield from (partial(check, k, d, value) for value in d.ends())
 
 
-def _check_runs(path: Path, campaign: Campaign) -> None:
+def _run_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
     """Make the runs' plants: what fails only in combination shows before anything starts."""
     law = campaign.file.laws[0]
-    for run in range(min(campaign.file.runs, _TRIED)):
+
+    def check(run: int) -> None:
         try:
             scenario, _ = campaign.scenario(run, law)
             make_plant(scenario.plant, scenario.T_s)
@@ -114,9 +123,11 @@ def _check_runs(path: Path, campaign: Campaign) -> None:
             check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
             raise
 
+    yield from (partial(check, run) for run in range(min(campaign.file.runs, _TRIED)))
+
 
 def _line(error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"])
+    where = printable(".".join(str(part) for part in error["loc"]))
     text = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{where}: {text}"

@@ -14,6 +14,7 @@ from rich.table import Table
 from gfm_hil.campaign.axes import Axis
 from gfm_hil.campaign.result import VERDICTS
 from gfm_hil.campaign.worker import Record
+from gfm_hil.expectation import reason_name
 from gfm_hil.report import EVENT_COLUMNS, cell
 
 _COLOURS = {"stable": "green", "oscillating": "yellow"}
@@ -73,7 +74,7 @@ def _worst(law: str, runs: list[dict[str, Any]], axes: list[Axis]) -> Table:
     table.add_column("")
     for entry in runs:
         what = entry["verdict"]
-        why = escape(entry["reason"].split(":")[0]) if what in ("tripped", "safe") else ""
+        why = escape(reason_name(entry["reason"])) if what in ("tripped", "safe") else ""
         if what == "oscillating":
             why = f"{entry['ripple_pu']:.3g} p.u."
         words = f"[{_COLOURS.get(what, 'red')}]{what.replace('-', ' ')}[/] {why}"

@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rich.console import Console
@@ -27,6 +27,8 @@ from gfm_hil.campaign.worker import Record, compile_once
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder
 from gfm_hil.errors import UserError
 from gfm_hil.stopping import Interrupt
+
+_PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 
 def add(commands: Any) -> None:
@@ -53,7 +55,8 @@ def call(options: argparse.Namespace) -> int:
         raise UserError("--workers, --dask: the cluster knows its workers; give one of them")
     if options.resume and (not options.out or options.only is not None):
         raise UserError("--resume: goes with --out, the folder to go on with, and without --only")
-    campaign = load_campaign(options.file)
+    with _checking(options.quiet) as tell_checks:
+        campaign = load_campaign(options.file, tell_checks)
     axes = find_axes(campaign, options.x, options.y)
     if options.only is not None:
         return _only(options, campaign)
@@ -113,6 +116,25 @@ def _only(options: argparse.Namespace, campaign: Campaign) -> int:
     if options.json:
         print(json.dumps(records, indent=2))
     return 0
+
+
+@contextlib.contextmanager
+def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar for the checks, which appears once they take long; one line where there is no
+    terminal. Yields what tells it of them."""
+    console, began = Console(stderr=True, quiet=quiet), time.monotonic()
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("checking the runs", visible=False)
+
+        def tell(done: int, of: int) -> None:
+            if time.monotonic() - began < _PATIENCE_S:
+                return
+            if not console.is_terminal and not bar.tasks[0].visible:
+                console.print(f"checking the runs: {done} of {of} done …", highlight=False)
+            bar.update(task, completed=done, total=of, visible=True)
+
+        yield tell
 
 
 @contextlib.contextmanager

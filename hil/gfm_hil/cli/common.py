@@ -112,9 +112,11 @@ def progress_bar(scenario: Scenario, label: str, quiet: bool) -> Iterator[tuple[
 def print_summary(summary: dict[str, Any], folder: Path) -> None:
     """The short table that ends a run."""
     console = Console()
-    colour = "green" if summary["status"] == summary["expected"] else "red"
+    colour = "red" if summary["unmet"] else "green"
     reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
     console.print(f"[bold {colour}]{summary['status']}[/]{reason}", highlight=False)
+    for part in summary["unmet"]:
+        console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
     console.print(escape(" → ".join(summary["laws"])), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
@@ -144,7 +146,7 @@ def events_table(events: list[dict[str, Any]]) -> Table:
 
 def exit_code(summary: dict[str, Any]) -> int:
     """0 as expected, 130 interrupted, 3 otherwise."""
-    if summary["status"] == summary["expected"]:
+    if not summary["unmet"]:
         return 0
     return EXIT_INTERRUPTED if summary["status"] == "interrupted" else EXIT_OTHERWISE
 

@@ -35,6 +35,8 @@ def call(options: argparse.Namespace) -> int:
             raise UserError(f"--format {said}: must be one of {', '.join(FORMATS)}")
     if file is None:
         file = Path(f"{options.folder.resolve().name}.{name}")
+    if not file.name:
+        raise UserError(f"--out {file}: must name a file")
     for path in export_run(options.folder, name, file):
         print(path)
     return 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -16,6 +17,7 @@ from importlib.metadata import version
 from gfm_hil.errors import UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
+from gfm_runtime.errors import printable
 
 #: the module of each command; only the one that is called is imported, so that a side of a run
 #: starts without the design tools
@@ -35,6 +37,7 @@ MODULES = {
     "doctor": "doctor",
     "scenarios": "scenarios",
     "keys": "keys",
+    "deploy": "deploy",
     "controller": "sides",
     "plant": "sides",
 }
@@ -56,14 +59,27 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = sys.argv[1:] if arguments is None else arguments
+    for text in given:
+        if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
+            return _refuse(f"{text}: -- cannot be a value; for a file of that name write ./--")
     options = parser(given[0] if given else None).parse_args(given)
     try:
         return int(options.call(options))
     except (UserError, LawError, NoEquilibrium) as problem:
-        print(f"gfmhil: {problem}", file=sys.stderr)
-        return 2
+        return _refuse(str(problem))
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # a reader such as head that has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to flush
         return 0
+    except OSError as problem:
+        if problem.filename is None:  # not about a file that the user named
+            raise
+        return _refuse(f"{problem.filename}: {problem.strerror}")
+
+
+def _refuse(problem: str) -> int:
+    """Print what is wrong, one line a mistake; returns the exit code."""
+    said = "\n".join(printable(line) for line in problem.split("\n"))
+    print(f"gfmhil: {said}", file=sys.stderr)
+    return 2

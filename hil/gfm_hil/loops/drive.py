@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.bench import Bench
 from gfm_hil.errors import PeerLost
+from gfm_hil.expectation import CONTROLLER_GONE
 from gfm_hil.frames import FrameReader, FrameWriter
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.base import Side
@@ -116,7 +117,7 @@ def drive_plant(
         elif why == PEER_STOPPED:
             timeline.end("interrupted", CONTROLLER_LEFT, tick)
         elif why == SILENT:
-            timeline.end("safe", "the controller's process is gone", tick)
+            timeline.end("safe", CONTROLLER_GONE, tick)
         elif why == LATE:
             timeline.end("safe", NO_FRESH_U, tick)
     assert timeline.outcome is not None

@@ -57,7 +57,7 @@ def weights_of(options: argparse.Namespace) -> tuple[Weight, ...]:
         return PAPER_WEIGHTS
     try:
         return read_weights(Path(options.weights))
-    except (OSError, ValueError) as problem:
+    except ValueError as problem:
         raise UserError(f"--weights {options.weights}: {problem}") from None
 
 

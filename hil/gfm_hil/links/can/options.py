@@ -24,7 +24,9 @@ class CanOptions(LinkOptions):
     )
     every: int = Field(1, ge=1, le=50, description="ticks to an exchange; held in between")
     dbc: str | None = Field(None, description="DBC file in place of the one of `gfmhil dbc`")
-    heartbeat: int = Field(10_000, ge=1, description="vectors after which a state is said again")
+    heartbeat: int = Field(
+        10_000, ge=1, le=10**9, description="vectors after which a state is said again"
+    )
     portable: bool = Field(
         False, description="leave the frames to python-can, where calling the kernel is unwanted"
     )

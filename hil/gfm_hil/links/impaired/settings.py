@@ -27,9 +27,13 @@ class Impairment(LinkOptions):
     reorder: float = Field(0.0, ge=0, le=1, description="a frame arrives after the next one")
     delay: float = Field(0.0, ge=0, le=10, description="every frame is late by that, s")
     jitter: float = Field(0.0, ge=0, le=2, description="and by up to that more, drawn evenly, s")
-    pause_at: int | None = Field(None, ge=0, description="frame from which the link is silent")
+    pause_at: int | None = Field(
+        None, ge=0, le=10**12, description="frame from which the link is silent"
+    )
     pause: float = Field(0.1, gt=0, le=60, description="for so long, s")
-    kill_at: int | None = Field(None, ge=0, description="frame at which the process is killed")
+    kill_at: int | None = Field(
+        None, ge=0, le=10**12, description="frame at which the process is killed"
+    )
 
     @model_validator(mode="after")
     def _something(self) -> Impairment:

@@ -1,0 +1,49 @@
+"""gfmhil deploy: the files that run a side as a service, in a container or on a bus."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.errors import UserError
+
+_FOLDERS = (
+    Path(__file__).resolve().parents[1] / "deploy",  # a wheel carries them here
+    Path(__file__).resolve().parents[3] / "deploy",  # a checkout has them here
+)
+# Named, as keys and scenarios may lie beside them in a checkout; hatch_build.py has the same list.
+FILES = ("can/*", "container/Containerfile", "container/compose.yaml", "systemd/**/*", "tune-*")
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "deploy",
+        help="write the service units, container files, CAN units and tuning script to a folder",
+        description="Write what is in deploy/: units of systemd, container files, units of CAN "
+        "interfaces and the script that tunes a machine for real time.",
+    )
+    command.add_argument("--out", required=True, metavar="DIR", help="folder; new or empty")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Write the files and list them; returns the exit code.
+
+    Raises:
+        UserError: the folder is not empty or cannot be written.
+    """
+    source = next((folder for folder in _FOLDERS if folder.is_dir()), None)
+    if source is None:
+        raise UserError("gfmhil deploy: this installation came without the files of deploy/")
+    out = Path(options.out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out}: is not an empty folder; choose another --out")
+    for path in sorted(p for pattern in FILES for p in source.glob(pattern) if p.is_file()):
+        target = out / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, target)  # with its mode: the script stays executable
+        print(target)
+    return 0

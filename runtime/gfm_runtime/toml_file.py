@@ -1,0 +1,81 @@
+"""Reading a TOML file of a user: every fault of the file is one line, and none stops the program.
+
+What comes out is bounded: tables and arrays are nested at most ``MAX_DEPTH`` deep, so that code
+may walk through them by recursion.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+MAX_BYTES = 4 * 2**20  # some ten thousand events
+MAX_DEPTH = 32
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Raises:
+        ValueError: one line: as ``read_text`` or ``parse_toml``.
+    """
+    return parse_toml(read_text(path))
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a file, with or without a byte order mark.
+
+    Raises:
+        ValueError: one line: the file cannot be opened, is not regular (a pipe or a device may
+            have no end), is larger than ``MAX_BYTES`` or is not UTF-8.
+    """
+    try:
+        # O_NONBLOCK: opening a named pipe would otherwise wait for its writer.
+        file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as problem:
+        raise ValueError(f"cannot be read: {problem.strerror}") from None
+    try:
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            raise ValueError("cannot be read: is not a regular file")
+        with os.fdopen(file, "rb", closefd=False) as opened:
+            data = opened.read(MAX_BYTES + 1)
+    except OSError as problem:
+        raise ValueError(f"cannot be read: {problem.strerror}") from None
+    finally:
+        os.close(file)
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"cannot be read: is larger than {MAX_BYTES // 2**20} MiB")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as problem:
+        line = data[: problem.start].count(b"\n") + 1
+        raise ValueError(f"cannot be read: line {line} is not UTF-8") from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The content of a TOML text.
+
+    Raises:
+        ValueError: one line: it is not TOML, or is nested too deeply.
+    """
+    too_deep = f"not usable: tables and arrays are nested more than {MAX_DEPTH} deep"
+    try:
+        content = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(too_deep) from None
+    except ValueError as problem:  # TOMLDecodeError, or an integer of thousands of digits
+        raise ValueError(f"not TOML: {problem}") from None
+    level: list[Any] = [content]
+    for _ in range(MAX_DEPTH):
+        level = [
+            below
+            for value in level
+            if isinstance(value, (dict, list))
+            for below in (value.values() if isinstance(value, dict) else value)
+        ]
+    if level:
+        raise ValueError(too_deep)
+    return content

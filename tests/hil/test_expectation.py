@@ -1,0 +1,137 @@
+"""What a scenario expects of its end: status, reason and time, each of which can fail alone."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gfm_hil.cli import main
+from gfm_hil.errors import UserError
+from gfm_hil.expectation import END_REASONS
+from gfm_hil.runner import run_scenario
+from gfm_hil.scenario import check_scenario, load_scenario
+from gfm_hil.toml_out import scenario_toml
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_controller"
+SENDS_NAN = f"""
+import sys
+sys.path.insert(0, {str(EXAMPLE)!r})
+import controller
+class Nan(controller.Droop):
+    ticks = 0
+    def step(self, *y):
+        self.ticks += 1
+        return super().step(*y) if self.ticks <= 280 else (float("nan"),) * 3
+controller.Droop = Nan
+controller.main(*sys.argv[1:])
+"""
+LOW = {"over_current": {"threshold": 1.5, "delay_s": 0.0}}
+TRIP = {
+    "events": [{"t": 0.05, "type": "grid-phase-jump", "degrees": 20.0}],
+    "plant": {"protection": LOW},
+    "expect": "tripped",
+}
+
+
+def switchover(**changed: Any) -> Any:
+    """The shipped experiment, whose law changes at 1 s, in one process."""
+    return load_scenario("switchover", mode="lockstep", link__type="inproc", **changed)
+
+
+@pytest.mark.attack(
+    "8.1",
+    "a controller that sends NaN 28 ms after the start of `switchover`, which expects a trip",
+    "exit code 0: any trip was the one expected",
+)
+def test_a_trip_for_another_reason_is_not_the_one_expected(tmp_path, attack_now):
+    (tmp_path / "nan.py").write_text(SENDS_NAN)
+    scenario = load_scenario("switchover", mode="lockstep", link__peer_timeout_s=20.0)
+    run = run_scenario(
+        scenario, tmp_path / "run", figures=False,
+        controller_command=(sys.executable, str(tmp_path / "nan.py"), "{endpoint}", "{scenario}"),
+    )  # fmt: skip
+    assert run.summary["status"] == "tripped" == run.summary["expected"]
+    assert run.summary["unmet"] == [
+        "expect_reason = 'over-current', but the reason was 'command not finite'",
+        "expect_after = 1 s, but the end came at 0.028 s",  # after 280 good commands
+    ]
+    attack_now(f"exit code 3 at {run.summary['duration_s'] * 1e3:.1f} ms: reason and time named")
+
+
+def test_the_shipped_experiment_ends_as_it_expects(tmp_path):
+    run = run_scenario(switchover(), tmp_path / "run", figures=False)
+    assert (run.summary["status"], run.summary["unmet"]) == ("tripped", [])
+    assert run.summary["reason"].startswith("over-current: ")
+    assert run.summary["duration_s"] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("expected", "part"),
+    [
+        ({"expect_reason": "over-current", "expect_after": 0.05}, None),
+        ({"expect_reason": "over-voltage"}, "expect_reason = 'over-voltage'"),
+        ({"expect_after": 0.06}, "expect_after = 0.06 s"),
+        ({"expect": "completed"}, "expect = 'completed'"),
+        ({"expect": "safe"}, "expect = 'safe'"),
+    ],
+)
+def test_terminal_summary_report_and_exit_code_agree(expected, part, make, tmp_path, capsys):
+    (tmp_path / "trip.toml").write_text(scenario_toml(make(**{**TRIP, **expected})))
+    folder = tmp_path / "run"
+    code = main(["run", str(tmp_path / "trip.toml"), "--out", str(folder), "--quiet"])
+    out = " ".join(capsys.readouterr().out.split())
+    unmet = json.loads((folder / "summary.json").read_text())["unmet"]
+    report = (folder / "report.html").read_text()
+    assert code == (0 if part is None else 3)
+    assert len(unmet) == (0 if part is None else 1)
+    assert ("not as expected: " + (part or "") in out) is (part is not None)
+    assert ("not as expected: " in report) is (part is not None)
+    if part is not None:
+        assert unmet[0].startswith(part + ", but ")
+
+
+@pytest.mark.parametrize(("after", "met"), [(0.05, True), (0.08, False)])
+def test_a_run_that_waits_is_judged_by_its_last_trip(run, after, met):
+    done = run(**TRIP, after_trip="wait", expect_reason="over-current", expect_after=after)
+    assert done.summary["ticks"] == 1000  # it waited to its end, which is not the time that counts
+    assert (not done.summary["unmet"]) is met
+
+
+WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
+    "misspelt": (
+        {"expect": "tripped", "expect_reason": "overcurrent"}, ["did you mean 'over-current'?"],
+    ),
+    "of no kind": (
+        {"expect": "tripped", "expect_reason": "x"}, ["expect_reason = 'x'", "'diverged'"],
+    ),
+    "of the other status": (
+        {"expect": "safe", "expect_reason": "over-current"}, ["expect = 'safe' takes one of"],
+    ),
+    "reason without a trip": (
+        {"expect_reason": "over-current"}, ["expect_reason", "needs expect = 'tripped' or 'safe'"],
+    ),
+    "time without a trip": ({"expect_after": 0.05}, ["expect_after = 0.05", "needs expect"]),
+    "time after the end": (
+        {"expect": "tripped", "expect_after": 0.1}, ["expect_after = 0.1 s", "below duration"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_an_expectation_that_cannot_be_met_is_refused(case):
+    content, parts = WRONG[case]
+    with pytest.raises(UserError) as found:
+        check_scenario({"title": "test", "duration": 0.1, **content}, "test.toml")
+    assert "\n" not in str(found.value)
+    for part in parts:
+        assert part in str(found.value)
+
+
+@pytest.mark.parametrize("status", END_REASONS)
+def test_every_name_of_the_lists_is_accepted(status, make):
+    for name in END_REASONS[status]:
+        assert make(expect=status, expect_reason=name).expect_reason == name
