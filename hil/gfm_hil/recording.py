@@ -1,8 +1,8 @@
 """Recording every tick, on disk from the first one, so that nothing recorded is ever lost.
 
 Each side writes its rows into arrays that are memory-mapped files in the run folder: what was
-written survives the process, however it ends. ``merge`` turns the parts into ``signals.npz`` and
-``timing.npz``. Columns are generated from the signal table.
+written survives the process, however it ends. ``merge`` makes ``signals.npz`` and ``timing.npz``
+of these parts. Columns are generated from the signal table.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gfm_hil import scratch
 from gfm_hil.atomics import prefetch
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES
+from gfm_hil.npz import BLOCK, Column, Source, open_npz, write_npz
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.compiled import compiled
@@ -100,12 +102,12 @@ class Part:
 
         def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
             path = parts / f"{side}_{what}.npy"
-            array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-            with path.open("r+b") as file:  # a page that is not to be had would end the process
-                try:
+            try:
+                array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+                with path.open("r+b") as file:  # a page that is not to be had would end the process
                     os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
-                except OSError as problem:
-                    raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
+            except OSError as problem:
+                raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
@@ -192,33 +194,54 @@ def _home_of(place: Path) -> Path | None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what the sides recorded, wherever it lies."""
+    """Remove what the sides recorded, wherever it lies.
+
+    A process that is killed meanwhile leaves a rest that the next call finds.
+    """
     parts = folder / "parts"
-    if not parts.is_dir():
-        return
-    place = parts.resolve()
+    if parts.is_dir():
+        for file in parts.glob("*.npy"):
+            file.unlink()
+        shutil.rmtree(parts.resolve())
     if parts.is_symlink():
         parts.unlink()
-    shutil.rmtree(place)
     if parts in _holds:
         scratch.let_go(_holds.pop(parts))
 
 
-def _recorded(part: Part) -> int:
+def _reader(path: Path, j: int) -> Callable[[int, int], NDArray[Any]]:
+    """Reads rows of column ``j`` of a part's file; maps only those rows, only while it reads."""
+    return lambda first, last: np.array(np.load(path, mmap_mode="r")[first:last, j])
+
+
+def _blocks(rows: int) -> Iterator[tuple[int, int]]:
+    return ((first, min(first + BLOCK, rows)) for first in range(0, rows, BLOCK))
+
+
+def _recorded(file: Path, ticks: int) -> int:
     """Ticks up to the last one that was recorded."""
-    rows = np.flatnonzero(~np.isnan(part.signals[:, NY]))  # a plant writes that column last
-    return int(rows[-1]) + 1 if len(rows) else 0
+    read = _reader(file, NY)  # a plant writes that column last
+    for first, last in reversed([*_blocks(ticks)]):
+        rows = np.flatnonzero(~np.isnan(read(first, last)))
+        if len(rows):
+            return first + int(rows[-1]) + 1
+    return 0
 
 
-def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
-    """Write signals.npz and timing.npz from the parts, remove the parts, return the signals.
+def merge(folder: Path, T_s: float, laws: list[str]) -> None:
+    """Write signals.npz and timing.npz from the parts, which stay.
 
-    Rows end where the plant's recording does (where it is missing, the controller's).
+    Rows end where the plant's recording does (where it is missing, the controller's). Memory is
+    that of a few blocks of rows.
+
+    Raises:
+        OSError: a file cannot be written; it is then not there.
     """
-    signals: dict[str, NDArray[Any]] = {}
-    timing: dict[str, NDArray[Any]] = {}
+    signals: dict[str, Source] = {}
+    timing: dict[str, Source] = {}
     parts = {side: part for side in SIDES if (part := Part.open(folder, side)) is not None}
-    counts = {side: _recorded(part) for side, part in parts.items()}
+    files = {side: folder / "parts" / f"{side}_signals.npy" for side in parts}
+    counts = {side: _recorded(files[side], len(part.signals)) for side, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
     for side, columns, times in (
         ("plant", PLANT_COLUMNS, PLANT_TIMES),
@@ -226,16 +249,39 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
     ):
         if side not in parts:
             continue
-        part = parts[side]
         for j, name in enumerate(columns):
-            signals[name] = np.array(part.signals[:done, j])
-        if (part.times >= 0).any():
-            for j, name in enumerate(times):
-                timing[f"{side}_{name}"] = np.array(part.times[:done, j])
-    signals = {"tick": np.arange(done), "t": np.arange(done) * T_s, **signals}
-    used = int(np.nanmax(signals["law"], initial=0)) + 1 if "law" in signals else 0
-    laws = laws[: max(used, len(laws) - SPARE)]
-    np.savez(folder / "signals.npz", laws=np.array(laws), **signals)  # type: ignore[arg-type]
-    np.savez(folder / "timing.npz", **timing)  # type: ignore[arg-type]
-    remove_parts(folder)
-    return signals
+            signals[name] = Source(np.dtype(float), done, _reader(files[side], j))
+        file = folder / "parts" / f"{side}_times.npy"
+        found = {
+            f"{side}_{name}": Source(np.dtype(np.int64), done, _reader(file, j))
+            for j, name in enumerate(times)
+        }
+        if any((x.read(a, b) >= 0).any() for x in found.values() for a, b in _blocks(done)):
+            timing |= found
+    signals = {
+        "tick": Source(np.dtype(np.int64), done, np.arange),
+        "t": Source(np.dtype(float), done, lambda first, last: np.arange(first, last) * T_s),
+        **signals,
+    }
+    used = 0
+    if "law" in signals:
+        of_law = (signals["law"].read(a, b) for a, b in _blocks(done))
+        used = max((int(np.nanmax(law, initial=0)) + 1 for law in of_law), default=1)
+    known = np.array(laws[: max(used, len(laws) - SPARE)])
+    write_npz(folder / "signals.npz", {"laws": Source.of(known), **signals})
+    write_npz(folder / "timing.npz", timing)
+
+
+def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
+    """The columns of signals.npz and of timing.npz, and the labels of the laws.
+
+    Raises:
+        OSError: a file is not there.
+        UserError: a file is damaged.
+    """
+    try:
+        signals, timing = open_npz(folder / "signals.npz"), open_npz(folder / "timing.npz")
+        laws = [str(label) for label in signals.pop("laws")[:]]
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as problem:
+        raise UserError(f"{folder}: signals.npz or timing.npz cannot be read: {problem}") from None
+    return signals, timing, laws

@@ -1,7 +1,7 @@
 """Argument parsing and exit codes.
 
 0: done, and a run ended as its scenario expects; 2: wrong input, nothing started; 3: a run ended
-otherwise; 130: interrupted.
+otherwise, or its folder could not be completed; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from gfm_hil.errors import UserError
+from gfm_hil.errors import Unfinished, UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
 
@@ -22,6 +22,7 @@ from gfm_runtime import LawError
 MODULES = {
     "run": "run",
     "tell": "tell",
+    "recover": "recover",
     "scope": "scope",
     "modbus": "modbus",
     "export": "export",
@@ -62,6 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (UserError, LawError, NoEquilibrium) as problem:
         print(f"gfmhil: {problem}", file=sys.stderr)
         return 2
+    except Unfinished as problem:
+        print(f"gfmhil: {problem}", file=sys.stderr)
+        return 3
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # a reader such as head that has seen enough
