@@ -7,14 +7,18 @@ blocks begin. Writing and reading take the memory of a few blocks, however long 
 
 from __future__ import annotations
 
+import contextlib
 import io
+import shutil
 import struct
+import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,59 +31,93 @@ _BLOCKS = 4000  # at most: an extra field holds 64 KiB
 # of 60 s of the paper's rig, 134 MB: level 1 leaves 47.1 MB, level 3 46.9, level 6 46.0 in 3.5
 # times the time
 _LEVEL = 1
+_SPOOL = 1 << 20  # bytes of a column, compressed, that are kept in memory
 _FIELD = 0x6667  # id of the extra field: rows a block, then where each block begins
+_DAMAGED = (zlib.error, zipfile.BadZipFile, struct.error, ValueError, KeyError, EOFError)
 _LAST = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS).flush()  # ends a deflate stream
 
 
 @dataclass(frozen=True)
-class Source:
-    """A column to be written: its type, its length, and ``read(first, last)`` for its rows."""
+class Table:
+    """Columns to be written that are read together.
 
-    dtype: np.dtype[Any]
+    Attributes:
+        columns: their types by name.
+        rows: their length.
+        read: ``read(first, last)`` gives those rows of each column, in the order of ``columns``.
+    """
+
+    columns: dict[str, np.dtype[Any]]
     rows: int
-    read: Callable[[int, int], NDArray[Any]]
+    read: Callable[[int, int], Iterable[NDArray[Any]]]
 
     @staticmethod
-    def of(array: NDArray[Any]) -> Source:
-        """An array of shape (rows,)."""
-        return Source(array.dtype, len(array), lambda first, last: array[first:last])
+    def of(**arrays: NDArray[Any]) -> Table:
+        """Arrays of shape (rows,)."""
+        kinds = {name: x.dtype for name, x in arrays.items()}
+        rows = len(next(iter(arrays.values())))
+        return Table(kinds, rows, lambda first, last: [x[first:last] for x in arrays.values()])
 
 
-def write_npz(path: Path, columns: Mapping[str, Source]) -> None:
-    """Write ``path`` as a whole, one column after the other.
+def write_npz(path: Path, tables: Iterable[Table]) -> None:
+    """Write ``path`` as a whole, one table after the other, each read once from its first row on.
 
     Raises:
         OSError: the file cannot be written.
     """
     with replacing(path) as part, part.open("wb") as file, zipfile.ZipFile(file, "w") as archive:
-        for name, column in columns.items():
-            info = zipfile.ZipInfo(f"{name}.npy")
-            size, crc, starts = 0, 0, []
-            step = max(BLOCK, -(-column.rows // _BLOCKS))
-            # zipfile copies what is compressed already as it is; then the member is declared to be
-            # what it is, in its own header here and in the directory when the archive is closed
-            with archive.open(info, "w", force_zip64=True) as member:
-                at = 0
-                for plain in _plain(column, step):
-                    size, crc = size + len(plain), zlib.crc32(plain, crc)
-                    at += member.write(_deflate(plain))
-                    starts.append(at)
-                member.write(_LAST)
-            info.compress_type, info.file_size, info.CRC = zipfile.ZIP_DEFLATED, size, crc
-            file.seek(info.header_offset)
-            file.write(info.FileHeader(zip64=True))
-            field = struct.pack(f"<{len(starts)}Q", step, *starts[:-1])  # the header is no block
-            info.extra = struct.pack("<HH", _FIELD, len(field)) + field
+        for table in tables:
+            with contextlib.ExitStack() as stack:
+                spool = partial(tempfile.SpooledTemporaryFile, _SPOOL, dir=str(path.parent))
+                packed = [
+                    _Packed(stack.enter_context(spool()), name, kind, table.rows)
+                    for name, kind in table.columns.items()
+                ]
+                step = max(BLOCK, -(-table.rows // _BLOCKS))
+                for first in range(0, table.rows, step):
+                    last = min(first + step, table.rows)
+                    for column, rows in zip(packed, table.read(first, last), strict=True):
+                        column.add(rows.tobytes())
+                for column in packed:
+                    column.move(archive, file, step)
 
 
-def _plain(column: Source, step: int) -> Iterator[bytes]:
-    """What np.load is to read: the header of an array, then its rows in blocks."""
-    header = io.BytesIO()
-    about = {"descr": column.dtype.str, "fortran_order": False, "shape": (column.rows,)}
-    np.lib.format.write_array_header_1_0(header, about)
-    yield header.getvalue()
-    for first in range(0, column.rows, step):
-        yield column.read(first, min(first + step, column.rows)).tobytes()
+class _Packed:
+    """A column while its table is read: compressed, in a file without a name if it is long."""
+
+    def __init__(self, spool: IO[bytes], name: str, kind: np.dtype[Any], rows: int) -> None:
+        self._name, self._size, self._crc = name, 0, 0
+        self._starts: list[int] = []
+        self._spool = spool
+        header = io.BytesIO()
+        about = {"descr": kind.str, "fortran_order": False, "shape": (rows,)}
+        np.lib.format.write_array_header_1_0(header, about)
+        self.add(header.getvalue())
+
+    def add(self, plain: bytes) -> None:
+        """Append a block of what np.load is to read."""
+        self._size, self._crc = self._size + len(plain), zlib.crc32(plain, self._crc)
+        self._spool.write(_deflate(plain))
+        self._starts.append(self._spool.tell())
+
+    def move(self, archive: zipfile.ZipFile, file: BinaryIO, step: int) -> None:
+        """Make it a member of an archive in ``file``, in blocks of ``step`` rows.
+
+        zipfile copies what is compressed already as it is; then the member is declared to be what
+        it is, in its own header here and in the directory when the archive is closed.
+        """
+        info = zipfile.ZipInfo(f"{self._name}.npy")
+        self._spool.write(_LAST)
+        self._spool.seek(0)
+        with archive.open(info, "w", force_zip64=True) as member:
+            shutil.copyfileobj(self._spool, member)
+        self._spool.close()
+        info.compress_type, info.file_size, info.CRC = zipfile.ZIP_DEFLATED, self._size, self._crc
+        file.seek(info.header_offset)
+        file.write(info.FileHeader(zip64=True))
+        starts = self._starts[:-1]  # the header is no block
+        field = struct.pack(f"<{1 + len(starts)}Q", step, *starts)
+        info.extra = struct.pack("<HH", _FIELD, len(field)) + field
 
 
 def _deflate(plain: bytes) -> bytes:
@@ -134,7 +172,7 @@ class Column:
         if held[0] != k:
             try:
                 held = self._held = (k, self._read(k))
-            except (zlib.error, ValueError, EOFError, zipfile.BadZipFile) as problem:
+            except _DAMAGED as problem:
                 raise UserError(f"{self.path}: {self.name} is damaged: {problem}") from None
         return held[1]
 
@@ -155,8 +193,16 @@ def open_npz(path: Path) -> dict[str, Column]:
     """The columns of an .npz file, none of them read yet.
 
     Raises:
-        OSError, ValueError, EOFError, zipfile.BadZipFile: it cannot be read.
+        OSError: it cannot be read.
+        UserError: it is damaged.
     """
+    try:
+        return _open(path)
+    except _DAMAGED as problem:
+        raise UserError(f"{path} is damaged: {problem}") from None
+
+
+def _open(path: Path) -> dict[str, Column]:
     found = {}
     with zipfile.ZipFile(path) as archive, path.open("rb") as file:
         for info in archive.infolist():

@@ -11,9 +11,9 @@ import contextlib
 import os
 import secrets
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from gfm_hil import scratch
 from gfm_hil.atomics import prefetch
 from gfm_hil.errors import UserError
-from gfm_hil.links.base import SIDES
-from gfm_hil.npz import BLOCK, Column, Source, open_npz, write_npz
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.npz import BLOCK, Column, Table, open_npz, write_npz
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.compiled import compiled
@@ -209,9 +209,9 @@ def remove_parts(folder: Path) -> None:
         scratch.let_go(_holds.pop(parts))
 
 
-def _reader(path: Path, j: int) -> Callable[[int, int], NDArray[Any]]:
-    """Reads rows of column ``j`` of a part's file; maps only those rows, only while it reads."""
-    return lambda first, last: np.array(np.load(path, mmap_mode="r")[first:last, j])
+def _rows(file: Path, first: int, last: int) -> NDArray[Any]:
+    """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
+    return np.ascontiguousarray(np.load(file, mmap_mode="r")[first:last].T)
 
 
 def _blocks(rows: int) -> Iterator[tuple[int, int]]:
@@ -220,9 +220,8 @@ def _blocks(rows: int) -> Iterator[tuple[int, int]]:
 
 def _recorded(file: Path, ticks: int) -> int:
     """Ticks up to the last one that was recorded."""
-    read = _reader(file, NY)  # a plant writes that column last
     for first, last in reversed([*_blocks(ticks)]):
-        rows = np.flatnonzero(~np.isnan(read(first, last)))
+        rows = np.flatnonzero(~np.isnan(_rows(file, first, last)[NY]))  # written last by a plant
         if len(rows):
             return first + int(rows[-1]) + 1
     return 0
@@ -231,45 +230,56 @@ def _recorded(file: Path, ticks: int) -> int:
 def merge(folder: Path, T_s: float, laws: list[str]) -> None:
     """Write signals.npz and timing.npz from the parts, which stay.
 
-    Rows end where the plant's recording does (where it is missing, the controller's). Memory is
-    that of a few blocks of rows.
+    Rows end where the plant's recording does (where it is missing, the controller's). Each part
+    is read once; memory is that of a few blocks of rows.
 
     Raises:
         OSError: a file cannot be written; it is then not there.
     """
-    signals: dict[str, Source] = {}
-    timing: dict[str, Source] = {}
     parts = {side: part for side in SIDES if (part := Part.open(folder, side)) is not None}
     files = {side: folder / "parts" / f"{side}_signals.npy" for side in parts}
     counts = {side: _recorded(files[side], len(part.signals)) for side, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
-    for side, columns, times in (
-        ("plant", PLANT_COLUMNS, PLANT_TIMES),
-        ("controller", CONTROLLER_COLUMNS, CONTROLLER_TIMES),
-    ):
-        if side not in parts:
-            continue
-        for j, name in enumerate(columns):
-            signals[name] = Source(np.dtype(float), done, _reader(files[side], j))
-        file = folder / "parts" / f"{side}_times.npy"
-        found = {
-            f"{side}_{name}": Source(np.dtype(np.int64), done, _reader(file, j))
-            for j, name in enumerate(times)
-        }
-        if any((x.read(a, b) >= 0).any() for x in found.values() for a, b in _blocks(done)):
-            timing |= found
-    signals = {
-        "tick": Source(np.dtype(np.int64), done, np.arange),
-        "t": Source(np.dtype(float), done, lambda first, last: np.arange(first, last) * T_s),
-        **signals,
-    }
+    write_npz(folder / "signals.npz", _signals(files, done, T_s, laws))
+    write_npz(folder / "timing.npz", _timing(folder / "parts", [*parts], done))
+
+
+def _signals(files: dict[Side, Path], done: int, T_s: float, laws: list[str]) -> Iterator[Table]:
+    kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
+
+    def clock(first: int, last: int) -> list[NDArray[Any]]:
+        ticks = np.arange(first, last)
+        return [ticks, ticks * T_s]
+
+    yield Table(kinds, done, clock)
     used = 0
-    if "law" in signals:
-        of_law = (signals["law"].read(a, b) for a, b in _blocks(done))
-        used = max((int(np.nanmax(law, initial=0)) + 1 for law in of_law), default=1)
-    known = np.array(laws[: max(used, len(laws) - SPARE)])
-    write_npz(folder / "signals.npz", {"laws": Source.of(known), **signals})
-    write_npz(folder / "timing.npz", timing)
+
+    def rows(file: Path, law: int | None) -> Callable[[int, int], NDArray[Any]]:
+        def read(first: int, last: int) -> NDArray[Any]:
+            nonlocal used
+            found = _rows(file, first, last)
+            if law is not None:
+                used = max(used, int(np.nanmax(found[law], initial=0)) + 1)
+            return found
+
+        return read
+
+    if "plant" in files:
+        kinds = dict.fromkeys(PLANT_COLUMNS, np.dtype(float))
+        yield Table(kinds, done, rows(files["plant"], None))
+    if "controller" in files:
+        kinds = dict.fromkeys(CONTROLLER_COLUMNS, np.dtype(float))
+        yield Table(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
+    yield Table.of(laws=np.array(laws[: max(used, len(laws) - SPARE)]))
+
+
+def _timing(parts: Path, sides: list[Side], done: int) -> Iterator[Table]:
+    """The times of each side that recorded some."""
+    for side, names in (("plant", PLANT_TIMES), ("controller", CONTROLLER_TIMES)):
+        file = parts / f"{side}_times.npy"
+        if side in sides and any((_rows(file, a, b) >= 0).any() for a, b in _blocks(done)):
+            kinds = {f"{side}_{name}": np.dtype(np.int64) for name in names}
+            yield Table(kinds, done, partial(_rows, file))
 
 
 def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
@@ -279,9 +289,8 @@ def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], 
         OSError: a file is not there.
         UserError: a file is damaged.
     """
-    try:
-        signals, timing = open_npz(folder / "signals.npz"), open_npz(folder / "timing.npz")
-        laws = [str(label) for label in signals.pop("laws")[:]]
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as problem:
-        raise UserError(f"{folder}: signals.npz or timing.npz cannot be read: {problem}") from None
+    signals, timing = open_npz(folder / "signals.npz"), open_npz(folder / "timing.npz")
+    if "laws" not in signals:
+        raise UserError(f"{folder / 'signals.npz'}: has no column laws")
+    laws = [str(label) for label in signals.pop("laws")[:]]
     return signals, timing, laws
