@@ -14,6 +14,10 @@ class UserError(Exception):
     """Wrong input or a bench that cannot start; the message names the field, value and remedy."""
 
 
+class Unfinished(Exception):
+    """A run that is over, but whose folder could not be completed; nothing recorded is lost."""
+
+
 class PeerLost(Exception):
     """The other side never came, stopped answering, or does not fit this side."""
 

@@ -2,47 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from gfm_hil.files import replacing
+from gfm_hil.metrics import Rows
 from gfm_hil.scenario import Scenario
-from gfm_hil.summary import nominal_frequency
+from gfm_hil.summary import Spread, nominal_frequency
 
-Signals = dict[str, NDArray[Any]]
+Signals = Mapping[str, Rows]
 
 # Okabe and Ito's colours: told apart by everyone, and in print
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _POINTS = 4000  # drawn a curve; each pixel column keeps its least and its largest value
+_PIECE = 1 << 18  # ticks read at a time
+_LABELS = 40  # events with a label
+_BINS = 60  # of the histogram of misses
 _GREY = "#888888"
 
 
-def _thin(t: NDArray[Any], x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Least and largest value of each stretch, so that no oscillation is drawn away."""
-    stretch = len(t) // (_POINTS // 2)
+def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Least and largest value of each stretch, so that no oscillation is drawn away.
+
+    ``t`` and ``x`` are arrays or columns of a file, of which a piece is read at a time.
+    """
+    ticks = len(t)
+    stretch = ticks // (_POINTS // 2)
     if stretch < 3:
-        return t, x
-    n = len(t) // stretch * stretch
-    blocks = x[:n].reshape(-1, stretch)
-    low, high = np.fmin.reduce(blocks, axis=1), np.fmax.reduce(blocks, axis=1)  # past any NaN
-    times = t[:n].reshape(-1, stretch)
-    pairs = np.column_stack([low, high]).ravel()
-    moments = np.column_stack([times[:, 0], times[:, stretch // 2]]).ravel()
-    return np.append(moments, t[n:]), np.append(pairs, x[n:])
+        return t[:], x[:] * factor
+    whole = ticks // stretch * stretch
+    step = max(1, _PIECE // stretch) * stretch
+    moments, pairs = [], []
+    for first in range(0, whole, step):
+        last = min(first + step, whole)
+        values = (x[first:last] * factor).reshape(-1, stretch)
+        low, high = np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)  # past any NaN
+        times = t[first:last].reshape(-1, stretch)
+        pairs.append(np.column_stack([low, high]).ravel())
+        moments.append(np.column_stack([times[:, 0], times[:, stretch // 2]]).ravel())
+    return (
+        np.concatenate([*moments, t[whole:ticks]]),
+        np.concatenate([*pairs, x[whole:ticks] * factor]),
+    )
 
 
 def draw_panel(
-    axes: Axes, title: str, curves: Sequence[tuple[NDArray[Any], NDArray[Any], str, str]]
+    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
 ) -> None:
-    """One quantity: curves of t [s], values, colour and label."""
+    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
     for t, x, colour, label in curves:
-        axes.plot(*_thin(t, x), color=colour, lw=1.1, label=label)
+        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, label=label)
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.tick_params(labelsize=8.5, color=_GREY)
@@ -58,9 +75,19 @@ def draw_panel(
 
 
 def _mark(axes: Sequence[Axes], events: Sequence[dict[str, Any]]) -> None:
-    for k, event in enumerate(events):
-        for a in axes:
-            a.axvline(event["t"], color=_GREY, lw=0.8, ls=(0, (4, 3)), zorder=0)
+    """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one."""
+    if not events:
+        return
+    for a in axes:  # one artist a panel: thousands of lines take minutes to draw
+        lines = LineCollection(
+            [[(e["t"], 0), (e["t"], 1)] for e in events], colors=_GREY, linewidths=0.8,
+            linestyles=[(0, (4, 3))], zorder=0, transform=a.get_xaxis_transform(),
+        )  # fmt: skip
+        lines.set_in_layout(False)
+        a.add_collection(lines, autolim=False)
+        a.update_datalim([(e["t"], 0) for e in events], updatey=False)
+        a.autoscale_view(scaley=False)
+    for k, event in enumerate(events[:: -(-len(events) // _LABELS)]):
         axes[0].annotate(
             event["label"], (event["t"], 1.0), (3, 20 + 10 * (k % 3)),
             xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
@@ -75,6 +102,11 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure,
     for a in axes[-1]:
         a.set_xlabel("t [s]", fontsize=9)
     return figure, list(axes.ravel())
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110)
 
 
 def draw_run(
@@ -106,8 +138,8 @@ def _draw_signals(
     blue, red, green, *_ = COLOURS
 
     def panel(axes: Axes, title: str, *names: tuple[str, str, str], factor: float = 1.0) -> None:
-        drawn = [(t, signals[n] * factor, c, label) for n, c, label in names if n in signals]
-        draw_panel(axes, title, drawn)
+        drawn = [(t, signals[n], c, label) for n, c, label in names if n in signals]
+        draw_panel(axes, title, drawn, factor)
         if len(drawn) > 1:
             axes.legend(fontsize=8, frameon=False, loc="best")
 
@@ -126,7 +158,7 @@ def _draw_signals(
         ha="left",
     )  # fmt: skip
     path = folder / "signals.png"
-    figure.savefig(path, dpi=110)
+    _save(figure, path)
     return path
 
 
@@ -135,21 +167,23 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    there = timing["plant_received"] >= 0
-    us = (timing["plant_received"] - timing["plant_sent"])[there] / 1e3
-    late = (timing["plant_woke"] - timing["plant_scheduled"])[timing["plant_woke"] >= 0] / 1e3
-    for x, colour, label in (
-        (us, COLOURS[0], "y[k] sent → u[k] received"),
-        (late, COLOURS[1], "tick begun after its deadline"),
+    for begin, end, colour, label in (
+        ("plant_sent", "plant_received", COLOURS[0], "y[k] sent → u[k] received"),
+        ("plant_scheduled", "plant_woke", COLOURS[1], "tick begun after its deadline"),
     ):
-        ordered = np.sort(x)
-        beyond = 1 - np.arange(len(x)) / len(x)
-        left.loglog(np.maximum(ordered, 0.1), beyond, color=colour, lw=1.2, label=label)
+        spread = Spread.between(timing, begin, end)
+        before = np.cumsum(spread.count) - spread.count
+        beyond = 1 - before / max(1, int(spread.count.sum()))
+        left.loglog(np.maximum(spread.ns / 1e3, 0.1), beyond, color=colour, lw=1.2, label=label)
     left.axvline(scenario.T_s * 1e6, color=_GREY, lw=0.8, ls=(0, (4, 3)))
     left.set_title("share of ticks beyond a latency [µs]", loc="left", fontsize=9.5)
     left.legend(fontsize=8, frameon=False)
-    missed = np.flatnonzero(~there) * scenario.T_s
-    right.hist(missed, bins=60, range=(0, summary["duration_s"]), color=COLOURS[1])
+    edges, counts = np.linspace(0, summary["duration_s"], _BINS + 1), np.zeros(_BINS)
+    ticks = len(timing["plant_received"])
+    for first in range(0, ticks, _PIECE):
+        missing = np.flatnonzero(timing["plant_received"][first : first + _PIECE] < 0)
+        counts += np.histogram((first + missing) * scenario.T_s, edges)[0]
+    right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
     right.set_title(
         f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}",
         loc="left",
@@ -160,12 +194,12 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict
         a.grid(True, color="#e4e4e4", lw=0.6)
         a.tick_params(labelsize=8.5)
     path = folder / "timing.png"
-    figure.savefig(path, dpi=110)
+    _save(figure, path)
     return path
 
 
 def draw_comparison(
-    path: Path, scenario: Scenario, runs: dict[str, Signals], events: Sequence[dict[str, Any]]
+    path: Path, scenario: Scenario, runs: Mapping[str, Signals], events: Sequence[dict[str, Any]]
 ) -> None:
     """p, frequency, q and v_dc of several laws in one figure, like the paper's."""
     figure, axes = _figure(4, 1, (8.6, 8.2))
@@ -181,11 +215,11 @@ def draw_comparison(
         strict=True,
     ):
         curves = [
-            (s["t"], s[name] * factor, COLOURS[k % len(COLOURS)], law)
+            (s["t"], s[name], COLOURS[k % len(COLOURS)], law)
             for k, (law, s) in enumerate(runs.items())
         ]
-        draw_panel(a, title, curves)
+        draw_panel(a, title, curves, factor)
     axes[0].legend(fontsize=8.5, frameon=False, ncols=min(4, len(runs)), loc="lower right")
     _mark(axes, events)
     figure.suptitle(scenario.title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path, dpi=110)
+    _save(figure, path)

@@ -101,7 +101,7 @@ def read_loop_delay(folder: Path, set_s: float, T_s: float, margin_s: float) -> 
     try:
         mode = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["mode"]
         with np.load(folder / "timing.npz") as file:
-            timing = dict(file)
+            timing = {n: file[n] for n in ("plant_sent", "plant_received") if n in file}
     except (OSError, ValueError, KeyError, TypeError) as problem:
         raise UserError(f"--run {folder}: cannot be read: {problem}") from None
     set_us, T_s_us = 1e6 * set_s, 1e6 * T_s

@@ -5,12 +5,22 @@ All from the plant's true signals. For each event the window runs to the next ev
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
+
+
+class Rows(Protocol):
+    """A column, shape (ticks,): an array, or one of a file of which only slices are read."""
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, rows: slice, /) -> Any: ...
+
 
 ROCOF_WINDOW = 0.1  # s; df/dt is the slope over this window
 METRICS = (
@@ -20,13 +30,26 @@ METRICS = (
 _BAND = 0.02  # settling: within 2 % of the step (or 0.02 p.u. where there is no step)
 _GONE = 1e-6
 _NO_STEP = 0.02  # p.u.; a smaller change of p is no step
+_PIECE = 1 << 18  # ticks read at a time
 _FEW = 20  # samples; a shorter window has no metrics
 
 
+def blocks(column: Rows, first: int, last: int) -> Iterator[Any]:
+    """Rows [first, last) of a column in pieces of at most ``_PIECE``, so that memory is bounded."""
+    return (column[a : min(a + _PIECE, last)] for a in range(first, last, _PIECE))
+
+
 def event_metrics(
-    signals: dict[str, NDArray[Any]], start: int, stop: int, T_s: float, f_n: float
+    signals: Mapping[str, Rows], start: int, stop: int, T_s: float, f_n: float
 ) -> dict[str, float | None]:
     """Metrics of the ticks [start, stop) after an event at ``start``.
+
+    Args:
+        signals: columns with at least true_p, true_omega_u and true_V, shape (ticks,), p.u.;
+            arrays, or columns of a file, which are read piece by piece.
+        start, stop: ticks.
+        T_s: sampling time, s.
+        f_n: nominal frequency, Hz.
 
     Returns:
         p_before, p_peak (the extreme furthest from p_before), p_final, v_min, v_max in p.u.;
@@ -35,38 +58,69 @@ def event_metrics(
         None where a quantity has no meaning, as overshoot without a step, or all of them in a
         window of a few ticks.
     """
-    p = signals["true_p"][start:stop]
-    if len(p) < _FEW:
+    p, f, V = signals["true_p"], signals["true_omega_u"], signals["true_V"]
+    length = stop - start
+    if length < _FEW:
         return dict.fromkeys(METRICS)
-    f = signals["true_omega_u"][start:stop] * f_n
-    V = signals["true_V"][start:stop]
-    before = float(signals["true_p"][max(start - 1, 0)])
-    final = float(np.mean(p[-max(1, len(p) // 20) :]))
+    rest = max(start - 1, 0)
+    before = float(p[rest : rest + 1][0])
+    tail = max(1, length // 20)
+    final = sum(float(np.sum(x)) for x in blocks(p, stop - tail, stop)) / tail
     step = final - before
-    peak = float(p[np.argmax(np.abs(p - before))])
+    peak, least, most = before, math.inf, -math.inf
+    for x in blocks(p, start, stop):
+        furthest = float(x[np.argmax(np.abs(x - before))])
+        peak = furthest if abs(furthest - before) > abs(peak - before) else peak
+        least, most = min(least, float(x.min())), max(most, float(x.max()))
     stepped = abs(step) >= _NO_STEP
-    band = _BAND * abs(step) if stepped else _BAND
-    outside = np.flatnonzero(np.abs(p - final) > band)
-    settled = 0 if not len(outside) else int(outside[-1]) + 1
-    beyond = float(np.max((p - final) * np.sign(step))) if stepped else 0.0
-    width = max(1, round(ROCOF_WINDOW / T_s))
-    slope = np.abs(f[width:] - f[:-width]) / (width * T_s)
-    damping, frequency = dominant_oscillation(p, T_s)
+    settled = _settled(p, start, stop, final, _BAND * abs(step) if stepped else _BAND)
+    beyond = (most - final if step > 0 else final - least) if stepped else 0.0
+    nadir, top, slope = _frequency(f, start, stop, max(1, round(ROCOF_WINDOW / T_s)))
+    voltages = [(float(x.min()), float(x.max())) for x in blocks(V, start, stop)]
+    damping, frequency = dominant_oscillation(p[start : min(stop, start + _longest(T_s))], T_s)
     return {
         "p_before": before,
         "p_peak": peak,
         "p_final": final,
         # an oscillation that is still outside at the end of the window has not settled
-        "settling_s": settled * T_s if settled < 0.95 * len(p) else None,
+        "settling_s": settled * T_s if settled < 0.95 * length else None,
         "overshoot_pct": 100 * max(0.0, beyond) / abs(step) if stepped else None,
-        "f_nadir_hz": float(f.min()),
-        "f_peak_hz": float(f.max()),
-        "rocof_hz_s": float(slope.max()) if len(slope) else None,
-        "v_min": float(V.min()),
-        "v_max": float(V.max()),
+        "f_nadir_hz": nadir * f_n,
+        "f_peak_hz": top * f_n,
+        "rocof_hz_s": None if slope is None else slope * f_n / T_s,
+        "v_min": min(low for low, _ in voltages),
+        "v_max": max(high for _, high in voltages),
         "damping_ratio": damping,
         "oscillation_hz": frequency,
     }
+
+
+def _settled(p: Rows, start: int, stop: int, final: float, band: float) -> int:
+    """Ticks after ``start`` from which on p stays within ``band`` of ``final``, to ``stop``."""
+    last = stop
+    while last > start:  # from the end, where it is found soon
+        first = max(start, last - _PIECE)
+        outside = np.flatnonzero(np.abs(p[first:last] - final) > band)
+        if len(outside):
+            return first + int(outside[-1]) + 1 - start
+        last = first
+    return 0
+
+
+def _frequency(f: Rows, start: int, stop: int, width: int) -> tuple[float, float, float | None]:
+    """Extremes of f, p.u., and its largest slope over ``width`` ticks, p.u. a tick."""
+    least, most, slope = math.inf, -math.inf, None
+    for first in range(start, stop, _PIECE):
+        x = f[first : min(first + _PIECE + width, stop)]
+        least, most = min(least, float(x.min())), max(most, float(x.max()))
+        if len(x) > width:
+            slope = max(slope or 0.0, float(np.abs(x[width:] - x[:-width]).max()) / width)
+    return least, most, slope
+
+
+def _longest(T_s: float) -> int:
+    """Ticks that ``dominant_oscillation`` looks at."""
+    return round(2.0 / T_s)
 
 
 def dominant_oscillation(p: Vector, T_s: float) -> tuple[float | None, float | None]:
@@ -76,7 +130,7 @@ def dominant_oscillation(p: Vector, T_s: float) -> tuple[float | None, float | N
     signal subspace (Hua and Sarkar, 1990); each mode's strength is the energy it contributes.
     (None, None) if nothing oscillates by more than 1e-4 p.u.
     """
-    window = p[: min(len(p), round(2.0 / T_s))]
+    window = p[: _longest(T_s)]
     stride = max(1, len(window) // 400)
     x = window[::stride] - np.mean(window[-max(1, len(window) // 10) :])
     if len(x) < 40 or np.max(np.abs(x)) < 1e-4:

@@ -1,8 +1,8 @@
 """Recording every tick, on disk from the first one, so that nothing recorded is ever lost.
 
 Each side writes its rows into arrays that are memory-mapped files in the run folder: what was
-written survives the process, however it ends. ``merge`` turns the parts into ``signals.npz`` and
-``timing.npz``. Columns are generated from the signal table.
+written survives the process, however it ends. ``merge`` makes ``signals.npz`` and ``timing.npz``
+of these parts. Columns are generated from the signal table.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from numpy.typing import NDArray
 from gfm_hil import scratch
 from gfm_hil.atomics import prefetch
 from gfm_hil.errors import UserError
-from gfm_hil.links.base import SIDES
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.npz import BLOCK, Column, Table, open_npz, write_npz
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.compiled import compiled
@@ -100,12 +102,12 @@ class Part:
 
         def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
             path = parts / f"{side}_{what}.npy"
-            array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-            with path.open("r+b") as file:  # a page that is not to be had would end the process
-                try:
+            try:
+                array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+                with path.open("r+b") as file:  # a page that is not to be had would end the process
                     os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
-                except OSError as problem:
-                    raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
+            except OSError as problem:
+                raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
@@ -192,50 +194,103 @@ def _home_of(place: Path) -> Path | None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what the sides recorded, wherever it lies."""
+    """Remove what the sides recorded, wherever it lies.
+
+    A process that is killed meanwhile leaves a rest that the next call finds.
+    """
     parts = folder / "parts"
-    if not parts.is_dir():
-        return
-    place = parts.resolve()
+    if parts.is_dir():
+        for file in parts.glob("*.npy"):
+            file.unlink()
+        shutil.rmtree(parts.resolve())
     if parts.is_symlink():
         parts.unlink()
-    shutil.rmtree(place)
     if parts in _holds:
         scratch.let_go(_holds.pop(parts))
 
 
-def _recorded(part: Part) -> int:
+def _rows(file: Path, first: int, last: int) -> NDArray[Any]:
+    """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
+    return np.ascontiguousarray(np.load(file, mmap_mode="r")[first:last].T)
+
+
+def _blocks(rows: int) -> Iterator[tuple[int, int]]:
+    return ((first, min(first + BLOCK, rows)) for first in range(0, rows, BLOCK))
+
+
+def _recorded(file: Path, ticks: int) -> int:
     """Ticks up to the last one that was recorded."""
-    rows = np.flatnonzero(~np.isnan(part.signals[:, NY]))  # a plant writes that column last
-    return int(rows[-1]) + 1 if len(rows) else 0
+    for first, last in reversed([*_blocks(ticks)]):
+        rows = np.flatnonzero(~np.isnan(_rows(file, first, last)[NY]))  # written last by a plant
+        if len(rows):
+            return first + int(rows[-1]) + 1
+    return 0
 
 
-def merge(folder: Path, T_s: float, laws: list[str]) -> dict[str, NDArray[Any]]:
-    """Write signals.npz and timing.npz from the parts, remove the parts, return the signals.
+def merge(folder: Path, T_s: float, laws: list[str]) -> None:
+    """Write signals.npz and timing.npz from the parts, which stay.
 
-    Rows end where the plant's recording does (where it is missing, the controller's).
+    Rows end where the plant's recording does (where it is missing, the controller's). Each part
+    is read once; memory is that of a few blocks of rows.
+
+    Raises:
+        OSError: a file cannot be written; it is then not there.
     """
-    signals: dict[str, NDArray[Any]] = {}
-    timing: dict[str, NDArray[Any]] = {}
     parts = {side: part for side in SIDES if (part := Part.open(folder, side)) is not None}
-    counts = {side: _recorded(part) for side, part in parts.items()}
+    files = {side: folder / "parts" / f"{side}_signals.npy" for side in parts}
+    counts = {side: _recorded(files[side], len(part.signals)) for side, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
-    for side, columns, times in (
-        ("plant", PLANT_COLUMNS, PLANT_TIMES),
-        ("controller", CONTROLLER_COLUMNS, CONTROLLER_TIMES),
-    ):
-        if side not in parts:
-            continue
-        part = parts[side]
-        for j, name in enumerate(columns):
-            signals[name] = np.array(part.signals[:done, j])
-        if (part.times >= 0).any():
-            for j, name in enumerate(times):
-                timing[f"{side}_{name}"] = np.array(part.times[:done, j])
-    signals = {"tick": np.arange(done), "t": np.arange(done) * T_s, **signals}
-    used = int(np.nanmax(signals["law"], initial=0)) + 1 if "law" in signals else 0
-    laws = laws[: max(used, len(laws) - SPARE)]
-    np.savez(folder / "signals.npz", laws=np.array(laws), **signals)  # type: ignore[arg-type]
-    np.savez(folder / "timing.npz", **timing)  # type: ignore[arg-type]
-    remove_parts(folder)
-    return signals
+    write_npz(folder / "signals.npz", _signals(files, done, T_s, laws))
+    write_npz(folder / "timing.npz", _timing(folder / "parts", [*parts], done))
+
+
+def _signals(files: dict[Side, Path], done: int, T_s: float, laws: list[str]) -> Iterator[Table]:
+    kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
+
+    def clock(first: int, last: int) -> list[NDArray[Any]]:
+        ticks = np.arange(first, last)
+        return [ticks, ticks * T_s]
+
+    yield Table(kinds, done, clock)
+    used = 0
+
+    def rows(file: Path, law: int | None) -> Callable[[int, int], NDArray[Any]]:
+        def read(first: int, last: int) -> NDArray[Any]:
+            nonlocal used
+            found = _rows(file, first, last)
+            if law is not None:
+                used = max(used, int(np.nanmax(found[law], initial=0)) + 1)
+            return found
+
+        return read
+
+    if "plant" in files:
+        kinds = dict.fromkeys(PLANT_COLUMNS, np.dtype(float))
+        yield Table(kinds, done, rows(files["plant"], None))
+    if "controller" in files:
+        kinds = dict.fromkeys(CONTROLLER_COLUMNS, np.dtype(float))
+        yield Table(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
+    yield Table.of(laws=np.array(laws[: max(used, len(laws) - SPARE)]))
+
+
+def _timing(parts: Path, sides: list[Side], done: int) -> Iterator[Table]:
+    """The times of each side that recorded some."""
+    for side, names in (("plant", PLANT_TIMES), ("controller", CONTROLLER_TIMES)):
+        file = parts / f"{side}_times.npy"
+        if side in sides and any((_rows(file, a, b) >= 0).any() for a, b in _blocks(done)):
+            kinds = {f"{side}_{name}": np.dtype(np.int64) for name in names}
+            yield Table(kinds, done, partial(_rows, file))
+
+
+def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
+    """The columns of signals.npz and of timing.npz, and the labels of the laws.
+
+    Raises:
+        OSError: a file is not there.
+        UserError: a file is damaged.
+    """
+    signals, timing = open_npz(folder / "signals.npz"), open_npz(folder / "timing.npz")
+    if "laws" not in signals:
+        raise UserError(f"{folder / 'signals.npz'}: has no column laws")
+    laws = [str(label) for label in signals.pop("laws")[:]]
+    return signals, timing, laws

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from gfm_hil.files import write_text
 from gfm_hil.scenario import Scenario
 
 _STYLE = """
@@ -93,7 +94,8 @@ def write_report(
     )
     resolved = html.escape((folder / "scenario.toml").read_text("utf-8"))
     path = folder / "report.html"
-    path.write_text(
+    write_text(
+        path,
         f"""<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{html.escape(scenario.title)}</title><style>{_STYLE}</style>
@@ -106,7 +108,6 @@ def write_report(
 <h2>Events</h2><div class="scroll"><table><tr>{head}</tr>{body}</table></div>
 <h2>Scenario as resolved</h2><pre>{resolved}</pre></html>
 """,
-        encoding="utf-8",
     )
     return path
 

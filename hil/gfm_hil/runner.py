@@ -9,11 +9,12 @@ from pathlib import Path
 
 from gfm_hil.bench import Bench, make_bench
 from gfm_hil.errors import UserError
+from gfm_hil.files import write_text
 from gfm_hil.inproc import compile_loop, run_inproc
 from gfm_hil.links.base import SIDES
 from gfm_hil.processes import Processes, Progress
 from gfm_hil.recording import Part, remove_parts
-from gfm_hil.run_folder import Run, check_free, finish
+from gfm_hil.run_folder import Run, check_free, finish, in_use
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario_model import INPROC
 from gfm_hil.stopping import Interrupt
@@ -51,23 +52,26 @@ def run_scenario(
     check_free(folder, scenario.ticks)
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
-    outside = None
-    with Interrupt() as interrupt:
-        if scenario.link.type == INPROC:
-            began = _run_here(bench, folder, progress, notice, interrupt)
-        else:
-            try:
-                processes = Processes(
-                    scenario, folder, progress, notice, interrupt, tuple(controller_command)
-                )
-                began, outside = processes.run()
-            except UserError:
-                remove_parts(folder)
-                shutil.rmtree(folder)
-                raise
-    wall_s = time.monotonic() - began
-    return finish(scenario, folder, bench.controller.labels, wall_s, figures, outside)
+    with in_use(folder):
+        outside = None
+        try:
+            with Interrupt() as interrupt:
+                try:
+                    write_text(folder / "scenario.toml", scenario_toml(scenario))
+                except OSError as problem:
+                    raise UserError(f"{folder}: {problem.strerror}") from None
+                if scenario.link.type == INPROC:
+                    began = _run_here(bench, folder, progress, notice, interrupt)
+                else:
+                    command = tuple(controller_command)
+                    both = Processes(scenario, folder, progress, notice, interrupt, command)
+                    began, outside = both.run()
+        except UserError:
+            remove_parts(folder)
+            shutil.rmtree(folder)
+            raise
+        wall_s = time.monotonic() - began
+        return finish(scenario, folder, bench.controller.labels, wall_s, figures, outside)
 
 
 def _run_here(

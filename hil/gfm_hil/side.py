@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -15,6 +16,7 @@ from gfm_hil.awake import kept_awake
 from gfm_hil.bench import Bench, make_bench
 from gfm_hil.controller_side import run_controller
 from gfm_hil.errors import PeerLost, UserError
+from gfm_hil.files import write_text
 from gfm_hil.frames import DATA_IDS, FrameReader, FrameWriter
 from gfm_hil.handshake import shake_hands
 from gfm_hil.links import Link, open_link
@@ -66,7 +68,7 @@ def _run(
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "scenario.toml").exists():  # a side alone; observers want to know what it runs
-        (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
+        write_text(folder / "scenario.toml", scenario_toml(scenario))
     if scenario.mode == "realtime":
         keep_in_memory(folder, scenario.ticks, notice)
     part = Part.create(folder, side, scenario.ticks)
@@ -81,7 +83,8 @@ def _run(
     with Desk(side, bench, timeline, folder, ring, interrupt.ask):
         try:
             seen = _meet_and_run(side, bench, endpoint, part, timeline, told, interrupt, notice)
-            (folder / f"link_{side}.json").write_text(json.dumps({"side": side, **seen}))
+            with contextlib.suppress(OSError):  # on a full disk these counts are lost, no more
+                write_text(folder / f"link_{side}.json", json.dumps({"side": side, **seen}))
         except PeerLost as problem:
             timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
         finally:

@@ -1,12 +1,14 @@
 """What happens when: carries out a scenario's events tick by tick and writes down what came of it.
 
-The log is one JSON object a line, written at once, so that it is there however a run ends.
+The log is one JSON object a line, written at once, so that it is there however a run ends. A log
+that cannot be written, as on a full disk, ends the run; its last lines go where room was kept.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import threading
 import time
 from collections import deque
@@ -15,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gfm_hil.bench import Bench
+from gfm_hil.errors import UserError
 from gfm_hil.events import CONTROLLER_EVENTS, Gains, LawChange, Reference, Reset, apply_grid_event
 from gfm_hil.links.base import Side
 from gfm_hil.retune import change_gains
@@ -28,6 +31,7 @@ Status = Literal["completed", "tripped", "safe", "interrupted"]
 PLANT_LEFT = "the plant ended before the scenario did"
 CONTROLLER_LEFT = "the controller was stopped"
 #: the other side knows why
+_ROOM = 1 << 16  # bytes kept beside the log for its last lines
 _HEARSAY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
 SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
 
@@ -62,11 +66,23 @@ class Timeline:
         bench: the records that events act on.
         log: file to append to.
         sides: which events are ours.
+
+    Raises:
+        UserError: the disk is full.
     """
 
     def __init__(self, bench: Bench, log: Path, sides: tuple[Side, ...]) -> None:
         self._bench, self._sides = bench, sides
-        self._log = log.open("a", encoding="utf-8")
+        self._path, self._room = log, log.with_suffix(".room")
+        try:
+            self._log = log.open("ab", buffering=0)
+            if log.is_file():  # not /dev/null
+                with self._room.open("wb") as room:
+                    os.posix_fallocate(room.fileno(), 0, _ROOM)
+        except OSError as problem:
+            raise UserError(f"{log}: {problem.strerror}") from None
+        self._unwritten = b""
+        self.failed = ""  # why the log cannot be written, if so
         scenario = bench.scenario
         self._todo = [
             (e.at(scenario.T_s), e)
@@ -167,6 +183,8 @@ class Timeline:
     def end(self, status: Status, reason: str, tick: int) -> None:
         """The run is over; the first reason stays."""
         if self.outcome is None:
+            if self.failed and status == "interrupted":
+                status, reason = "safe", self.failed
             self.outcome = Outcome(status, reason, tick)
             side, now = "+".join(self._sides), time.monotonic_ns()  # the clock of timing.npz
             self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now)
@@ -180,14 +198,28 @@ class Timeline:
 
     def flush(self) -> None:
         """Put on disk what is not there yet; may be called from another thread."""
+        tick = 0
         while self._lines:
-            self._log.write(json.dumps(self._lines.popleft()) + "\n")
-        self._log.flush()
+            line = self._lines.popleft()
+            tick = line["tick"]
+            self._unwritten += (json.dumps(line) + "\n").encode()
+        try:
+            while self._unwritten:
+                self._unwritten = self._unwritten[self._log.write(self._unwritten) :]
+        except OSError as problem:
+            if self.failed:  # there is no room left at all: ``close`` tries again
+                return
+            self.failed = f"{self._path.name} cannot be written: {problem.strerror}"
+            self._room.unlink(missing_ok=True)
+            if not self.put_off:  # else who flushes stops the loop, which then ends the run
+                self.end("interrupted", "", tick)
+            self.flush()
 
     def close(self) -> None:
         """Close the log."""
         self.flush()
         self._log.close()
+        self._room.unlink(missing_ok=True)
 
 
 def safe_reason(ctl: Any) -> str:

@@ -17,8 +17,9 @@ from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.loops.records import TOLD
 from gfm_hil.loops.thread import run_compiled
+from gfm_hil.npz import Arrays
 from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part, merge
+from gfm_hil.recording import Part, merge, read_recording
 from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
 from gfm_hil.timeline import Timeline, read_log
@@ -97,7 +98,8 @@ def run_pair(
         if problem is not None:
             raise problem
     pair.log = read_log(*sorted(folder.glob("events_*.jsonl")))
-    pair.signals = merge(folder, scenario.T_s, benches["controller"].controller.labels)
+    merge(folder, scenario.T_s, benches["controller"].controller.labels)
+    pair.signals = dict(Arrays(read_recording(folder)[0]))
     with np.load(folder / "timing.npz") as file:
         pair.timing = dict(file)
     return pair

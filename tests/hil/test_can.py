@@ -29,8 +29,9 @@ from gfm_hil.links.can.plan import load_plan
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.loops.records import TOLD
 from gfm_hil.loops.thread import run_compiled
+from gfm_hil.npz import Arrays
 from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part, merge
+from gfm_hil.recording import Part, merge, read_recording
 from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
 from gfm_hil.timeline import Timeline
@@ -101,7 +102,8 @@ def both_sides(
     for outcome in found.values():
         if isinstance(outcome, Exception):
             raise outcome
-    return merge(folder, scenario.T_s, benches["controller"].controller.labels), found
+    merge(folder, scenario.T_s, benches["controller"].controller.labels)
+    return dict(Arrays(read_recording(folder)[0])), found
 
 
 BOTH_WAYS = pytest.mark.parametrize("portable", [True, False])

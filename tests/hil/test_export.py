@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -40,7 +41,8 @@ def table(tmp_path_factory) -> RunTable:
     first, *rest = log.read_text(encoding="utf-8").splitlines(keepends=True)
     line = json.dumps({**told, "by": "operator"}) + "\n"
     log.write_text("".join([first, line, *rest]), encoding="utf-8")
-    return load_run(folder)
+    table = load_run(folder)
+    return replace(table, values={name: x[:] for name, x in table.values.items()})
 
 
 def same(a: np.ndarray, b: np.ndarray) -> bool:

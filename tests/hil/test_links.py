@@ -19,8 +19,9 @@ from gfm_hil.handshake import shake_hands
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.zeromq.link import ZmqLink
+from gfm_hil.npz import Arrays
 from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part, merge
+from gfm_hil.recording import Part, merge, read_recording
 from gfm_hil.scenario import Scenario
 from gfm_hil.side import compile_side
 from gfm_hil.timeline import Timeline, read_log, worst
@@ -82,7 +83,8 @@ def both_sides(
     for problem in in_threads(call).values():
         if problem is not None:
             raise problem
-    return merge(folder, scenario.T_s, benches["controller"].controller.labels)
+    merge(folder, scenario.T_s, benches["controller"].controller.labels)
+    return dict(Arrays(read_recording(folder)[0]))
 
 
 def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:

@@ -20,6 +20,7 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.errors import UserError
 from gfm_hil.figures import draw_comparison
+from gfm_hil.files import write_text
 from gfm_hil.report import EVENT_COLUMNS, cell
 from gfm_hil.run_folder import Run, check_free
 from gfm_hil.runner import run_scenario
@@ -54,11 +55,11 @@ def call(options: argparse.Namespace) -> int:
         if runs[name].summary["status"] == "interrupted":
             break
     events = max((run.summary["events"] for run in runs.values()), key=len)
-    signals = {name: run.signals for name, run in runs.items() if "true_p" in run.signals}
+    signals = {name: run.columns for name, run in runs.items() if "true_p" in run.columns}
     if signals:
         draw_comparison(folder / "comparison.png", base, signals, events)
     summaries = {name: run.summary for name, run in runs.items()}
-    (folder / "comparison.json").write_text(json.dumps(summaries, indent=2) + "\n", "utf-8")
+    write_text(folder / "comparison.json", json.dumps(summaries, indent=2) + "\n")
     if options.json:
         print(json.dumps(summaries, indent=2))
     else:

@@ -1,7 +1,7 @@
 """Argument parsing and exit codes.
 
 0: done, and a run ended as its scenario expects; 2: wrong input, nothing started; 3: a run ended
-otherwise; 130: interrupted.
+otherwise, or its folder could not be completed; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from gfm_hil.errors import UserError
+from gfm_hil.errors import Unfinished, UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
 from gfm_runtime.errors import printable
@@ -24,6 +24,7 @@ from gfm_runtime.errors import printable
 MODULES = {
     "run": "run",
     "tell": "tell",
+    "recover": "recover",
     "scope": "scope",
     "modbus": "modbus",
     "export": "export",
@@ -67,6 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(options.call(options))
     except (UserError, LawError, NoEquilibrium) as problem:
         return _refuse(str(problem))
+    except Unfinished as problem:
+        _refuse(str(problem))
+        return 3
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # a reader such as head that has seen enough

@@ -12,7 +12,7 @@ from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, prin
 from gfm_hil.errors import UserError
 from gfm_hil.links import link_names
 from gfm_hil.links.base import Side
-from gfm_hil.run_folder import check_free, finish
+from gfm_hil.run_folder import check_free, finish, in_use
 from gfm_hil.scenario_model import INPROC
 from gfm_hil.side import run_side
 from gfm_hil.stopping import end_with_parent
@@ -37,23 +37,29 @@ def call(options: argparse.Namespace) -> int:
     """Carry one side out; returns the exit code."""
     side: Side = options.side
     scenario = resolve(options, law=options.law)
+    if options.part is None and scenario.link.endpoint is None:
+        raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
     if scenario.link.type == INPROC:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     folder = new_folder(options.out, side)
     if options.part is not None:  # of `gfmhil run`, which puts the parts together
         end_with_parent(options.part)
-        run_side(side, scenario, folder, notice=lambda text: None)
+        with in_use(folder):
+            run_side(side, scenario, folder, notice=lambda text: None)
         return 0
     check_free(folder, scenario.ticks)
+    labels = make_bench(scenario).controller.labels
+    folder.mkdir(parents=True, exist_ok=True)
 
     def notice(text: str) -> None:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
     began = time.monotonic()
-    run_side(side, scenario, folder, notice)
-    wall_s = time.monotonic() - began
-    run = finish(scenario, folder, make_bench(scenario).controller.labels, wall_s)
+    with in_use(folder):
+        run_side(side, scenario, folder, notice)
+        wall_s = time.monotonic() - began
+        run = finish(scenario, folder, labels, wall_s)
     if not options.quiet:
         print_summary(run.summary, folder)
     return exit_code(run.summary)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import heapq
 import tomllib
+from bisect import bisect_right
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +31,8 @@ from gfm_hil.links.can.vectors import PARTS, CanFrame, encode, sender_dtype, set
 from gfm_hil.links.can.wire import frame_dtype
 from gfm_runtime.controller import INIT, PLANT_TRIP, REASONS, SAFE
 from gfm_runtime.signals import Group, names
+
+_PIECE = 1 << 16  # ticks
 
 #: a CAN frame and when it was sent, s from tick 0
 Timed = tuple[float, CanFrame]
@@ -104,14 +107,15 @@ class _Sender:
 
 def _measurements(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
-    sender = _Sender(plan, "y", options.heartbeat)
-    rows, times = _vector(table, "y"), _times(table, "plant")
-    tripped = table.values["true_trip"] != 0
-    for k, row in enumerate(rows):
-        state, reason = (SAFE, PLANT_TRIP) if tripped[k] else (INIT, 0)
-        sender.pack(k, state, reason, row)
-        if k % options.every == 0 and not np.isnan(row[0]):
-            yield from ((times[k], frame) for frame in sender.frames())
+    sender, clock = _Sender(plan, "y", options.heartbeat), _Clock(table, "plant")
+    for first, last in _pieces(table):
+        rows, times = _vector(table, "y", first, last), clock.times(first, last)
+        tripped = table.values["true_trip"][first:last] != 0
+        for k, row in enumerate(rows, first):
+            state, reason = (SAFE, PLANT_TRIP) if tripped[k - first] else (INIT, 0)
+            sender.pack(k, state, reason, row)
+            if k % options.every == 0 and not np.isnan(row[0]):
+                yield from ((times[k - first], frame) for frame in sender.frames())
 
 
 def _commands(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
@@ -120,47 +124,77 @@ def _commands(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Time
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
     """
     sender, n = _Sender(plan, "u", options.heartbeat), options.every
-    rows, times, taken = _vector(table, "u"), _times(table, "controller"), _taken(table)
-    state = table.values["state"]
-    for k in np.flatnonzero(~np.isnan(state)).tolist():
-        at = k + n if n > 1 and k else k
-        known = at < len(rows) and bool(taken[at])
-        now = int(state[k])
-        values = rows[at] if known else np.zeros(rows.shape[1])
-        sender.pack(k, now, _safe_reason(table, k) if now == SAFE else 0, values)
-        if k % n == 0:
-            frames = sender.frames()
-            if known:
-                yield from ((times[k], frame) for frame in frames)
+    clock, reasons = _Clock(table, "controller"), _SafeReasons(table)
+    for first, last in _pieces(table):
+        times, state = clock.times(first, last), table.values["state"][first:last]
+        beyond = last + n  # u[k] may be taken as late as that
+        rows, taken = _vector(table, "u", first, beyond), _taken(table, first, beyond)
+        for j in np.flatnonzero(~np.isnan(state)).tolist():
+            k = first + j
+            at = j + n if n > 1 and k else j
+            known = at < len(rows) and bool(taken[at])
+            now = int(state[j])
+            values = rows[at] if known else np.zeros(rows.shape[1])
+            sender.pack(k, now, reasons.at(k) if now == SAFE else 0, values)
+            if k % n == 0:
+                frames = sender.frames()
+                if known:
+                    yield from ((times[j], frame) for frame in frames)
 
 
-def _vector(table: RunTable, group: Group) -> NDArray[np.float64]:
+def _pieces(table: RunTable) -> Iterator[tuple[int, int]]:
+    """The ticks of a run, first and last of a piece that is held in memory."""
+    return ((a, min(a + _PIECE, table.ticks)) for a in range(0, table.ticks, _PIECE))
+
+
+def _vector(table: RunTable, group: Group, first: int, last: int) -> NDArray[np.float64]:
     """Rows of a vector, shape (ticks, n), p.u."""
-    return np.column_stack([table.values[f"{group}_{name}"] for name in names(group)])
+    return np.column_stack([table.values[f"{group}_{n}"][first:last] for n in names(group)])
 
 
-def _taken(table: RunTable) -> NDArray[np.bool_]:
+def _taken(table: RunTable, first: int, last: int) -> NDArray[np.bool_]:
     """Ticks at which the plant took a command in time; in process it always does."""
-    received = table.values.get("plant_received")
-    return np.ones(len(table.values["tick"]), bool) if received is None else received >= 0
+    received = table.values.get("plant_received", table.values["tick"])
+    return received[first:last] >= 0
 
 
-def _times(table: RunTable, side: str) -> NDArray[np.float64]:
+class _Clock:
     """When a side sent its frame of each tick, s from tick 0."""
-    if table.summary["mode"] == "lockstep":
-        return table.values["t"]
-    sent, due = table.values[f"{side}_sent"], table.values[f"{side}_scheduled"]
-    known = np.flatnonzero(due >= 0)[0]
-    begin = due[known] - round(known * table.summary["T_s"] * 1e9)
-    return (sent - begin) * 1e-9
+
+    def __init__(self, table: RunTable, side: str) -> None:
+        self._t = table.values["t"] if table.summary["mode"] == "lockstep" else None
+        if self._t is None:
+            self._sent, due = table.values[f"{side}_sent"], table.values[f"{side}_scheduled"]
+            for first, last in _pieces(table):
+                known = np.flatnonzero(due[first:last] >= 0)
+                if len(known):
+                    k = first + int(known[0])
+                    self._begin = int(due[k : k + 1][0]) - round(k * table.summary["T_s"] * 1e9)
+                    break
+
+    def times(self, first: int, last: int) -> NDArray[np.float64]:
+        """The times of ticks [first, last), shape (ticks,)."""
+        if self._t is not None:
+            return self._t[first:last]
+        return (self._sent[first:last] - self._begin) * 1e-9
 
 
-def _safe_reason(table: RunTable, tick: int) -> int:
-    """Code of the reason for which the controller is in SAFE; the log has it in words."""
-    said = [
-        line["reason"]
-        for line in table.events
-        if "controller" in line.get("side", "") and "reason" in line and line["tick"] <= tick
-    ]
-    codes = [k for k, text in enumerate(REASONS) if text and said and said[-1].startswith(text)]
-    return codes[0] if codes else 0
+class _SafeReasons:
+    """Codes of the reasons for which the controller was in SAFE; the log has them in words."""
+
+    def __init__(self, table: RunTable) -> None:
+        said = [
+            line
+            for line in table.events
+            if "controller" in line.get("side", "") and "reason" in line
+        ]
+        self._ticks = [line["tick"] for line in said]
+        self._codes = [0, *(self._code(line["reason"]) for line in said)]
+
+    @staticmethod
+    def _code(reason: str) -> int:
+        return next((k for k, text in enumerate(REASONS) if text and reason.startswith(text)), 0)
+
+    def at(self, tick: int) -> int:
+        """The code of the reason given last at a tick; 0 for none."""
+        return self._codes[bisect_right(self._ticks, tick)]

@@ -43,7 +43,7 @@ _TIMES = {
 
 
 @dataclass(frozen=True)
-class Column:
+class Described:
     """One column: its name in the run folder, unit (empty for codes), a line for people, and the
     words for its values if it is a code."""
 
@@ -53,7 +53,7 @@ class Column:
     words: tuple[tuple[int, str], ...] = ()
 
 
-def describe(name: str, laws: list[str]) -> Column:
+def describe(name: str, laws: list[str]) -> Described:
     """A column of signals.npz or timing.npz, by its name there.
 
     Args:
@@ -65,7 +65,7 @@ def describe(name: str, laws: list[str]) -> Column:
         "state": tuple(enumerate(STATES)),
         "true_trip": tuple(TRIP_REASONS.items()),
     }
-    return Column(name, *_unit_and_comment(name), words.get(name, ()))
+    return Described(name, *_unit_and_comment(name), words.get(name, ()))
 
 
 def _unit_and_comment(name: str) -> tuple[str, str]:

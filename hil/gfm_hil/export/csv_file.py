@@ -15,7 +15,5 @@ def write_csv(table: RunTable, file: Path) -> None:
     with file.open("w", newline="", encoding="utf-8") as out:
         writer = csv.writer(out)
         writer.writerow(table.values)
-        count = len(table.values["tick"])
-        for first in range(0, count, _LINES):
-            block = [x[first : first + _LINES].tolist() for x in table.values.values()]
-            writer.writerows(zip(*block, strict=True))
+        for _, block in table.blocks(_LINES):
+            writer.writerows(zip(*(x.tolist() for x in block.values()), strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -12,6 +11,7 @@ from typing import Any
 
 from gfm_hil.errors import UserError
 from gfm_hil.export.table import load_run
+from gfm_hil.files import replacing, write_text
 
 
 @dataclass(frozen=True)
@@ -67,21 +67,17 @@ def export_run(folder: Path, name: str, file: Path) -> list[Path]:
     """
     check_format(name)
     table, form = load_run(folder), FORMATS[name]
-    # no half a file under its name; asammdf and python-can go by the suffix
-    part = file.with_name(f".{file.stem}-{os.getpid()}{file.suffix}")
     written = [file]
     try:
-        part.touch()  # the packages say it each in its own way
-        _function(form.writer)(table, part)
-        if form.beside is not None:
-            suffix, text = form.beside
-            written.append(file.with_suffix(suffix))
-            written[-1].write_text(_function(text)(table), encoding="utf-8")
-        part.replace(file)
+        with replacing(file) as part:
+            part.touch()  # the packages say it each in its own way
+            _function(form.writer)(table, part)
+            if form.beside is not None:
+                suffix, text = form.beside
+                written.append(file.with_suffix(suffix))
+                write_text(written[-1], _function(text)(table))
     except OSError as problem:
-        raise UserError(f"{file}: {problem.strerror}") from None
-    finally:
-        part.unlink(missing_ok=True)
+        raise UserError(f"{file}: {problem.strerror or problem}") from None
     return written
 
 

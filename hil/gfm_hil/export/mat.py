@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.export.table import RunTable, event_text
+from gfm_hil.npz import Column
 
 
 def write_mat(table: RunTable, file: Path) -> None:
@@ -18,7 +19,7 @@ def write_mat(table: RunTable, file: Path) -> None:
     def cells(texts: list[str]) -> Any:
         return np.array(texts, dtype=object).reshape(-1, 1)
 
-    content: dict[str, Any] = {name: x.reshape(-1, 1) for name, x in table.values.items()}
+    content: dict[str, Any] = {}
     content["unit"] = {c.name: c.unit for c in table.columns}
     content["comment"] = {c.name: c.comment for c in table.columns}
     content["words"] = {
@@ -37,4 +38,18 @@ def write_mat(table: RunTable, file: Path) -> None:
         "text": cells([event_text(e) for e in table.events]),
     }
     content["scenario"] = table.text("scenario.toml")
-    savemat(file, content, appendmat=False, long_field_names=True, do_compression=True)
+    variables = _OneByOne(table.values, content)
+    savemat(file, variables, appendmat=False, long_field_names=True, do_compression=True)
+
+
+class _OneByOne(dict[str, Any]):
+    """Variables for ``savemat``, which asks for each in its turn: no two columns are in memory."""
+
+    def __init__(self, columns: dict[str, Column], content: dict[str, Any]) -> None:
+        super().__init__(content)
+        self._columns = columns
+
+    def items(self) -> Any:
+        for name, column in self._columns.items():
+            yield name, column[:].reshape(-1, 1)
+        yield from super().items()

@@ -11,8 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
+from gfm_hil.export.columns import Described
 from gfm_hil.export.table import RunTable, event_text
 
+_ROWS = 1 << 17  # handed over at a time
 _ATTACHED = {
     "scenario.toml": "application/toml",
     "summary.json": "application/json",
@@ -24,23 +28,27 @@ def write_mf4(table: RunTable, file: Path) -> None:
     """Write a run."""
     from asammdf import MDF, Signal
 
-    t = table.values["t"]
-    signals = [
-        Signal(
-            table.values[c.name],
-            t,
+    def signal(c: Described, rows: dict[str, NDArray[Any]]) -> Any:
+        return Signal(
+            rows[c.name],
+            rows["t"],
             name=c.name,
             unit=c.unit,
             comment=c.comment,
             conversion=_words(c.words),
         )
-        for c in table.columns
-        if c.name != "t"  # the group's master
-    ]
+
+    channels = [c for c in table.columns if c.name != "t"]  # the group's master
     began = (table.folder / "scenario.toml").stat().st_mtime  # written as the run is started
     with MDF(version="4.11") as mdf:
         mdf.start_time = datetime.fromtimestamp(began, UTC)
-        mdf.append(signals, comment=table.summary["title"], common_timebase=True)
+        empty = {name: x[:0] for name, x in table.values.items()}
+        for first, rows in table.blocks(_ROWS) if table.ticks else [(0, empty)]:
+            if first:  # asammdf keeps what was appended in a file of its own
+                mdf.extend(0, [(rows["t"], None), *((rows[c.name], None) for c in channels)])
+            else:
+                signals = [signal(c, rows) for c in channels]
+                mdf.append(signals, comment=table.summary["title"], common_timebase=True)
         mdf.events = [_event(event, table.summary["T_s"]) for event in table.events]
         for name, mime in _ATTACHED.items():
             mdf.attach(table.text(name).encode(), name, mime=mime)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from gfm_hil.export.table import RunTable
 
+_ROWS = 1 << 17  # of a row group, which is held in memory
+
 
 def write_parquet(table: RunTable, file: Path) -> None:
     """Write a run; laws, events, summary and scenario lie in the file's own metadata."""
@@ -29,10 +31,13 @@ def write_parquet(table: RunTable, file: Path) -> None:
         "scenario": table.text("scenario.toml"),
     }
     # columns of smoothly changing numbers: bytes of one place beside each other compress well
-    parquet.write_table(
-        pa.table(list(table.values.values()), schema=pa.schema(fields, metadata=about)),
+    schema = pa.schema(fields, metadata=about)
+    with parquet.ParquetWriter(
         file,
+        schema,
         compression="zstd",
         use_dictionary=False,
         column_encoding="BYTE_STREAM_SPLIT",
-    )
+    ) as writer:
+        for _, block in table.blocks(_ROWS):
+            writer.write_table(pa.table(list(block.values()), schema=schema))

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.errors import UserError
-from gfm_hil.export.columns import Column, describe
+from gfm_hil.export.columns import Described, describe
+from gfm_hil.npz import Column
+from gfm_hil.recording import read_recording
 from gfm_hil.timeline import read_log
 
 
@@ -22,18 +24,29 @@ class RunTable:
     Attributes:
         folder: of the run.
         columns: described, in the order of ``values``.
-        values: by name, each shape (ticks,): float64 in the unit of its column, or int64.
+        values: by name, each shape (ticks,): float64 in the unit of its column, or int64; a slice
+            of one is read from the file, and nothing more.
         laws: labels of the laws, which the column ``law`` refers to.
         events: lines of events.jsonl.
         summary: content of summary.json.
     """
 
     folder: Path
-    columns: list[Column]
-    values: dict[str, NDArray[Any]]
+    columns: list[Described]
+    values: dict[str, Column]
     laws: list[str]
     events: list[dict[str, Any]]
     summary: dict[str, Any]
+
+    @property
+    def ticks(self) -> int:
+        """Rows of the table."""
+        return len(self.values["tick"])
+
+    def blocks(self, ticks: int) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
+        """Rows in blocks of at most ``ticks``: the first tick, and all columns from there on."""
+        for first in range(0, self.ticks, ticks):
+            yield first, {name: x[first : first + ticks] for name, x in self.values.items()}
 
     def text(self, name: str) -> str:
         """A text file of the run folder."""
@@ -47,18 +60,16 @@ def load_run(folder: Path) -> RunTable:
         UserError: it is no run folder, or the run is not over.
     """
     try:
-        with np.load(folder / "signals.npz") as file:
-            laws = [str(name) for name in file["laws"]]
-            values = {name: file[name] for name in file.files if name != "laws"}
-        with np.load(folder / "timing.npz") as file:
-            values |= {name: file[name] for name in file.files}
+        signals, timing, laws = read_recording(folder)
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except FileNotFoundError as problem:
         going = (folder / "scenario.toml").is_file()
-        what = "the run is not over, see gfmhil stream" if going else "is not a run folder"
+        what = "the run is not over, see gfmhil stream, or was cut off, see gfmhil recover"
+        what = what if going else "is not a run folder"
         raise UserError(f"{folder}: {what} ({Path(problem.filename).name} is missing)") from None
     except (OSError, ValueError) as problem:
         raise UserError(f"{folder}: {problem}") from None
+    values = {**signals, **timing}
     columns = [describe(name, laws) for name in values]
     log = read_log(folder / "events.jsonl")
     return RunTable(folder, columns, values, laws, log, summary)

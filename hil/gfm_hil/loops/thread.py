@@ -55,8 +55,8 @@ def run_compiled(
     try:
         while thread.is_alive():
             thread.join(_LOOK_S)
-            told[STOP] = stopped()
             timeline.flush()
+            told[STOP] = stopped() or bool(timeline.failed)
     finally:  # a second Ctrl-C: the thread must not outlive what it writes to
         told[STOP] = 1
         while thread.is_alive():

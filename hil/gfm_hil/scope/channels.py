@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.metrics import Rows
 from gfm_runtime.signals import Group, Signal, group
 
-Columns = Mapping[str, NDArray[Any]]  #: of a recording, by name, one row a tick
+Columns = Mapping[str, Rows]  #: of a recording, by name, one row a tick
 Values = NDArray[np.float64]
 
 _SYMBOLS = {"omega_u": "f", "omega_g": "f_g"}  # a scope shows frequencies in Hz

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from gfm_hil.recording import (
     PLANT_COLUMNS,
     PLANT_TIMES,
     Part,
+    read_recording,
 )
 from gfm_hil.scope.channels import Columns
 from gfm_hil.timeline import read_log
@@ -148,11 +148,11 @@ def open_record(folder: Path) -> Record:
 
 def _finished(folder: Path, scenario: dict[str, Any]) -> Record:
     try:
-        columns = {**_mapped(folder / "signals.npz"), **_mapped(folder / "timing.npz")}
-        laws = [_law(str(label)) for label in columns.pop("laws")]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as problem:
+        signals, timing, laws = read_recording(folder)
+    except OSError as problem:
         raise UserError(f"{folder}: signals.npz or timing.npz cannot be read: {problem}") from None
-    record = Record(folder, scenario, columns, laws, live=False)
+    columns = {**signals, **timing}
+    record = Record(folder, scenario, columns, [_law(label) for label in laws], live=False)
     record._done = record.capacity = len(columns["tick"])
     return record
 
@@ -162,30 +162,6 @@ def _columns(side: str, part: Part) -> dict[str, NDArray[Any]]:
     signals, times = np.asarray(part.signals), np.asarray(part.times)
     found = {name: signals[:, j] for j, name in enumerate(_COLUMNS[side])}
     return found | {f"{side}_{name}": times[:, j] for j, name in enumerate(_TIMES[side])}
-
-
-def _mapped(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of an .npz without reading them: what ``np.savez`` writes is stored as it is."""
-    found: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(path) as archive, path.open("rb") as file:
-        for info in archive.infolist():
-            if info.compress_type != zipfile.ZIP_STORED:
-                raise ValueError(f"{info.filename} is compressed")
-            file.seek(info.header_offset + 26)  # lengths of name and extra field, PKWARE APPNOTE
-            lengths = np.frombuffer(file.read(4), "<u2")
-            file.seek(info.header_offset + 30 + int(lengths.sum()))
-            version = np.lib.format.read_magic(file)
-            header = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }[version]
-            shape, _, dtype = header(file)
-            if 0 in shape:
-                array = np.empty(shape, dtype)
-            else:
-                array = np.asarray(np.memmap(path, dtype, "r", file.tell(), shape))
-            found[info.filename.removesuffix(".npy")] = array
-    return found
 
 
 def ready(scenario: dict[str, Any]) -> list[str]:

@@ -120,7 +120,7 @@ class View:
     def _last(self, column: str, head: int) -> float:
         """A column at the newest tick; -1 if it is not known."""
         rows = self._pyramid.record.columns.get(column)
-        value = float(rows[head - 1]) if rows is not None and head > 0 else np.nan
+        value = float(rows[head - 1 : head][0]) if rows is not None and head > 0 else np.nan
         return value if np.isfinite(value) else -1
 
     def _mean(self, name: str, head: int) -> float:

@@ -1,0 +1,37 @@
+"""gfmhil recover: complete the folder of a run that was cut off."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.cli.common import print_summary
+from gfm_hil.run_folder import recover
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "recover",
+        help="complete the folder of a run that a kill or a full disk cut off",
+        description=(
+            "Complete the folder of a run that a kill, a power failure or a full disk cut off: "
+            "signals, times, events, summary, figures and report of all that was recorded. "
+            "The command leaves a folder that is complete as it is."
+        ),
+    )
+    command.add_argument("folder", type=Path, help="the run folder")
+    command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Complete the folder; returns the exit code."""
+    run = recover(options.folder)
+    if options.json:
+        print(json.dumps(run.summary, indent=2))
+    else:
+        print_summary(run.summary, options.folder)
+    return 0

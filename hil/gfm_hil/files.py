@@ -1,0 +1,50 @@
+"""Files that are there whole or not at all: written under another name, then renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+_PREFIX = ".part-"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a path beside ``path`` to write to; what was written there then becomes ``path``.
+
+    The data are on the disk before the new name is, so that a power failure leaves either the old
+    file or the new one. If the block raises, ``path`` stays as it was.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    part = path.with_name(f"{_PREFIX}{os.getpid()}-{path.name}")
+    try:
+        yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole text file, see ``replacing``."""
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in ``folder`` on the disk before anything else is done."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def unfinished(folder: Path) -> list[Path]:
+    """What a killed process was just writing in ``folder``."""
+    return sorted(folder.glob(f"{_PREFIX}*"))
