@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -90,6 +92,35 @@ def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
     finally:
         process.terminate()
         process.wait()
+
+
+@contextmanager
+def serving(scope: Any) -> Iterator[int]:
+    """Serve a ``Scope`` from a thread of this process; its port."""
+    loop = asyncio.new_event_loop()
+    ports: list[int] = []
+    ready = threading.Event()
+
+    def note(port: int) -> None:
+        ports.append(port)
+        ready.set()
+
+    task = loop.create_task(scope.serve("127.0.0.1", [0], None, note))
+
+    def work() -> None:
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            loop.close()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        assert ready.wait(PATIENCE_S)
+        yield ports[0]
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
 
 
 class Browser:
