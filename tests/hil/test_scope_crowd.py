@@ -20,7 +20,7 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope
 from gfm_hil.scope.view import View
 
-from .scope_pages import Rig, rig, serving, wait_for
+from .scope_pages import Rig, mute, rig, serving, wait_for
 
 LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "held", "span": 0.1}
 
@@ -62,23 +62,6 @@ def gone(peer: ClientConnection) -> bool:
         except ConnectionClosed:
             return True
     return False
-
-
-@contextlib.contextmanager
-def mute(port: int, *messages: str) -> Iterator[socket.socket]:
-    """A page that says hello to HTTP, sends messages, and from then on reads nothing."""
-    with socket.socket() as raw:
-        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-        raw.connect(("127.0.0.1", port))
-        raw.sendall(
-            b"GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
-            b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-        )
-        for text in messages:
-            assert len(text) < 126  # the short form of a frame, masked with zeros
-            raw.sendall(bytes((0x81, 0x80 | len(text), 0, 0, 0, 0)) + text.encode())
-        yield raw
 
 
 @pytest.mark.attack(
