@@ -50,14 +50,18 @@ def temporary(prefix: str) -> Iterator[Path]:
 
 
 def held(place: Path) -> bool:
-    """Whether somebody uses a folder."""
+    """Whether a process uses a folder.
+
+    Raises:
+        OSError: it cannot be told, for example because there are no descriptors left.
+    """
     try:
         handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError:  # it is gone
+    except FileNotFoundError:  # it is gone
         return False
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return True
     finally:
         os.close(handle)

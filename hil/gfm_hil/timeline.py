@@ -49,6 +49,7 @@ class Outcome:
 class Ticket:
     """What became of an event that an operator put in: its tick once ``done``, or an error."""
 
+    operator: dict[str, Any]
     done: threading.Event = field(default_factory=threading.Event)
     tick: int = -1
     error: str = ""
@@ -95,6 +96,7 @@ class Timeline:
         self.put_off = False  # a disk may keep the writer waiting for longer than a tick
         self.outcome: Outcome | None = None
         self._fault: tuple[Status, str] | None = None  # what a run that waits is waiting for
+        self.stopped_by: dict[str, Any] | None = None  # the operator, if one has said stop
 
     @property
     def running(self) -> bool:
@@ -105,9 +107,14 @@ class Timeline:
         """Tick of the next event; far away if there is none."""
         return self._todo[0][0] if self._todo else 2**62
 
-    def insert(self, event: Any) -> Ticket:
-        """Have an event of ours carried out at the next tick; may be called from any thread."""
-        ticket = Ticket()
+    def insert(self, event: Any, operator: dict[str, Any]) -> Ticket:
+        """Have an event of ours carried out at the next tick; may be called from any thread.
+
+        Args:
+            event: a checked one.
+            operator: who gives the command, for the log.
+        """
+        ticket = Ticket(operator)
         self._inbox.append((event, ticket))
         return ticket
 
@@ -124,7 +131,7 @@ class Timeline:
             if not ticket.claim():
                 continue
             try:
-                self._carry_out(event, tick, by="operator")
+                self._carry_out(event, tick, by="operator", operator=ticket.operator)
                 ticket.tick = tick
             except ValueError as problem:  # of a plant that has changed since it was checked
                 ticket.error = str(problem)
@@ -187,7 +194,10 @@ class Timeline:
                 status, reason = "safe", self.failed
             self.outcome = Outcome(status, reason, tick)
             side, now = "+".join(self._sides), time.monotonic_ns()  # the clock of timing.npz
-            self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now)
+            more: dict[str, Any] = {}
+            if status == "interrupted" and self.stopped_by is not None:
+                more = {"operator": self.stopped_by}
+            self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now, **more)
 
     def write(self, tick: int, kind: str, **more: Any) -> None:
         """One line of the log; on disk at once, or at the next ``flush`` if that is put off."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -90,6 +93,52 @@ def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
     finally:
         process.terminate()
         process.wait()
+
+
+@contextmanager
+def serving(scope: Any) -> Iterator[int]:
+    """Serve a ``Scope`` from a thread of this process; its port."""
+    loop = asyncio.new_event_loop()
+    ports: list[int] = []
+    ready = threading.Event()
+
+    def note(port: int) -> None:
+        ports.append(port)
+        ready.set()
+
+    task = loop.create_task(scope.serve("127.0.0.1", [0], None, note))
+
+    def work() -> None:
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            loop.close()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        assert ready.wait(PATIENCE_S)
+        yield ports[0]
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+
+
+@contextmanager
+def mute(port: int, *messages: str) -> Iterator[socket.socket]:
+    """A page that says hello to HTTP, sends messages, and from then on reads nothing."""
+    with socket.socket() as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        raw.connect(("127.0.0.1", port))
+        raw.sendall(
+            b"GET /socket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
+            b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        for text in messages:
+            assert len(text) < 126  # the short form of a frame, masked with zeros
+            raw.sendall(bytes((0x81, 0x80 | len(text), 0, 0, 0, 0)) + text.encode())
+        yield raw
 
 
 class Browser:

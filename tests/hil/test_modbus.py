@@ -124,6 +124,22 @@ def test_a_set_point_reverts(device, run):
     write(device, 704, WSetRvrtTms=0)
 
 
+@pytest.mark.attack(
+    "10.6", "who moved the set-point over Modbus?", "`by`: operator, whoever it was"
+)
+def test_the_log_says_who_commanded(device, run, attack_now):
+    before = len(told(run))
+    write(device, 704, WSetRvrtTms=1, WSetEna=1, WSet=3100)
+    wait_for(lambda: any("name" in line["operator"] for line in told(run)[before:]))
+    write(device, 704, WSetRvrtTms=0)
+    *clients, timer = (line["operator"] for line in told(run)[before:])
+    assert timer == {"through": "modbus", "name": "timer"}
+    assert clients
+    for client in clients:
+        assert client.pop("peer").startswith("127.0.0.1:") and client == {"through": "modbus"}
+    attack_now(f"address and port of the client; `{json.dumps(timer)}` for the taking back")
+
+
 def test_droops_and_voltage(device, run):
     control = device.models[711][0]
     for name in ("KOf", "KUf"):
@@ -307,9 +323,8 @@ def test_a_certificate_is_asked_of_every_client(run, tmp_path):
     server.private_key_pem.write_to_path(files["key"])
     server.cert_chain_pems[0].write_to_path(files["cert"])
     authority.cert_pem.write_to_path(files["ca"])
-    authority.issue_cert("operator@bench").private_key_and_cert_chain_pem.write_to_path(
-        files["mine"]
-    )
+    mine = authority.issue_cert("operator@bench", common_name="Ada")
+    mine.private_key_and_cert_chain_pem.write_to_path(files["mine"])
     stranger.issue_cert("nobody@bench").private_key_and_cert_chain_pem.write_to_path(
         files["theirs"]
     )
@@ -324,6 +339,7 @@ def test_a_certificate_is_asked_of_every_client(run, tmp_path):
         assert known.models[1][0].Mn.value == "gfmhil"
         write(known, 704, WSetEna=1, WSet=2200)
         wait_for(lambda: last(run)["ref_P_ref"] == 0.55)
+        assert "commonName=Ada" in told(run)[-1]["operator"]["certificate"]
         write(known, 704, WSetEna=0)
         known.close()
         for certificate in (None, files["theirs"]):

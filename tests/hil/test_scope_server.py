@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import os
 import shutil
 import ssl
 import subprocess
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -27,7 +25,7 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope, static_files
 from gfm_hil.scope.view import HEAD
 
-from .scope_pages import addresses
+from .scope_pages import addresses, serving
 
 LOOK = {"kind": "look", "id": 1, "channels": ["p", "omega_u"], "bins": 50, "mode": "held"}
 
@@ -38,28 +36,8 @@ def served(run) -> Iterator[tuple[int, Access, Any]]:
     done = run(events=[{"type": "reference", "t": 0.05, "P_ref": 0.6}])
     access = Access()
     scope = Scope(open_record(done.folder), access)
-    loop = asyncio.new_event_loop()
-    ports: list[int] = []
-    ready = threading.Event()
-
-    def note(port: int) -> None:
-        ports.append(port)
-        ready.set()
-
-    task = loop.create_task(scope.serve("127.0.0.1", [0], None, note))
-
-    def work() -> None:
-        try:
-            loop.run_until_complete(task)
-        except asyncio.CancelledError:
-            loop.close()
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    assert ready.wait(20)
-    yield ports[0], access, done
-    loop.call_soon_threadsafe(task.cancel)
-    thread.join()
+    with serving(scope) as port:
+        yield port, access, done
 
 
 def fetch(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import time
 from collections import defaultdict
@@ -17,10 +18,11 @@ import zmq
 from gfm_hil.cli import main
 from gfm_hil.links.base import SIDES
 from gfm_hil.operator import Operator
-from gfm_hil.recording import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
+from gfm_hil.recording import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
 from gfm_hil.telemetry import BlockReader
 from gfm_hil.telemetry.blocks import block_dtype, messages
-from gfm_hil.telemetry.follow import Rows
+from gfm_hil.telemetry.follow import Follower, Rows
+from gfm_hil.telemetry.publish import Ports, Publisher
 from gfm_hil.telemetry.samples import Sampler
 
 SCENARIO = """
@@ -299,3 +301,37 @@ def test_a_port_that_is_taken_is_named(start, tmp_path):
     assert again.returncode == 2
     assert f"--port {port}: tcp://127.0.0.1:{port}: Address already in use" in error
     stop(folder, run, stream)
+
+
+@pytest.mark.attack(
+    "3.6", "one exception in the stream's follower", "the stream ends while the run goes on"
+)
+def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now):
+    monkeypatch.setattr("gfm_hil.supervised.PAUSE_S", 0.01)
+    ticks = 3000
+    (tmp_path / "scenario.toml").write_text("T_s = 1e-4\n", encoding="utf-8")
+    part = Part.create(tmp_path, "plant", ticks)
+    follower = Follower(tmp_path)
+    part.signals[:], part.times[:] = 0.5, -1
+    looks = iter(range(100, ticks + 1, 100))
+
+    def stopped() -> bool:
+        part.progress[0] = next(looks, ticks)
+        if part.progress[0] == ticks:
+            shutil.rmtree(tmp_path / "parts", ignore_errors=True)
+        return False
+
+    find, calls = follower._find, iter(range(100))
+    problems = {2: OSError(24, "Too many open files"), 3: ValueError("a mistake of ours")}
+
+    def sometimes(from_now: bool) -> None:
+        if problem := problems.get(next(calls)):
+            raise problem
+        find(from_now)
+
+    monkeypatch.setattr(follower, "_find", sometimes)
+    with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:
+        sent = publisher.follow(follower, 500.0, stopped)
+    assert sent == ticks
+    assert "Too many open files" in caplog.text and "a mistake of ours" in caplog.text
+    attack_now(f"2 of 2 reported; {sent} of {ticks} ticks sent on")

@@ -16,6 +16,7 @@ from gfm_hil.stopping import end_with_parent
 
 PORT = 8470
 _LOOK_S = 0.1
+_OPERATOR = "operator"  # who has the address with control if no names are given
 _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 
 
@@ -40,6 +41,11 @@ def add(commands: Any) -> None:
         "--plain", action="store_true",
         help="serve beyond this machine without encryption: everybody on the way sees the token",
     )  # fmt: skip
+    command.add_argument(
+        "--operator", action="append", metavar="NAME",
+        help="print an address with control for NAME, under which the run's log has what is "
+        "commanded with it; may be repeated",
+    )  # fmt: skip
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
     command.set_defaults(call=call)
 
@@ -57,14 +63,16 @@ def call(options: argparse.Namespace) -> int:
     while options.wait and not begun(options.folder):
         time.sleep(_LOOK_S)
     os.nice(_NICENESS)
-    access = Access([*options.name, options.host])
+    access = Access([*options.name, options.host], dict.fromkeys(options.operator or [_OPERATOR]))
     scope = Scope(open_record(options.folder), access)
 
     def ready(port: int) -> None:
         host = f"[{options.host}]" if ":" in options.host else options.host
         address = f"http{'s' if encryption else ''}://{host}:{port}/"
         print(f"scope, to look: {address}")
-        print(f"with control:   {address}#token={access.token}")
+        for name, token in access.tokens.items():
+            whose = "" if name == _OPERATOR else f" ({name})"
+            print(f"with control{whose}:   {address}#token={token}")
         sys.stdout.flush()
 
     run_scope(scope, options.host, ports, encryption, ready)

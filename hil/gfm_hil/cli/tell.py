@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Carry it out; returns the exit code."""
     events = _events(options)
-    operator = Operator(options.folder)
+    operator = Operator(options.folder, through="tell")
     try:
         for event in events:
             done = operator.tell(event)

@@ -10,6 +10,9 @@ import asyncio
 import logging
 import ssl
 import struct
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from pymodbus.constants import ExcCodes
@@ -17,7 +20,9 @@ from pymodbus.pdu import ExceptionResponse, ModbusPDU
 from pymodbus.server import ModbusTcpServer
 from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import SimDevice
-from pymodbus.transport import CommParams, CommType
+
+from gfm_hil.listener import Listener
+from gfm_hil.operator import Identity, Rate, address
 
 UNIT = 1
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows it, unit
@@ -25,7 +30,28 @@ _LONGEST = 1024  # of unit and PDU; 254 by the specification, and what is longer
 _BUFFER = 64 * 1024
 _MOST_WAITING = 32
 _WRITE_ONE, _WRITE_MANY = 6, 16
-_FUNCTIONS = (3, _WRITE_ONE, _WRITE_MANY)
+_WRITES = (_WRITE_ONE, _WRITE_MANY)
+_FUNCTIONS = (3, *_WRITES)
+
+CLIENTS = 64  # at a time that have asked for something, and as many that have not yet
+HALF_OPEN_S = 10.0  # in which a client must make its first request
+IDLE_S = 300.0  # after which a silent client is dropped, but for the one that commands
+SEND_S = 5.0  # in which a client must take an answer
+_PER_S, _BURST = 50.0, 100  # requests of one client that come to commands
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Client:
+    """Who is at the other end, and how much it may command."""
+
+    identity: Identity
+    rate: Rate
+
+
+CLIENT: ContextVar[Client | None] = ContextVar("client", default=None)
+"""Whose request is being carried out; None: nobody's, a timer has run out."""
 
 _Request = tuple[int, int, bytes]  # transaction, unit, PDU
 
@@ -38,7 +64,27 @@ class Connection(ServerRequestHandler):
         super().callback_connected()
         self.max_buffer_size = _BUFFER  # pymodbus throws away what is beyond it
         self._waiting: asyncio.Queue[_Request | None] = asyncio.Queue()
+        self._room = asyncio.Event()
+        self._room.set()
+        self.number = int(self.transport.get_extra_info("socket").fileno())
         self.server.workers.add(asyncio.create_task(self._work()))
+
+    def _client(self) -> Client:
+        """Who it is, as far as the connection tells."""
+        peer = address(self.transport.get_extra_info("peername"))
+        secure = self.transport.get_extra_info("ssl_object")
+        subject = None if secure is None else secure.getpeercert()["subject"]
+        name = subject and ", ".join(f"{key}={value}" for part in subject for key, value in part)
+        who = Identity(through="modbus", peer=peer, certificate=name and name[:1000])
+        return Client(who, Rate("this client", _PER_S, _BURST))
+
+    def pause_writing(self) -> None:
+        """The client does not take what it is sent."""
+        self._room.clear()
+
+    def resume_writing(self) -> None:
+        """It does again."""
+        self._room.set()
 
     def callback_disconnected(self, exc: Exception | None) -> None:
         """What was received is still carried out, what it said is not sent any more."""
@@ -50,28 +96,49 @@ class Connection(ServerRequestHandler):
         used = 0
         while len(data) - used >= _HEADER.size:
             transaction, protocol, length, unit = _HEADER.unpack_from(data, used)
-            if protocol or not 2 <= length <= _LONGEST or self._waiting.qsize() >= _MOST_WAITING:
+            if self._waiting.qsize() >= _MOST_WAITING:  # it will not take its answers either
+                self._drop()
+                return len(data)
+            if protocol or not 2 <= length <= _LONGEST:
                 self.close()
+                self._waiting.put_nowait(None)  # pymodbus does not say that this one has ended
                 return len(data)
             end = used + _HEADER.size - 1 + length
             if end > len(data):
                 break
             self._waiting.put_nowait((transaction, unit, data[used + _HEADER.size : end]))
             used = end
+        if used:
+            self.server.peers.heard(self.number)
         return used
+
+    def _drop(self) -> None:
+        """End the connection with what has not been sent yet."""
+        transport: Any = self.transport
+        if transport is not None:
+            transport.abort()
 
     async def _work(self) -> None:
         """Answer one request after the other until the connection is closed."""
+        CLIENT.set(client := self._client())
         while (request := await self._waiting.get()) is not None:
             transaction, unit, frame = request
             try:
                 answer = await self._answer(unit, frame)
             except Exception:  # whatever it is, the client shall not wait for ever
-                logging.getLogger(__name__).exception("request %s", frame.hex())
+                _LOG.exception("request %s", frame.hex())
                 answer = ExceptionResponse(frame[0] & 0x7F, ExcCodes.DEVICE_FAILURE)
             answer.transaction_id, answer.dev_id = transaction, unit
             if self.transport is not None:
                 self.server_send(answer, None)
+            try:
+                async with asyncio.timeout(SEND_S):
+                    await self._room.wait()
+            except TimeoutError:
+                who = client.identity.peer
+                _LOG.warning("%s: has taken nothing for %g s: the client is dropped", who, SEND_S)
+                self._room.set()
+                self._drop()
         self.server.workers.discard(asyncio.current_task())
 
     async def _answer(self, unit: int, frame: bytes) -> ModbusPDU:
@@ -86,6 +153,8 @@ class Connection(ServerRequestHandler):
         answer = await request.datastore_update(self.server.context, UNIT)
         if code == _WRITE_ONE and not answer.isError():  # an echo, whatever it reads afterwards
             answer.address, *answer.registers = struct.unpack(">HH", frame[1:])
+        if code in _WRITES and not answer.isError():
+            self.server.keep(self)
         return answer
 
 
@@ -96,18 +165,29 @@ class Server(ModbusTcpServer):
         device: what it serves.
         address: host and port.
         tls: of a server that demands a certificate of its clients; None: plain TCP.
+
+    Raises:
+        OSError: the address is not to be had.
     """
 
     def __init__(
         self, device: SimDevice, address: tuple[str, int], tls: ssl.SSLContext | None
     ) -> None:
-        if tls is not None:  # frames are the same: pymodbus' own for TLS takes one a record
-            self.tls_setup = CommParams(
-                comm_type=CommType.TLS, comm_name="server_listener", reconnect_delay=0.0,
-                reconnect_delay_max=0.0, timeout_connect=0.0, sslctx=tls,
-            )  # fmt: skip
         super().__init__(device, address=address)
+        self.peers = Listener(*address, CLIENTS, HALF_OPEN_S, IDLE_S)
+        # frames are the same with TLS: pymodbus' own server for it takes one a record
+        self.call_create = partial(
+            self.loop.create_server, self.handle_new_connection, sock=self.peers, ssl=tls
+        )
         self.workers: set[asyncio.Task[None]] = set()
+        self._commands: Connection | None = None
+
+    def keep(self, connection: Connection) -> None:
+        """Keep a connection, however silent it may be: its client commands, until another does."""
+        if self._commands is not None:
+            self.peers.keep(self._commands.number, kept=False)
+        self._commands = connection
+        self.peers.keep(connection.number)
 
     async def shutdown(self) -> None:
         """Hang up on everybody."""
@@ -115,12 +195,6 @@ class Server(ModbusTcpServer):
         for worker in self.workers:
             worker.cancel()
         await asyncio.gather(*self.workers, return_exceptions=True)
-
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        listening: Any = self.transport
-        return int(listening.sockets[0].getsockname()[1])
 
     def callback_new_connection(self) -> Connection:
         """For a client that has connected."""

@@ -14,6 +14,7 @@ from typing import Any
 from pymodbus.constants import ExcCodes
 
 from gfm_hil.errors import UserError
+from gfm_hil.modbus.connection import CLIENT
 from gfm_hil.modbus.curves import (
     DROOP,
     VOLT_VAR,
@@ -178,6 +179,7 @@ class Device:
             if view is None:
                 raise Refused(ExcCodes.DEVICE_FAILURE, "the run has not begun")
             plans = self._plans(cut, view)
+            _count(plans)
             try:
                 await self._carry_out(plans, view)
             except UserError as problem:
@@ -245,3 +247,15 @@ class Device:
         if "V_ref" in meaning:
             events.append({"type": "reference", "V_ref": meaning["V_ref"]})
         return tuple(events)
+
+
+def _count(plans: Sequence[Plan]) -> None:
+    """Count a request that comes to commands among those of its client; a stop always passes."""
+    client = CLIENT.get()
+    kinds = [event["type"] for plan in plans for event in plan.events]
+    if client is None or not kinds or "stop" in kinds:
+        return
+    try:
+        client.rate.take()
+    except UserError as problem:
+        raise Refused(ExcCodes.DEVICE_BUSY, str(problem)) from None

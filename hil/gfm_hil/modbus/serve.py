@@ -20,17 +20,19 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES
-from gfm_hil.modbus.connection import UNIT, Server
+from gfm_hil.modbus.connection import CLIENT, UNIT, Server
 from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE
 from gfm_hil.modbus.view import Watcher
-from gfm_hil.operator import Operator, present
+from gfm_hil.operator import Identity, Operator, present
 from gfm_hil.scenario import load_scenario
+from gfm_hil.supervised import supervised
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
 
-_LOOK = round(0.1 / TICK_S)  # ticks of the clock between two looks at what changes seldom
-_SECOND = round(1.0 / TICK_S)
+_LOOK_S = 0.1  # between two looks at what changes seldom
+_LOOKS = 10  # of those between two looks at the slack
+_TIMER = Identity(through="modbus", name="timer")
 _NICE = 10  # behind everything that is in a hurry
 
 
@@ -116,10 +118,12 @@ async def _serve(
     began = time.monotonic()
 
     def tell(event: dict[str, Any]) -> None:
+        client = CLIENT.get()
+        by = _TIMER if client is None else client.identity
         if event["type"] == "stop":
-            operator.stop()
+            operator.stop(by)
         else:
-            operator.tell(event)
+            operator.tell(event, by)
         watcher.forget()
 
     device = Device(
@@ -128,16 +132,23 @@ async def _serve(
     )  # fmt: skip
     with contextlib.suppress(OSError):
         os.nice(_NICE)
-    server = _server(device, address, context)
     try:
+        server = _server(device, address, context)
         await server.serve_forever(background=True)
-    except RuntimeError:
+    except (RuntimeError, OSError):
         where = f"--host {address.host} --port {address.port}"
         raise UserError(f"{where}: cannot listen there") from None
     try:
         kind = "Modbus/TCP" if context is None else "Modbus/TCP with TLS"
-        notice(f"{kind} on {address.host}:{server.port}, unit {UNIT}, SunSpec from {BASE}")
-        await _clock(folder, device, watcher, began, over)
+        port = server.peers.port
+        notice(f"{kind} on {address.host}:{port}, unit {UNIT}, SunSpec from {BASE}")
+        await asyncio.gather(
+            supervised("the clock of the Modbus server", lambda: _clock(device, began, over)),
+            supervised(
+                "the Modbus server's look at the run",
+                lambda: _watch(folder, device, watcher, server, over),
+            ),
+        )
     finally:
         await server.shutdown()
 
@@ -158,24 +169,32 @@ def _server(device: Device, address: Address, context: ssl.SSLContext | None) ->
     return Server(sim, (address.host, address.port), context)
 
 
-async def _clock(
-    folder: Path, device: Device, watcher: Watcher, began: float, over: asyncio.Event
-) -> None:
+async def _clock(device: Device, began: float, over: asyncio.Event) -> None:
     """Tick until the run is over; ticks that were slept through are made up for by the last."""
-    tick = look = second = 0
+    tick = 0
     while not over.is_set():
-        if tick >= look:
-            look = tick + _LOOK
-            if not _going(folder):
-                return
-            device.take((folder / LOCAL).exists())
-        if tick >= second:
-            second = tick + _SECOND
-            device.slack = watcher.slack()
         await device.clock()
         tick = max(tick + 1, int((time.monotonic() - began) / TICK_S))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(over.wait(), max(began + tick * TICK_S - time.monotonic(), 0))
+        await _rest(over, began + tick * TICK_S - time.monotonic())
+
+
+async def _watch(
+    folder: Path, device: Device, watcher: Watcher, server: Server, over: asyncio.Event
+) -> None:
+    """See until the run is over what changes seldom: the clock does not depend on it."""
+    while not over.is_set():
+        device.slack = watcher.slack()
+        for _ in range(_LOOKS):
+            if not _going(folder):
+                over.set()
+            device.take((folder / LOCAL).exists())
+            server.peers.reap()
+            await _rest(over, _LOOK_S)
+
+
+async def _rest(over: asyncio.Event, seconds: float) -> None:
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(over.wait(), max(seconds, 0))
 
 
 def begun(folder: Path) -> bool:

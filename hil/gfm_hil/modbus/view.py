@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gfm_hil.errors import UserError
 from gfm_hil.operator import Operator
 from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, PLANT_TIMES, Part
 from gfm_hil.scenario import Scenario
@@ -92,7 +94,8 @@ class Watcher:
         code = (row["law"], row["state"], row["true_trip"])
         now = time.monotonic()
         if code != self._code or now >= self._asked + _NAMES_S:  # takes the reading of files
-            self._said = {**self._said, **self._operator.snapshot()}
+            with contextlib.suppress(UserError):  # names that are a little old serve as well
+                self._said = {**self._said, **self._operator.snapshot()}
             self._code, self._asked = code, now
         if "active" not in self._said:  # the controller's desk is not there yet
             return None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil import scratch
+from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES, Side
 
 SCHEME = "ipc://"
@@ -18,15 +19,28 @@ def announcement(folder: Path, side: Side) -> Path:
 
 
 def announced(folder: Path, side: Side) -> dict[str, Any] | None:
-    """What a side's desk announces, or None if there is none that lives."""
+    """What a side's desk announces, or None if there is none that lives.
+
+    Raises:
+        UserError: it cannot be told whether there is one; that says nothing about the run.
+    """
+    file = announcement(folder, side)
     try:
-        found = json.loads(announcement(folder, side).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = dict(json.loads(file.read_text(encoding="utf-8")))
+        place = Path(str(found["endpoint"]).removeprefix(SCHEME)).parent
+        return found if scratch.held(place) else None
+    except FileNotFoundError:
         return None
-    place = Path(str(found["endpoint"]).removeprefix(SCHEME)).parent
-    return dict(found) if scratch.held(place) else None
+    except OSError as problem:
+        raise UserError(f"{file}: {problem.strerror}") from None
+    except (ValueError, TypeError, KeyError) as problem:
+        raise UserError(f"{file}: not an announcement of a run: {problem!r}") from None
 
 
 def present(folder: Path) -> list[Side]:
-    """The sides that have a desk that lives."""
+    """The sides that have a desk that lives.
+
+    Raises:
+        UserError: it cannot be told whether a side has one.
+    """
     return [side for side in SIDES if announced(folder, side) is not None]

@@ -11,6 +11,7 @@ from gfm_hil.errors import UserError
 from gfm_hil.events import CONTROLLER_EVENTS
 from gfm_hil.links.base import Side
 from gfm_hil.operator.announced import announced, present
+from gfm_hil.operator.identity import Identity, local
 from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
 from gfm_plant import TRIP_REASONS
 from gfm_runtime.controller import REASONS, STATES
@@ -24,13 +25,14 @@ class Operator:
 
     Args:
         folder: the run folder.
+        through: what passes the commands on, for the log of the run.
 
     Raises:
         UserError: nothing is going on there.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, through: str = "python") -> None:
+        self._folder, self._local = folder, local(through)
         self._context = zmq.Context()
         if not present(folder):
             raise UserError(f"{folder}: no run is going on there")
@@ -39,8 +41,12 @@ class Operator:
         """Let go of the sockets."""
         self._context.destroy(linger=0)
 
-    def tell(self, event: dict[str, Any]) -> dict[str, Any]:
+    def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
         """Have an event of a scenario, without its time, carried out at once.
+
+        Args:
+            event: plain data, ``type`` and what belongs to it.
+            by: who gives the command; this process if None.
 
         Returns:
             ``tick`` at which it was, and its ``label``.
@@ -48,13 +54,19 @@ class Operator:
         Raises:
             UserError: it was refused, with the reason; or the side is gone.
         """
-        side: Side = "controller" if event.get("type") in _CONTROLLERS else "plant"
-        return self._ask(side, event)
+        kind = event.get("type", "")
+        if not isinstance(kind, str):
+            raise UserError(f"type = {str(kind)[:60]}: must be the name of an event")
+        return self._ask("controller" if kind in _CONTROLLERS else "plant", event, by)
 
-    def stop(self) -> None:
-        """End the run as Ctrl-C would."""
+    def stop(self, by: Identity | None = None) -> None:
+        """End the run as Ctrl-C would.
+
+        Raises:
+            UserError: the run does not answer.
+        """
         for side in present(self._folder):
-            self._ask(side, {"type": "stop"})
+            self._ask(side, {"type": "stop"}, by)
             return
 
     def snapshot(self) -> dict[str, Any]:
@@ -89,17 +101,25 @@ class Operator:
                     found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found
 
-    def _ask(self, side: Side, content: dict[str, Any]) -> dict[str, Any]:
+    def _ask(self, side: Side, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
         desk = announced(self._folder, side)
         if desk is None:
             raise UserError(f"{self._folder}: the {side} is not running")
+        content = {**event, "by": (by or self._local).plain()}
+        try:
+            answer = self._exchange(side, desk["endpoint"], content)
+        except zmq.ZMQError as problem:  # no descriptor for a socket, for example
+            raise UserError(f"{self._folder}: the {side} cannot be asked: {problem}") from None
+        if not answer["ok"]:
+            raise UserError(str(answer["error"]))
+        return {key: value for key, value in answer.items() if key != "ok"}
+
+    def _exchange(self, side: Side, endpoint: str, content: dict[str, Any]) -> dict[str, Any]:
         with self._context.socket(zmq.REQ) as socket:
             socket.set(zmq.LINGER, 0)
-            socket.connect(desk["endpoint"])
+            socket.connect(endpoint)
             socket.send_json(content)
             if not socket.poll(_ANSWER_MS):
                 raise UserError(f"{self._folder}: the {side} does not answer")
             answer: Any = socket.recv_json()
-        if not answer["ok"]:
-            raise UserError(str(answer["error"]))
-        return {key: value for key, value in answer.items() if key != "ok"}
+        return dict(answer)

@@ -2,7 +2,8 @@
 
 A command is an event of a scenario without its time. It is checked here, in a thread that the
 loop never waits for; a good one is put into the timeline and the loop's bell is rung, so that it
-is carried out between two ticks. The answer names that tick. The socket is a ZeroMQ REP on a Unix
+is carried out between two ticks. The answer names that tick. ``by`` in the command says who gives
+it (see ``Identity``), and the log of the run records that. The socket is a ZeroMQ REP on a Unix
 path in a folder that only this user can read; ``desk_<side>.json`` in the run folder names it.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -32,14 +34,19 @@ from gfm_hil.events import (
 )
 from gfm_hil.links.base import Side
 from gfm_hil.operator.announced import SCHEME, announcement
+from gfm_hil.operator.identity import Identity
+from gfm_hil.operator.rate import Rate
 from gfm_hil.retune import retuned
 from gfm_hil.timeline import Timeline
 
 _LOOK_MS = 100
 _TAKEN_OVER_S = 5.0  # in lockstep a tick may take as long as the other side likes
 _LARGEST = 65536  # bytes of a command
+_PER_S, _BURST = 100.0, 200  # commands to one side, of all operators together
 
 _EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+_UNKNOWN = {"through": "socket"}  # a program that does not say who it is
+_LOG = logging.getLogger(__name__)
 
 
 class Desk:
@@ -64,6 +71,7 @@ class Desk:
         self._side, self._bench, self._timeline = side, bench, timeline
         self._announcement = announcement(folder, side)
         self._ring, self._stop = ring, stop
+        self._rate = Rate("all operators together", _PER_S, _BURST)
         self._over = threading.Event()
 
     def __enter__(self) -> Desk:
@@ -114,21 +122,25 @@ class Desk:
     def _answer(self, message: bytes) -> dict[str, Any]:
         try:
             content = json.loads(message)
-            if content == {"type": "stop"}:
+            if not isinstance(content, dict):
+                raise ValueError("a command must be an object")
+            by = Identity.model_validate(content.pop("by", _UNKNOWN))
+            if content == {"type": "stop"}:  # always passes
+                self._timeline.stopped_by = by.plain()
                 self._stop()
                 return {"ok": True}
-            if isinstance(content, dict):
-                for key in ("t", "tick"):
-                    if key in content:
-                        raise ValueError(
-                            f"{key} = {content[key]}: a command is carried out at once"
-                        )
-                content["tick"] = 0
-            return self._carry_out(self._checked(content))
+            self._rate.take()
+            for key in ("t", "tick"):
+                if key in content:
+                    raise ValueError(f"{key} = {content[key]}: a command is carried out at once")
+            return self._carry_out(self._checked({**content, "tick": 0}), by)
         except ValidationError as problem:
             return {"ok": False, "error": "; ".join(lines(problem))}
-        except (ValueError, RecursionError) as problem:
+        except (UserError, ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
+        except Exception as problem:  # a mistake of ours; the next command must find a desk
+            _LOG.exception("the %s's desk: %r", self._side, message[:200])
+            return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
 
     def _checked(self, content: Any) -> Any:
         """The event, with everything tried out that might fail in the loop.
@@ -154,8 +166,8 @@ class Desk:
             apply_grid_event(event, par, st)
         return event
 
-    def _carry_out(self, event: Any) -> dict[str, Any]:
-        ticket = self._timeline.insert(event)
+    def _carry_out(self, event: Any, by: Identity) -> dict[str, Any]:
+        ticket = self._timeline.insert(event, by.plain())
         self._ring()
         until = time.monotonic() + _TAKEN_OVER_S
         while not ticket.done.wait(_LOOK_MS * 1e-3):

@@ -33,11 +33,15 @@ class Access:
 
     Args:
         names: hosts, beside addresses, localhost and this machine's name, by which it is reached.
+        operators: names of those who may control; each gets a token of his own.
+
+    Attributes:
+        tokens: by the name of the operator.
     """
 
-    def __init__(self, names: Iterable[str] = ()) -> None:
+    def __init__(self, names: Iterable[str] = (), operators: Iterable[str] = ("operator",)) -> None:
         self._names = {"localhost", socket.gethostname().lower(), *(n.lower() for n in names)}
-        self.token = secrets.token_urlsafe(16)
+        self.tokens = {name: secrets.token_urlsafe(16) for name in operators}
 
     def refusal(self, headers: Headers) -> str:
         """Why a request is refused; empty if it is not.
@@ -64,6 +68,15 @@ class Access:
             return host in self._names
         return True
 
-    def may_control(self, token: str) -> bool:
-        """The token is the one that was printed."""
-        return hmac.compare_digest(token.encode(), self.token.encode())
+    @property
+    def token(self) -> str:
+        """Of the first operator."""
+        return next(iter(self.tokens.values()))
+
+    def operator(self, token: str) -> str:
+        """The name of the operator who was given this token; empty if there is none."""
+        given = token.encode()
+        names = [
+            n for n, known in self.tokens.items() if hmac.compare_digest(given, known.encode())
+        ]
+        return names[0] if names else ""

@@ -104,11 +104,18 @@ class Record:
         return read_log(whole) if whole.is_file() else read_log(*self.folder.glob("events_*.jsonl"))
 
     def ended(self) -> dict[str, str] | None:
-        """How the run ended, once it has: ``status`` and ``reason``."""
+        """How the run ended, once it has: ``status`` and ``reason``.
+
+        Raises:
+            OSError: the summary cannot be read.
+            UserError: it cannot be told whether the run goes on.
+        """
         try:
             content = json.loads((self.folder / "summary.json").read_text("utf-8"))
-        except (OSError, ValueError):
+        except FileNotFoundError:
             return self._gone()
+        except ValueError:  # it is just being written
+            return None
         return {key: content[key] for key in ("status", "reason")}
 
     def _gone(self) -> dict[str, str] | None:

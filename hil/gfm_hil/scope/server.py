@@ -7,32 +7,39 @@ import contextlib
 import http
 import logging
 import os
+import socket
 import ssl
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from gfm_hil.errors import UserError
-from gfm_hil.operator import Operator
+from gfm_hil.listener import Listener
+from gfm_hil.operator import Identity, Operator
 from gfm_hil.scenario_model import INPROC
 from gfm_hil.scope.access import HEADERS, Access
 from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.record import Record
 from gfm_hil.scope.record import ready as ready_laws
-from gfm_hil.scope.session import Session
+from gfm_hil.scope.session import SEND_S, Session, in_words
+from gfm_hil.supervised import supervised
 from gfm_runtime.controller import STATES
 from gfm_runtime.signals import group
 
 FRAMES_PER_S = 30
 _LOG_S = 0.25  # between two looks at what has happened
 _LARGEST = 16384  # bytes of a message from a page
-_PAGES = 16  # at a time
+_PAGES = 16  # at a time that look, and as many that control
+WAITING = 64  # connections that are no page yet, or fetch a file
+HALF_OPEN_S = 10.0  # in which a connection must become a page
+_PING_S = 10.0  # between two pings, and for their answer: a page that does not live is dropped
 _EVENTS = 500  # of the newest, told to pages
 
 _STATIC = Path(__file__).resolve().parent / "static"
@@ -43,6 +50,7 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _SOCKET = "/socket"
+_CONTROL = "control"  # query of a page that will say a token at once, and waits for the answer
 
 _LOG = logging.getLogger("gfmhil.scope")  # what comes to the port and is no browser is no error
 _LOG.addFilter(lambda record: "handshake" not in record.getMessage())
@@ -95,54 +103,65 @@ class Scope:
         Raises:
             UserError: none of the ports is to be had.
         """
-        async with await self._listen(host, ports, encryption) as server:
-            ready(next(iter(server.sockets)).getsockname()[1])
-            log = asyncio.create_task(self._follow_log())
-            try:
-                await self._frames()
-            finally:
-                log.cancel()
+        with _listen(host, ports) as listener:
 
-    async def _listen(
-        self, host: str, ports: list[int], encryption: ssl.SSLContext | None
-    ) -> Server:
-        for port in ports:
-            try:
-                return await serve(
-                    self._page, host, port, ssl=encryption, process_request=self._answer,
-                    compression=None, max_size=_LARGEST, max_queue=8, server_header=None,
-                    logger=_LOG,
-                )  # fmt: skip
-            except OSError as problem:
-                reason = os.strerror(problem.errno) if problem.errno else str(problem)
-        raise UserError(f"--host {host} --port {ports[0]}: {reason}")
+            async def page(connection: ServerConnection) -> None:
+                await self._page(connection, listener)
+
+            async with serve(
+                page, sock=listener, ssl=encryption, process_request=self._answer,
+                compression=None, max_size=_LARGEST, max_queue=8, server_header=None, logger=_LOG,
+                ping_interval=_PING_S, ping_timeout=_PING_S, close_timeout=SEND_S,
+            ):  # fmt: skip
+                ready(listener.port)
+                await asyncio.gather(
+                    supervised("the scope's pictures", self._frames),
+                    supervised("the scope's look at events", self._follow_log),
+                    supervised("the scope's connections", lambda: _reap(listener)),
+                )
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The files; None for the WebSocket."""
         refusal = self.access.refusal(request.headers)
         if refusal:
             return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", refusal)
-        path = request.path.partition("?")[0]
+        path, _, query = request.path.partition("?")
         if path == _SOCKET:
-            if len(self._sessions) < _PAGES:
+            full = self._full(control=False)
+            if query == _CONTROL or not full:
                 return None
-            text = f"{_PAGES} pages look already"
-            return _response(http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", text)
+            return _response(http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", full)
         if path not in self._static:
             return _response(http.HTTPStatus.NOT_FOUND, "text/plain", "not found")
         kind, content = self._static[path]
         return _response(http.HTTPStatus.OK, kind, content)
 
-    async def _page(self, socket: ServerConnection) -> None:
-        session = Session(socket, self._pyramid, self.access, self._tell)
-        self._sessions.add(session)
-        try:
-            await session.say("about", **self._about())
-            await session.say("events", **self._happened())
-            with contextlib.suppress(ConnectionClosed):
-                await session.listen()
-        finally:
-            self._sessions.discard(session)
+    def _full(self, control: bool) -> str:
+        """Why there is no room for one more page that may control, or may only look; or ""."""
+        if sum(bool(s.operator) == control for s in self._sessions) < _PAGES:
+            return ""
+        return f"{_PAGES} pages {'control' if control else 'look'} already"
+
+    async def _page(self, connection: ServerConnection, listener: Listener) -> None:
+        """One page's connection, to its end. One that says that it will control takes no place
+        among those that look: until its token was right it is one of those that wait, of which
+        the listener drops the oldest."""
+        session = Session(connection, self._pyramid, self.access, self._tell)
+        with contextlib.suppress(ConnectionClosed):
+            request = connection.request
+            if request is not None and request.path.partition("?")[2] == _CONTROL:
+                await session.hear(await connection.recv())
+            if full := self._full(bool(session.operator)):
+                await connection.close(CloseCode.TRY_AGAIN_LATER, full)
+                return
+            listener.keep(connection.transport.get_extra_info("socket").fileno())
+            self._sessions.add(session)
+            try:
+                await session.say("about", **self._about())
+                await session.say("events", **self._happened())
+                await session.run()
+            finally:
+                self._sessions.discard(session)
 
     async def _frames(self) -> None:
         """Take in what is new and show it, at a steady pace."""
@@ -167,8 +186,9 @@ class Scope:
             self.record.look_up_laws()
             now = self._happened()
             if now != said:
+                news = in_words("events", **now)
                 for session in list(self._sessions):
-                    await session.say("events", **now)
+                    session.post(news)
             said = now
             await asyncio.sleep(_LOG_S)
 
@@ -199,18 +219,35 @@ class Scope:
             "grid_hz": s["plant"]["grid"].get("omega_g", 1.0) * self.record.f_b,
         }
 
-    async def _tell(self, event: dict[str, Any]) -> dict[str, Any]:
+    async def _tell(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
         async with self._commands:
-            return await asyncio.to_thread(self._tell_now, event)
+            return await asyncio.to_thread(self._tell_now, event, by)
 
-    def _tell_now(self, event: dict[str, Any]) -> dict[str, Any]:
+    def _tell_now(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
         if not self.record.live:
             raise UserError("the run is over")
         if self._operator is None:
             if self.record.scenario["link"]["type"] == INPROC:
                 raise UserError("a run in one process (link inproc) takes no commands")
             self._operator = Operator(self.record.folder)
-        return self._operator.tell(event)
+        return self._operator.tell(event, by)
+
+
+def _listen(host: str, ports: list[int]) -> Listener:
+    for port in ports:
+        try:
+            return Listener(host, port, WAITING, HALF_OPEN_S, HALF_OPEN_S)
+        except socket.gaierror as problem:
+            reason = problem.strerror
+        except OSError as problem:
+            reason = os.strerror(problem.errno) if problem.errno else str(problem)
+    raise UserError(f"--host {host} --port {ports[0]}: {reason}")
+
+
+async def _reap(listener: Listener) -> None:
+    while True:
+        listener.reap()
+        await asyncio.sleep(_LOG_S)
 
 
 def _response(status: http.HTTPStatus, kind: str, content: str | bytes) -> Response:

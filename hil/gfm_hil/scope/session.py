@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import time
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any, Literal
@@ -14,12 +15,23 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from gfm_hil.errors import UserError, lines
+from gfm_hil.operator import Identity, Rate, address
 from gfm_hil.scope.access import Access
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.view import Look, View
 
 #: carries an event out, says at which tick; raises UserError with the reason of a refusal
-Teller = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
+
+SEND_S = 5.0  # in which a page must take what it is sent
+PER_S, BURST = 20.0, 40  # commands from one page
+
+_LOG = logging.getLogger("gfmhil.scope")
+
+
+def in_words(kind: str, **content: Any) -> str:
+    """A message in words, as it is sent."""
+    return json.dumps({"kind": kind, **content})
 
 
 class _Message(BaseModel):
@@ -46,7 +58,7 @@ class Tell(_Message):
     """An event for the run."""
 
     kind: Literal["tell"]
-    id: int
+    id: int = Field(ge=-(2**53), le=2**53)  # what a number of JavaScript can hold
     event: dict[str, Any]
 
 
@@ -58,21 +70,37 @@ _MESSAGE: TypeAdapter[Hello | Look | Play | Tell] = TypeAdapter(
 class Session:
     """State of one connection.
 
+    Three things go out to a page, each in its own way, so that a page that is slow, or that does
+    not read at all, keeps nothing from another page: answers wait for the page, which alone waits
+    for them; of news and of pictures only the newest is kept, and ``run`` sends it when there is
+    room. A page that takes nothing for ``SEND_S`` is dropped.
+
     Args:
         socket: to the page.
         pyramid: of the recording.
         access: the rules.
         tell: for commands.
+
+    Attributes:
+        operator: the name that belongs to the page's token; empty: the page may only look.
     """
 
     def __init__(
         self, socket: ServerConnection, pyramid: Pyramid, access: Access, tell: Teller
     ) -> None:
         self._socket, self._pyramid, self._access, self._tell = socket, pyramid, access, tell
-        self.control = False
+        self.operator = ""
+        self._rate = Rate("this page", PER_S, BURST)
         self._view: View | None = None
         self._played: tuple[float, float, float] | None = None  # start [ticks], speed, since when
-        self._sending: asyncio.Task[None] | None = None
+        self._news: str | None = None
+        self._picture: bytes | None = None
+        self._wake = asyncio.Event()
+
+    @property
+    def peer(self) -> str:
+        """Address and port of the page."""
+        return address(self._socket.remote_address)
 
     def head(self) -> int:
         """Ticks that this page considers done."""
@@ -83,41 +111,75 @@ class Session:
         return min(self._pyramid.done, int(start + gone))
 
     def picture(self) -> None:
-        """Send the next frame, unless there is none or the page has not taken the last one yet:
-        a slow page sees fewer pictures, never older ones."""
-        if self._view is None or (self._sending is not None and not self._sending.done()):
+        """Send the next frame soon, unless there is none or the page has not taken the last one
+        yet: a slow page sees fewer pictures, never older ones. A page whose picture cannot be made
+        is dropped."""
+        if self._view is None or self._picture is not None:
             return
-        frame = self._view.frame(self.head())
-        if frame is not None:
-            self._sending = asyncio.create_task(self._send(frame))
+        try:
+            self._picture = self._view.frame(self.head())
+        except Exception:
+            _LOG.exception("%s: its picture cannot be made: the page is dropped", self.peer)
+            self._view = None
+            self._socket.transport.abort()
+        if self._picture is not None:
+            self._wake.set()
+
+    def post(self, news: str) -> None:
+        """Send a message soon; a newer one takes the place of one that has not been sent yet."""
+        self._news = news
+        self._wake.set()
 
     async def say(self, kind: str, **content: Any) -> None:
-        """A message in words."""
-        await self._send(json.dumps({"kind": kind, **content}))
+        """A message in words, at once."""
+        await self._send(in_words(kind, **content))
 
     async def _send(self, message: str | bytes) -> None:
-        with contextlib.suppress(ConnectionClosed):
-            await self._socket.send(message)
+        try:
+            async with asyncio.timeout(SEND_S):
+                await self._socket.send(message)
+        except TimeoutError:
+            _LOG.warning("%s: has taken nothing for %g s: the page is dropped", self.peer, SEND_S)
+            self._socket.transport.abort()
 
-    async def listen(self) -> None:
-        """Deal with messages until the page has gone."""
-        async for text in self._socket:
-            try:
-                message = _MESSAGE.validate_json(text)
-                match message:
-                    case Hello():
-                        self.control = self._access.may_control(message.token)
-                        await self.say("control", granted=self.control)
-                    case Look():
-                        self._view = View(self._pyramid, message, self.head())
-                    case Play():
-                        self._play(message)
-                    case Tell():
-                        await self._command(message)
-            except ValidationError as problem:
-                await self.say("error", text="; ".join(lines(problem)).removeprefix(": "))
-            except ValueError as problem:
-                await self.say("error", text=str(problem))
+    async def run(self) -> None:
+        """Deal with messages, and send what is to be seen, until the page has gone."""
+        sending = asyncio.create_task(self._keep_sending())
+        try:
+            async for text in self._socket:
+                await self.hear(text)
+        finally:
+            sending.cancel()
+
+    async def _keep_sending(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while await self._wake.wait():
+                self._wake.clear()
+                news, self._news = self._news, None
+                if news is not None:
+                    await self._send(news)
+                if self._picture is not None:
+                    await self._send(self._picture)
+                    self._picture = None
+
+    async def hear(self, text: str | bytes) -> None:
+        """Deal with one message."""
+        try:
+            message = _MESSAGE.validate_json(text)
+            match message:
+                case Hello():
+                    self.operator = self._access.operator(message.token)
+                    await self.say("control", granted=bool(self.operator))
+                case Look():
+                    self._view = View(self._pyramid, message, self.head())
+                case Play():
+                    self._play(message)
+                case Tell():
+                    await self._command(message)
+        except ValidationError as problem:
+            await self.say("error", text="; ".join(lines(problem)).removeprefix(": "))
+        except ValueError as problem:
+            await self.say("error", text=str(problem))
 
     def _play(self, message: Play) -> None:
         if self._pyramid.record.live:
@@ -127,9 +189,12 @@ class Session:
 
     async def _command(self, message: Tell) -> None:
         try:
-            if not self.control:
+            if not self.operator:
                 raise UserError("this page may look, not touch: open the address with the token")
-            done = await self._tell(message.event)
+            if message.event.get("type") != "stop":  # which always passes
+                self._rate.take()
+            by = Identity(through="scope", name=self.operator, peer=self.peer)
+            done = await self._tell(message.event, by)
         except UserError as problem:
             await self.say("answer", id=message.id, ok=False, text=str(problem))
         else:

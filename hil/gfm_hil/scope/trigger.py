@@ -22,8 +22,8 @@ class Trigger(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    channel: str
-    level: float
+    channel: str = Field(max_length=40)
+    level: float = Field(ge=-1e9, le=1e9)
     edge: Literal["rising", "falling", "both"] = "rising"
     mode: Literal["auto", "normal", "single"] = "auto"
     before: float = Field(0.2, ge=0, le=1, description="part of the picture before the edge")

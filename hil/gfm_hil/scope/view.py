@@ -7,7 +7,7 @@ each of them and of those that are only watched.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -35,6 +35,8 @@ HEAD = {
 }
 _NOW_S = 0.02
 
+ChannelName = Annotated[str, Field(max_length=40)]
+
 
 class Look(BaseModel):
     """What a page wants to see."""
@@ -42,9 +44,9 @@ class Look(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: Literal["look"]
-    id: int = Field(ge=0)
-    channels: list[str] = Field(max_length=24)
-    watched: list[str] = Field(default=[], max_length=24)
+    id: int = Field(ge=0, lt=2**53)  # a frame carries it as float64
+    channels: list[ChannelName] = Field(max_length=24)
+    watched: list[ChannelName] = Field(default=[], max_length=24)
     bins: int = Field(ge=16, le=4096)
     mode: Literal["roll", "held", "trigger"]
     span: float = Field(gt=0, le=1e6, description="s")

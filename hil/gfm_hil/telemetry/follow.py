@@ -69,17 +69,23 @@ class Follower:
                 self._next[side] = int(part.progress[0]) if from_now else 0
 
     def news(self) -> list[Rows]:
-        """What has been recorded since the last call; ``over`` tells that there will be no more."""
-        self.over = not (self.folder / "parts").is_dir()  # put together, and gone
+        """What has been recorded since the last call that returned; ``over`` tells that there will
+        be no more.
+
+        Raises:
+            OSError: it cannot be told what there is; the next call finds it.
+        """
+        over = not (self.folder / "parts").is_dir()  # put together, and gone
         self._find(from_now=False)
         found = []
         for side, part in self.parts.items():
-            first, done = self._next[side], int(part.progress[0]) - (0 if self.over else _LAST)
+            first, done = self._next[side], int(part.progress[0]) - (0 if over else _LAST)
             if done > first:
-                self._next[side] = done
                 rows = slice(first, done)
                 signals, times = np.asarray(part.signals[rows]), np.asarray(part.times[rows])
                 found.append(Rows(side, first, signals, times))
+        self.over = over
+        self._next |= {rows.side: rows.first + len(rows.signals) for rows in found}
         return found
 
     def misses_before(self) -> int:

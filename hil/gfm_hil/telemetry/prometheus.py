@@ -84,9 +84,10 @@ class RunCollector(Collector):
 
     def _seen(self, follower: Follower) -> dict[str, Any]:
         """The newest tick in words; laws by their index where no desk tells their names."""
-        with contextlib.suppress(UserError):  # no desk: in process, or not yet
+        seen: dict[str, Any] = {}
+        with contextlib.suppress(UserError):  # no desk: in process, or not yet, or not to be read
             self._operator = self._operator or Operator(follower.folder)
-        seen = self._operator.snapshot() if self._operator is not None else {}
+            seen = self._operator.snapshot()
         part = follower.parts.get("controller")
         if part is not None and not seen and int(part.progress[0]):
             law, state, _ = part.signals[int(part.progress[0]) - 1, -3:].tolist()

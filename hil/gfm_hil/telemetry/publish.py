@@ -10,6 +10,7 @@ import zmq
 
 from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES, Side
+from gfm_hil.supervised import attempt
 from gfm_hil.telemetry import blocks
 from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.samples import Sampler
@@ -69,16 +70,20 @@ class Publisher:
         sampler = Sampler(follower.T_s, rate, follower.misses_before())
         count: dict[Side, int] = dict.fromkeys(SIDES, 0)
         looked = time.monotonic()
-        while not follower.over and not stopped():
-            time.sleep(_LOOK_S)
-            now = time.monotonic()
+
+        def look() -> None:
+            nonlocal looked
+            before, looked = looked, time.monotonic()
             for rows in follower.news():
                 count[rows.side] += len(rows.signals)
-                for message in sampler.messages(rows, now - looked):
+                for message in sampler.messages(rows, looked - before):
                     self._samples.send_multipart(message)
                 for message in blocks.messages(rows):
                     self._blocks.send_multipart(message)
-            looked = now
+
+        while not follower.over and not stopped():
+            time.sleep(_LOOK_S)
+            attempt("the stream's look at the run", look)
         return count["plant"] or count["controller"]
 
 

@@ -25,7 +25,9 @@ export class Link {
 
   open() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    this.socket = new WebSocket(`${scheme}://${location.host}/socket`);
+    // With a token there is room also where many look: the query says that a hello comes first.
+    const query = this.token ? "?control" : "";
+    this.socket = new WebSocket(`${scheme}://${location.host}/socket${query}`);
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => {
       if (this.token) this.say({ kind: "hello", token: this.token });

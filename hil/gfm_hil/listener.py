@@ -1,0 +1,117 @@
+"""A listening socket with room for so many peers: a new one takes the place of the most silent.
+
+The servers of asyncio take every connection that comes, to the last descriptor of the process. They
+call ``accept`` of the socket that they are given, and here that socket counts. Peers that have sent
+nothing whole yet have their own room, so that however many of them come, they take no place from
+those that speak.
+"""
+
+from __future__ import annotations
+
+import resource
+import socket
+import time
+from dataclasses import dataclass
+from typing import Any
+
+_KEEPALIVE = (  # the kernel finds out within a minute that the other machine is gone
+    (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 30),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3),
+)
+
+
+@dataclass
+class _Peer:
+    """A connection; ``since`` is when it last sent something whole or, if it never ``spoke``, when
+    it came, s. One that is ``kept`` may be silent for ever and is not counted."""
+
+    connection: socket.socket
+    since: float
+    spoke: bool = False
+    kept: bool = False
+
+
+class Listener(socket.socket):
+    """A listening TCP socket, bound.
+
+    Args:
+        host, port: to listen at; the first address that the name stands for.
+        limit: connections that have not spoken yet, and as many that have; never more than a
+            quarter of the descriptors that the process may have.
+        half_open_s: how long a peer may take to send its first whole message.
+        idle_s: how long a peer may be silent after a message.
+
+    Raises:
+        OSError: the address is not to be had.
+    """
+
+    def __init__(self, host: str, port: int, limit: int, half_open_s: float, idle_s: float) -> None:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        super().__init__(family, kind, protocol)
+        self._limit = min(limit, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
+        self._silence_s = {False: half_open_s, True: idle_s}  # by ``spoke``
+        self._peers: dict[int, _Peer] = {}  # by descriptor, the most silent first
+        try:
+            self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self.bind(address)
+        except OSError:
+            self.close()
+            raise
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self.getsockname()[1])
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection; ends the oldest that has not spoken yet if there are too many.
+
+        Raises:
+            OSError: there is none (BlockingIOError), or no descriptor for it.
+        """
+        connection, address = super().accept()
+        for option in _KEEPALIVE:
+            connection.setsockopt(*option)
+        self._peers = {n: p for n, p in self._peers.items() if p.connection.fileno() == n}
+        self._peers[connection.fileno()] = _Peer(connection, time.monotonic())
+        self._make_room(spoke=False)
+        return connection, address
+
+    def heard(self, number: int) -> None:
+        """The peer of this descriptor has sent something whole; ends the most silent one of those
+        that once did if there are too many."""
+        peer = self._peers.pop(number, None)
+        if peer is not None:
+            peer.since, first, peer.spoke = time.monotonic(), not peer.spoke, True
+            self._peers[number] = peer
+            if first:
+                self._make_room(spoke=True)
+
+    def keep(self, number: int, kept: bool = True) -> None:
+        """Keep the connection of this descriptor however silent it is, or no longer do so."""
+        if number in self._peers:
+            self._peers[number].kept = kept
+
+    def reap(self) -> None:
+        """End the connections that have been silent for too long; to be called now and then."""
+        now = time.monotonic()
+        for number, peer in list(self._peers.items()):
+            if not peer.kept and now - peer.since > self._silence_s[peer.spoke]:
+                self._end(number)
+
+    def _make_room(self, spoke: bool) -> None:
+        same = [n for n, p in self._peers.items() if p.spoke == spoke and not p.kept]
+        for number in same[: max(len(same) - self._limit, 0)]:
+            self._end(number)
+
+    def _end(self, number: int) -> None:
+        """Both ways at once, so that its server sees the end of it and closes the descriptor."""
+        connection = self._peers.pop(number).connection
+        try:
+            connection.shutdown(socket.SHUT_RDWR)
+        except OSError:  # the peer or its server was first
+            return

@@ -1,0 +1,54 @@
+"""Who gives a command, as the log of the run records it."""
+
+from __future__ import annotations
+
+import os
+import pwd
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Identity(BaseModel):
+    """An operator. The desk's socket is in a folder of this user alone, so that only programs of
+    this user can say who gives a command; each server says what it knows of its peer.
+
+    Attributes:
+        through: what passes the command on: scope, modbus, tell or python.
+        name: of the token (scope), of the local user (tell, python), or ``timer`` where the
+            Modbus server itself takes a set-point back.
+        peer: address and port of the other end.
+        certificate: subject of the client's TLS certificate.
+        uid, pid: of a local process.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    through: str = Field(max_length=20)
+    name: str | None = Field(None, max_length=100)
+    peer: str | None = Field(None, max_length=100)
+    certificate: str | None = Field(None, max_length=1000)
+    uid: int | None = Field(None, ge=0, lt=2**32)
+    pid: int | None = Field(None, ge=0, lt=2**32)
+
+    def plain(self) -> dict[str, Any]:
+        """What is known, as plain data."""
+        return self.model_dump(exclude_none=True)
+
+
+def local(through: str) -> Identity:
+    """This process and the user that it belongs to."""
+    uid = os.getuid()
+    try:
+        name = pwd.getpwuid(uid).pw_name
+    except KeyError:  # a container may have users without names
+        name = None
+    return Identity(through=through, name=name, uid=uid, pid=os.getpid())
+
+
+def address(peer: Any) -> str:
+    """Address and port as one text, of what ``getpeername`` gives."""
+    if not isinstance(peer, tuple):
+        return str(peer)
+    host, port = peer[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,0 +1,192 @@
+"""The command server against what may come to its socket, and what looks like the end of a run."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from gfm_hil import scratch
+from gfm_hil.bench import make_bench
+from gfm_hil.errors import UserError
+from gfm_hil.events import Reference
+from gfm_hil.operator import Desk, Operator, Rate, announced, present
+from gfm_hil.scope.record import open_record
+from gfm_hil.timeline import Timeline, read_log
+
+
+class Ends:
+    """A command server with a timeline that carries out at once, and no loop."""
+
+    def __init__(self, folder: Path, bench: Any) -> None:
+        self.timeline = Timeline(bench, folder / "events_controller.jsonl", ("controller",))
+        self.stops, self.tick = 0, 0
+        self.desk = Desk("controller", bench, self.timeline, folder, self.ring, self.stop)
+
+    def ring(self) -> None:
+        self.tick += 1
+        self.timeline.carry_out(self.tick)
+
+    def stop(self) -> None:
+        self.stops += 1
+        self.timeline.end("interrupted", "stopped by the operator", self.tick)
+
+
+@pytest.fixture
+def ends(make, tmp_path):
+    found = Ends(tmp_path, make_bench(make()))
+    with found.desk:
+        yield found
+    found.timeline.close()
+
+
+def ask(folder: Path, *messages: bytes) -> list[dict[str, Any]]:
+    """What the command server answers to bytes."""
+    desk = announced(folder, "controller")
+    assert desk is not None
+    answers = []
+    with zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.set(zmq.LINGER, 0)
+        socket.connect(desk["endpoint"])
+        for message in messages:
+            socket.send(message)
+            assert socket.poll(60_000), message
+            answers.append(json.loads(socket.recv()))
+    return answers
+
+
+P_REF = {"type": "reference", "P_ref": 0.6}
+
+
+def test_no_command_ends_the_command_server(ends, tmp_path) -> None:
+    digits = b"9" * 400
+    messages = [
+        b'{"type": []}',
+        b'{"type": {}}',
+        b'{"type": null}',
+        b'{"type": {"type": []}}',
+        b'{"type": "reference", "P_ref": ' + digits + b"}",
+        b'{"type": "gains", "values": {"D_p": ' + digits + b"}}",
+        b'{"type": "reference", "P_ref": 0.6, "tick": ' + digits + b"}",
+        b'{"type": "law", "law": "\\ud800"}',
+        b"[" * 5000,
+        b"[]",
+        b"\xff\xfe",
+        b'{"type": "reference", "P_ref": 0.6, "by": {"through": []}}',
+    ]
+    answers = ask(tmp_path, *messages, json.dumps(P_REF).encode())
+    assert [a["ok"] for a in answers] == [False] * 12 + [True]
+    assert all(len(a["error"]) < 2000 for a in answers[:-1])
+
+
+@pytest.mark.attack(
+    "3.5", "a command that raises what the command server does not expect",
+    "its thread ends: no command passes any more",
+)  # fmt: skip
+def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, attack_now) -> None:
+    def fails(self: Any, content: Any) -> Any:
+        raise KeyError("a mistake of ours")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Desk, "_checked", fails)
+        answer = ask(tmp_path, json.dumps(P_REF).encode())[0]
+    assert not answer["ok"] and "a mistake of ours" in answer["error"] + caplog.text
+    assert ask(tmp_path, json.dumps(P_REF).encode())[0]["ok"]
+    attack_now("answered and logged; the next command is carried out")
+
+
+@pytest.mark.attack(
+    "4.4", "no descriptor left (EMFILE) where a server looks whether the run goes on",
+    "taken for the end of the run: Modbus ends, with its heartbeat and timers, as if regular",
+)  # fmt: skip
+def test_no_descriptor_left_is_not_the_end_of_a_run(
+    ends, run, tmp_path, monkeypatch, attack_now
+) -> None:
+    record = open_record(run().folder)
+    record.folder = tmp_path
+    assert present(tmp_path) == ["controller"] and record.ended() is None
+
+    def full(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    checks = (lambda: present(tmp_path), lambda: Operator(tmp_path), record.ended)
+    for where, name in ((Path, "read_text"), (os, "open")):
+        with monkeypatch.context() as patch:
+            patch.setattr(where, name, full)
+            for check in checks:
+                with pytest.raises((UserError, OSError), match="Too many open files"):
+                    check()
+    assert present(tmp_path) == ["controller"] and record.ended() is None
+    attack_now("reported as what it is, 6 of 6 times; then the run goes on")
+
+
+def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
+    with scratch.temporary("gfmhil-desk-") as place:
+        assert scratch.held(place)
+        (tmp_path / "desk_plant.json").write_text("[1]", encoding="utf-8")
+        with pytest.raises(UserError, match=r"desk_plant\.json: not an announcement"):
+            present(tmp_path)
+    assert not scratch.held(place)
+
+
+@pytest.mark.attack(
+    "10.3", "1,000 commands at once to the command server, then a stop", "1,000 carried out"
+)
+def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_now) -> None:
+    answers = ask(tmp_path, *[json.dumps(P_REF).encode()] * 1000, b'{"type": "stop"}')
+    refused = [a["error"] for a in answers if not a["ok"]]
+    assert all(a["ok"] for a in answers[:200]) and answers[-1] == {"ok": True}
+    assert refused and f"{len(refused)} refused" in refused[-1] and ends.stops == 1
+    attack_now(f"{1000 - len(refused)} carried out, {len(refused)} refused, the stop passes")
+
+
+@pytest.mark.attack("10.4", "who told the run to stop?", "nothing in events.jsonl")
+def test_the_log_says_who_told_and_who_stopped(ends, tmp_path, attack_now) -> None:
+    operator = Operator(tmp_path, through="tell")
+    operator.tell(P_REF)
+    operator.stop()
+    operator.close()
+    who = {"through": "tell", "uid": os.getuid(), "pid": os.getpid()}
+    told, end = read_log(tmp_path / "events_controller.jsonl")
+    for line in (told, end):
+        assert {k: v for k, v in line["operator"].items() if k != "name"} == who
+    assert (told["by"], end["event"]) == ("operator", "end")
+    attack_now(f"`{json.dumps(end['operator'])}`")
+
+
+def test_events_of_the_scenario_have_no_operator(make, tmp_path) -> None:
+    event = {"type": "reference", "tick": 0, "P_ref": 0.6}
+    timeline = Timeline(make_bench(make(events=[event])), tmp_path / "log", ("controller",))
+    timeline.carry_out(0)
+    timeline.insert(Reference(type="reference", tick=0, P_ref=0.7), {"through": "python"})
+    timeline.carry_out(1)
+    timeline.close()
+    planned, told = read_log(tmp_path / "log")
+    assert "operator" not in planned and "by" not in planned
+    assert told["operator"] == {"through": "python"}
+
+
+def test_a_rate_lets_a_burst_through_and_fills_up_again() -> None:
+    now = [0.0]
+    rate = Rate("a page", per_s=10.0, burst=3, clock=lambda: now[0])
+
+    def passed(count: int) -> int:
+        done = 0
+        for _ in range(count):
+            try:
+                rate.take()
+                done += 1
+            except UserError as problem:
+                assert str(problem).startswith("more than 10 commands a second from a page")
+        return done
+
+    assert (passed(5), rate.refused) == (3, 2)
+    now[0] += 0.25
+    assert passed(5) == 2
+    now[0] += 1e6
+    assert (passed(5), rate.refused) == (3, 7)
