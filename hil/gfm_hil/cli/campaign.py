@@ -124,13 +124,14 @@ def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     terminal. Yields what tells it of them."""
     console, began = Console(stderr=True, quiet=quiet), time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    terminal = console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=not terminal) as bar:
         task = bar.add_task("checking the runs", visible=False)
 
         def tell(done: int, of: int) -> None:
             if time.monotonic() - began < _PATIENCE_S:
                 return
-            if not console.is_terminal and not bar.tasks[0].visible:
+            if not terminal and not bar.tasks[0].visible:
                 console.print(f"checking the runs: {done} of {of} done …", highlight=False)
             bar.update(task, completed=done, total=of, visible=True)
 
