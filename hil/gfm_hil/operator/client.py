@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -66,6 +67,9 @@ class Operator:
         that has not recorded anything is left out.
 
         Rows are only ever appended, so that reading them takes nothing from the loop.
+
+        Raises:
+            UserError: the recording is damaged.
         """
         found: dict[str, Any] = {}
         sides: tuple[tuple[Side, tuple[str, ...]], ...]
@@ -78,16 +82,22 @@ class Operator:
             found.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
             if side == "plant":
                 found["tick"], found["misses"] = done - 1, int(part.progress[1])
-                trip = int(found["true_trip"])
-                found["trip"] = TRIP_REASONS[trip] if trip else ""
+                found["trip"] = self._word("trip", {**TRIP_REASONS, 0: ""}, found["true_trip"])
             else:
-                found["state"] = STATES[int(found["state"])]
-                found["reason"] = REASONS[int(part.progress[1])]
+                found["state"] = self._word("state", dict(enumerate(STATES)), found["state"])
+                reasons = dict(enumerate(REASONS))
+                found["reason"] = self._word("reason", reasons, int(part.progress[1]))
                 if (desk := announced(self._folder, side)) is not None:
-                    law = desk["laws"][int(found["law"])]
+                    law = self._word("law", dict(enumerate(desk["laws"])), found["law"])
                     found["active"], found["gains"] = law["name"], law["gains"]
                     found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found
+
+    def _word(self, what: str, words: Mapping[int, Any], code: float) -> Any:
+        """What a recorded code stands for."""
+        if code not in words:
+            raise UserError(f"{self._folder}: damaged: there is no {what} of number {code:g}")
+        return words[int(code)]
 
     def _ask(self, side: Side, content: dict[str, Any]) -> dict[str, Any]:
         desk = announced(self._folder, side)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +21,7 @@ from gfm_hil.recording import (
     PLANT_TIMES,
     Part,
 )
+from gfm_hil.scenario import resolved_scenario
 from gfm_hil.scope.channels import Columns
 from gfm_hil.timeline import read_log
 from gfm_plant import load_converter
@@ -133,12 +133,7 @@ def open_record(folder: Path) -> Record:
     Raises:
         UserError: it is no run folder, or one without a recording.
     """
-    file = folder / "scenario.toml"
-    try:
-        scenario = tomllib.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as problem:
-        reason = getattr(problem, "strerror", None) or problem
-        raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}") from None
+    scenario = resolved_scenario(folder)
     if (folder / "summary.json").is_file():
         return _finished(folder, scenario)
     if not begun(folder):
@@ -150,7 +145,9 @@ def _finished(folder: Path, scenario: dict[str, Any]) -> Record:
     try:
         columns = {**_mapped(folder / "signals.npz"), **_mapped(folder / "timing.npz")}
         laws = [_law(str(label)) for label in columns.pop("laws")]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as problem:
+        if {x.shape for x in columns.values()} != {columns["tick"].shape[:1]}:
+            raise ValueError("columns of different lengths")
+    except Exception as problem:  # numpy and zipfile have no common base for what is damaged
         raise UserError(f"{folder}: signals.npz or timing.npz cannot be read: {problem}") from None
     record = Record(folder, scenario, columns, laws, live=False)
     record._done = record.capacity = len(columns["tick"])
