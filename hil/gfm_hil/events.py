@@ -21,7 +21,7 @@ class _Event(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    t: float | None = Field(None, ge=0, le=86400, description="s")
+    t: float | None = Field(None, ge=0, description="s")
     tick: int | None = Field(None, ge=0)
 
     @model_validator(mode="after")

@@ -84,24 +84,6 @@ def load_scenario(name: str, **changed: Any) -> Scenario:
     return check_scenario(content, str(path))
 
 
-def resolved_scenario(folder: Path) -> dict[str, Any]:
-    """The scenario in a run folder as plain data; its law and converter files may be gone.
-
-    Raises:
-        UserError: there is none, or it is damaged.
-    """
-    try:
-        content = tomllib.loads((folder / "scenario.toml").read_text("utf-8"))
-        return Scenario.model_validate(content).model_dump(mode="json", exclude_none=True)
-    except ValidationError as problem:
-        reason = "; ".join(lines(problem))
-    except RecursionError:
-        reason = "nested too deeply"
-    except (OSError, ValueError) as problem:
-        reason = getattr(problem, "strerror", None) or str(problem)
-    raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}")
-
-
 def check_scenario(content: dict[str, Any], where: str) -> Scenario:
     """The scenario of a dict, with its laws and its plant tried out.
 

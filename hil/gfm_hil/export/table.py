@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.errors import UserError
-from gfm_hil.export.columns import Column, all_columns, describe
+from gfm_hil.export.columns import Column, describe
 from gfm_hil.timeline import read_log
 
 
@@ -47,38 +47,21 @@ def load_run(folder: Path) -> RunTable:
         UserError: it is no run folder, or the run is not over.
     """
     try:
-        values = {**_arrays(folder / "signals.npz"), **_arrays(folder / "timing.npz")}
-        laws = [str(name) for name in np.atleast_1d(values.pop("laws", []))]
+        with np.load(folder / "signals.npz") as file:
+            laws = [str(name) for name in file["laws"]]
+            values = {name: file[name] for name in file.files if name != "laws"}
+        with np.load(folder / "timing.npz") as file:
+            values |= {name: file[name] for name in file.files}
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except FileNotFoundError as problem:
         going = (folder / "scenario.toml").is_file()
         what = "the run is not over, see gfmhil stream" if going else "is not a run folder"
         raise UserError(f"{folder}: {what} ({Path(problem.filename).name} is missing)") from None
-    except (OSError, ValueError, RecursionError) as problem:
+    except (OSError, ValueError) as problem:
         raise UserError(f"{folder}: {problem}") from None
-    unknown = sorted(values.keys() - {*all_columns()})
-    if unknown or {x.shape for x in values.values()} != {values.get("tick", np.empty(0)).shape[:1]}:
-        what = f"unknown columns {unknown}" if unknown else "columns of different lengths"
-        raise UserError(f"{folder}: signals.npz, timing.npz: {what}")
     columns = [describe(name, laws) for name in values]
     log = read_log(folder / "events.jsonl")
     return RunTable(folder, columns, values, laws, log, summary)
-
-
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an .npz.
-
-    Raises:
-        FileNotFoundError: it is not there.
-        ValueError: it is damaged.
-    """
-    try:
-        with np.load(path) as file:
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise
-    except Exception as problem:  # numpy and zipfile have no common base for what is damaged
-        raise ValueError(f"{path.name} is damaged: {problem}") from None
 
 
 def event_text(event: dict[str, Any]) -> str:

@@ -82,22 +82,20 @@ class Operator:
             found.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
             if side == "plant":
                 found["tick"], found["misses"] = done - 1, int(part.progress[1])
-                found["trip"] = self._word("trip", {**TRIP_REASONS, 0: ""}, found["true_trip"])
+                found["trip"] = _word(
+                    self._folder, "trip", {**TRIP_REASONS, 0: ""}, found["true_trip"]
+                )
             else:
-                found["state"] = self._word("state", dict(enumerate(STATES)), found["state"])
+                found["state"] = _word(
+                    self._folder, "state", dict(enumerate(STATES)), found["state"]
+                )
                 reasons = dict(enumerate(REASONS))
-                found["reason"] = self._word("reason", reasons, int(part.progress[1]))
+                found["reason"] = _word(self._folder, "reason", reasons, int(part.progress[1]))
                 if (desk := announced(self._folder, side)) is not None:
-                    law = self._word("law", dict(enumerate(desk["laws"])), found["law"])
+                    law = _word(self._folder, "law", dict(enumerate(desk["laws"])), found["law"])
                     found["active"], found["gains"] = law["name"], law["gains"]
                     found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found
-
-    def _word(self, what: str, words: Mapping[int, Any], code: float) -> Any:
-        """What a recorded code stands for."""
-        if code not in words:
-            raise UserError(f"{self._folder}: damaged: there is no {what} of number {code:g}")
-        return words[int(code)]
 
     def _ask(self, side: Side, content: dict[str, Any]) -> dict[str, Any]:
         desk = announced(self._folder, side)
@@ -113,3 +111,14 @@ class Operator:
         if not answer["ok"]:
             raise UserError(str(answer["error"]))
         return {key: value for key, value in answer.items() if key != "ok"}
+
+
+def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
+    """What a recorded code stands for.
+
+    Raises:
+        UserError: nothing, so that the recording is damaged.
+    """
+    if code not in words:
+        raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
+    return words[int(code)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from gfm_hil.errors import UserError
+from gfm_hil.errors import UserError, lines
 from gfm_hil.operator import announced, present
 from gfm_hil.recording import (
     CONTROLLER_COLUMNS,
@@ -21,7 +23,7 @@ from gfm_hil.recording import (
     PLANT_TIMES,
     Part,
 )
-from gfm_hil.scenario import resolved_scenario
+from gfm_hil.scenario import Scenario
 from gfm_hil.scope.channels import Columns
 from gfm_hil.timeline import read_log
 from gfm_plant import load_converter
@@ -133,7 +135,7 @@ def open_record(folder: Path) -> Record:
     Raises:
         UserError: it is no run folder, or one without a recording.
     """
-    scenario = resolved_scenario(folder)
+    scenario = _resolved(folder)
     if (folder / "summary.json").is_file():
         return _finished(folder, scenario)
     if not begun(folder):
@@ -141,13 +143,25 @@ def open_record(folder: Path) -> Record:
     return Record(folder, scenario, laws=_laws(scenario))
 
 
+def _resolved(folder: Path) -> dict[str, Any]:
+    """The scenario of a run as plain data with every default; its law files may be gone."""
+    try:
+        content = tomllib.loads((folder / "scenario.toml").read_text("utf-8"))
+        return Scenario.model_validate(content).model_dump(mode="json", exclude_none=True)
+    except ValidationError as problem:
+        reason = "; ".join(lines(problem))
+    except RecursionError:
+        reason = "nested too deeply"
+    except (OSError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or str(problem)
+    raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}")
+
+
 def _finished(folder: Path, scenario: dict[str, Any]) -> Record:
     try:
         columns = {**_mapped(folder / "signals.npz"), **_mapped(folder / "timing.npz")}
         laws = [_law(str(label)) for label in columns.pop("laws")]
-        if {x.shape for x in columns.values()} != {columns["tick"].shape[:1]}:
-            raise ValueError("columns of different lengths")
-    except Exception as problem:  # numpy and zipfile have no common base for what is damaged
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as problem:
         raise UserError(f"{folder}: signals.npz or timing.npz cannot be read: {problem}") from None
     record = Record(folder, scenario, columns, laws, live=False)
     record._done = record.capacity = len(columns["tick"])
