@@ -20,6 +20,17 @@ _ANSWER_MS = 6000
 _CONTROLLERS = {get_args(e.model_fields["type"].annotation)[0] for e in CONTROLLER_EVENTS}
 
 
+def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
+    """What a recorded code stands for.
+
+    Raises:
+        UserError: nothing, so that the recording is damaged.
+    """
+    if code not in words:
+        raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
+    return words[int(code)]
+
+
 class Operator:
     """Commands and a look, for one run that is going on.
 
@@ -111,14 +122,3 @@ class Operator:
         if not answer["ok"]:
             raise UserError(str(answer["error"]))
         return {key: value for key, value in answer.items() if key != "ok"}
-
-
-def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
-    """What a recorded code stands for.
-
-    Raises:
-        UserError: nothing, so that the recording is damaged.
-    """
-    if code not in words:
-        raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
-    return words[int(code)]
