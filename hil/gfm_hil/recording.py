@@ -95,8 +95,7 @@ class Part:
     @staticmethod
     def create(folder: Path, side: str, ticks: int) -> Part:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop."""
-        columns = PLANT_COLUMNS if side == "plant" else CONTROLLER_COLUMNS
-        times = PLANT_TIMES if side == "plant" else CONTROLLER_TIMES
+        columns, times = _layout(side)
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
@@ -119,15 +118,28 @@ class Part:
 
     @staticmethod
     def open(folder: Path, side: str) -> Part | None:
-        """The files of a side as they are, or None if that side never came so far."""
+        """The files of a side as they are, or None if that side never came so far, or one of them
+        is damaged."""
         try:
             arrays = [
                 np.load(folder / "parts" / f"{side}_{what}.npy", mmap_mode="r")
                 for what in ("signals", "times", "progress")
             ]
-        except (OSError, ValueError, EOFError):  # not there, or just being made
+        except Exception:  # not there, or just being made; numpy has no common base for its errors
             return None
-        return Part(*arrays)
+        signals, times, progress = arrays
+        columns, names = _layout(side)
+        kinds = (signals.dtype, times.dtype, progress.dtype) == ("f8", "i8", "i8")
+        widths = (signals.shape[1:], times.shape[1:]) == ((len(columns),), (len(names),))
+        whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)
+        return Part(*arrays) if whole and 0 <= progress[0] <= len(signals) else None
+
+
+def _layout(side: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The columns of a side's ``signals`` and ``times``."""
+    if side == "plant":
+        return PLANT_COLUMNS, PLANT_TIMES
+    return CONTROLLER_COLUMNS, CONTROLLER_TIMES
 
 
 def keep_in_memory(

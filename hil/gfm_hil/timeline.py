@@ -240,13 +240,18 @@ def safe_reason(ctl: Any) -> str:
 
 
 def read_log(*paths: Path) -> list[dict[str, Any]]:
-    """The lines of one or more logs, in order of their ticks."""
+    """The lines of one or more logs, in order of their ticks.
+
+    A line that is damaged, as the last one of a side that was killed may be, is left out.
+    """
     lines: list[dict[str, Any]] = []
     for path in paths:
         if path.is_file():
-            for line in path.read_text("utf-8").splitlines():
-                with contextlib.suppress(ValueError):  # the last one of a side that was killed
-                    lines.append(json.loads(line))
+            for text in path.read_text("utf-8", errors="replace").splitlines():
+                with contextlib.suppress(ValueError, RecursionError):
+                    line = json.loads(text)
+                    if isinstance(line, dict) and isinstance(line.get("tick"), int):
+                        lines.append(line)
     return sorted(lines, key=lambda line: line["tick"])
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import struct
 import time
 import urllib.request
 from pathlib import Path
@@ -125,3 +127,18 @@ def test_what_is_missing_is_said(tmp_path, capsys, monkeypatch, recorded):
     monkeypatch.setattr("gfm_hil.cli.stream.find_spec", lambda name: None)
     assert main(["stream", "x", "--prometheus", "0"]) == 2
     assert "pip install 'gfmhil[metrics]'" in capsys.readouterr().err
+
+
+@pytest.mark.attack(
+    "11.3", "a client of the metrics that says nothing and resets the connection",
+    "a traceback on stderr for each",
+)  # fmt: skip
+def test_a_client_that_hangs_up_is_not_worth_a_traceback(capfd, attack_now):
+    gone = 20
+    with serve_metrics(RunCollector(), "127.0.0.1", 0) as port:
+        for _ in range(gone):
+            with socket.create_connection(("127.0.0.1", port)) as stranger:
+                stranger.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        assert scraped(port) == {}
+    assert capfd.readouterr().err == ""
+    attack_now(f"{gone} such clients: nothing is printed, and the next one is served")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,17 @@ from gfm_runtime.controller import REASONS, STATES
 
 _ANSWER_MS = 6000
 _CONTROLLERS = {get_args(e.model_fields["type"].annotation)[0] for e in CONTROLLER_EVENTS}
+
+
+def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
+    """What a recorded code stands for.
+
+    Raises:
+        UserError: nothing, so that the recording is damaged.
+    """
+    if code not in words:
+        raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
+    return words[int(code)]
 
 
 class Operator:
@@ -78,6 +90,9 @@ class Operator:
         that has not recorded anything is left out.
 
         Rows are only ever appended, so that reading them takes nothing from the loop.
+
+        Raises:
+            UserError: the recording is damaged.
         """
         found: dict[str, Any] = {}
         sides: tuple[tuple[Side, tuple[str, ...]], ...]
@@ -90,13 +105,17 @@ class Operator:
             found.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
             if side == "plant":
                 found["tick"], found["misses"] = done - 1, int(part.progress[1])
-                trip = int(found["true_trip"])
-                found["trip"] = TRIP_REASONS[trip] if trip else ""
+                found["trip"] = _word(
+                    self._folder, "trip", {**TRIP_REASONS, 0: ""}, found["true_trip"]
+                )
             else:
-                found["state"] = STATES[int(found["state"])]
-                found["reason"] = REASONS[int(part.progress[1])]
+                found["state"] = _word(
+                    self._folder, "state", dict(enumerate(STATES)), found["state"]
+                )
+                reasons = dict(enumerate(REASONS))
+                found["reason"] = _word(self._folder, "reason", reasons, int(part.progress[1]))
                 if (desk := announced(self._folder, side)) is not None:
-                    law = desk["laws"][int(found["law"])]
+                    law = _word(self._folder, "law", dict(enumerate(desk["laws"])), found["law"])
                     found["active"], found["gains"] = law["name"], law["gains"]
                     found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found

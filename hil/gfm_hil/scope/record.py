@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from gfm_hil.errors import UserError
+from gfm_hil.errors import UserError, lines
 from gfm_hil.operator import announced, present
 from gfm_hil.recording import (
     CONTROLLER_COLUMNS,
@@ -22,6 +23,7 @@ from gfm_hil.recording import (
     Part,
     read_recording,
 )
+from gfm_hil.scenario import Scenario
 from gfm_hil.scope.channels import Columns
 from gfm_hil.timeline import read_log
 from gfm_plant import load_converter
@@ -140,17 +142,26 @@ def open_record(folder: Path) -> Record:
     Raises:
         UserError: it is no run folder, or one without a recording.
     """
-    file = folder / "scenario.toml"
-    try:
-        scenario = tomllib.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as problem:
-        reason = getattr(problem, "strerror", None) or problem
-        raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}") from None
+    scenario = _resolved(folder)
     if (folder / "summary.json").is_file():
         return _finished(folder, scenario)
     if not begun(folder):
         raise UserError(f"{folder}: nothing has been recorded there")
     return Record(folder, scenario, laws=_laws(scenario))
+
+
+def _resolved(folder: Path) -> dict[str, Any]:
+    """The scenario of a run as plain data with every default; its law files may be gone."""
+    try:
+        content = tomllib.loads((folder / "scenario.toml").read_text("utf-8"))
+        return Scenario.model_validate(content).model_dump(mode="json", exclude_none=True)
+    except ValidationError as problem:
+        reason = "; ".join(lines(problem))
+    except RecursionError:
+        reason = "nested too deeply"
+    except (OSError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or str(problem)
+    raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}")
 
 
 def _finished(folder: Path, scenario: dict[str, Any]) -> Record:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,8 +56,13 @@ class Follower:
             raise UserError(f"{folder}: the run is over, see gfmhil export")
         if not begun(folder):
             raise UserError(f"{folder}: no run is going on there; --wait waits for one")
-        scenario = tomllib.loads((folder / "scenario.toml").read_text(encoding="utf-8"))
-        self.folder, self.T_s = folder, float(scenario["T_s"])
+        try:
+            T_s = tomllib.loads((folder / "scenario.toml").read_text(encoding="utf-8"))["T_s"]
+            if not isinstance(T_s, float) or not 0 < T_s < math.inf:
+                raise ValueError(f"T_s = {T_s!r}: must be a number of seconds")
+        except (OSError, ValueError, KeyError, RecursionError) as problem:
+            raise UserError(f"{folder}: scenario.toml: {problem}") from None
+        self.folder, self.T_s = folder, T_s
         self.parts: dict[Side, Part] = {}
         self._next: dict[Side, int] = {}
         self.over = False

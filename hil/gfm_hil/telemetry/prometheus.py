@@ -112,6 +112,10 @@ def _quantiles(
     return metric
 
 
+def _say_nothing(*_: object) -> None:
+    """What is printed about a connection that failed."""
+
+
 @contextlib.contextmanager
 def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int]:
     """Serve metrics at ``/metrics`` while in this context; yields the port.
@@ -125,6 +129,8 @@ def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int
         server, thread = start_http_server(port, addr=host, registry=registry)
     except OSError as problem:
         raise UserError(f"--prometheus {port}: {host}: {problem.strerror}") from None
+    # A client that hangs up is no fault of ours; socketserver would print a traceback.
+    setattr(server, "handle_error", _say_nothing)  # noqa: B010 (mypy takes it for a method)
     try:
         yield int(server.server_port)
     finally:

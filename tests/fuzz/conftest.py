@@ -1,0 +1,87 @@
+"""One reader for each parser, its corpus, and what every reader has to keep to."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from hypothesis import strategies as st
+
+CORPUS = Path(__file__).with_name("corpus")
+#: reads one input
+Take = Callable[[bytes], None]
+MOST_MEMORY = 400e6  # bytes that reading may take on top, whatever is read
+
+
+@dataclass(frozen=True)
+class Parser:
+    """Something that reads what others wrote.
+
+    Attributes:
+        name: its folder in the corpus.
+        open: given an empty folder, what reads one input; it raises nothing that is documented.
+        inputs: strategy of inputs, made once the parser is open.
+    """
+
+    name: str
+    open: Callable[[Path], AbstractContextManager[Take]]
+    inputs: Callable[[], st.SearchStrategy[bytes]]
+
+
+@dataclass
+class Reader:
+    """An open parser; ``read`` fails if an input brings up what is not documented."""
+
+    parser: Parser = field(repr=False)
+    inputs: st.SearchStrategy[bytes] = field(repr=False)
+    take: Take = field(repr=False)
+    kept: Path
+
+    def read(self, message: bytes) -> None:
+        """Read an input; one that fails is kept, to be copied into the corpus."""
+        try:
+            self.take(message)
+        except Exception as problem:
+            self.kept.parent.mkdir(parents=True, exist_ok=True)
+            self.kept.write_bytes(message)
+            keep = f"cp {self.kept} tests/fuzz/corpus/{self.parser.name}/NAME"
+            problem.add_note(f"to keep this input: {keep}")
+            raise
+
+    def corpus(self) -> list[Path]:
+        """The inputs that are kept in the repository."""
+        return sorted((CORPUS / self.parser.name).iterdir())
+
+
+def peak() -> int:
+    """Most memory of this process since ``forget_peak``, bytes."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+def forget_peak() -> None:
+    """Begin to measure the most memory anew, proc_pid_clear_refs(5)."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+@pytest.fixture(scope="module")
+def reader(request: pytest.FixtureRequest) -> Iterator[Reader]:
+    """The parser of the parameter, open; in the end it must not have taken much memory."""
+    parser: Parser = request.param
+    kept = Path(os.path.relpath(request.config.rootpath / ".hypothesis" / "failed" / parser.name))
+    place = Path(tempfile.mkdtemp(prefix="gfmhil-fuzz-"))
+    try:
+        with parser.open(place) as take:
+            found = Reader(parser, parser.inputs(), take, kept)
+            forget_peak()
+            before = peak()
+            yield found
+            assert peak() - before < MOST_MEMORY, f"{(peak() - before) / 1e6:.0f} MB"
+    finally:
+        shutil.rmtree(place)

@@ -1,0 +1,332 @@
+"""The parsers of files: scenarios, laws, campaigns, run folders and shared memory."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from hypothesis import strategies as st
+
+from gfm_hil import scratch
+from gfm_hil.campaign import loading
+from gfm_hil.cli import main
+from gfm_hil.errors import UserError
+from gfm_hil.links.shm import segment
+from gfm_hil.links.shm.link import ShmLink
+from gfm_hil.recording import Part
+from gfm_hil.runner import run_scenario
+from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario
+from gfm_hil.scope.record import open_record
+from gfm_hil.telemetry.follow import Follower
+from gfm_hil.toml_out import scenario_toml
+from gfm_runtime import LawError, discretise, load_law
+
+from .conftest import Parser, Take
+from .mutations import blobs, texts
+
+CATALOGUE = Path(load_law.__code__.co_filename).parent / "laws"
+CAMPAIGN = """
+title = "two runs"
+scenario = "rig_pref_step"
+laws = ["vsg-2"]
+runs = 2
+ripple_max = 0.2
+[set]
+duration = 0.1
+"references.Q_ref" = 0.0
+[figure]
+x = "plant.factors.L_g"
+[[draw]]
+path = "plant.factors.L_g"
+type = "loguniform"
+low = 0.5
+high = 10.0
+label = "L_g / nominal"
+[[draw]]
+path = "plant.factors.L_f"
+type = "normal"
+mean = 1.0
+sigma = 0.1
+low = 0.7
+high = 1.3
+[[draw]]
+path = "plant.delay.samples"
+type = "choice"
+values = [1, 2]
+"""
+EVENTS = """
+title = "every event"
+duration = 1.0
+T_s = 1e-4
+after_trip = "wait"
+ready_laws = ["vsg-2"]
+seed = 3
+references = { P_ref = 0.5, Q_ref = 0.0 }
+late_policy = { hold = 10, extrapolate = 2 }
+[link]
+type = "can"
+endpoint = "can+udp://127.0.0.1:4000"
+options = { every = 2, heartbeat = 50 }
+impairment = { loss = 0.1, burst = 2.0, bits = 3, corrupt = 0.1, pause_at = 5 }
+[plant]
+converter = "rig"
+delay = { samples = 1, fraction = 0.3 }
+adc = "DS2004"
+factors = { L_g = 2.0, R_g = 0.5 }
+dc_source = { mode = "regulated" }
+[plant.sensors]
+bandwidth_hz = 300.0
+noise_std = { p = 1e-4, V = 1e-4 }
+[plant.grid]
+load_R = 2.0
+load_L = 1.0
+[[events]]
+t = 0.1
+type = "reference"
+P_ref = 0.6
+ramp_s = 0.1
+[[events]]
+tick = 3000
+type = "law"
+law = "vsg-2"
+[[events]]
+t = 0.4
+type = "gains"
+values = { D_p = 0.011 }
+[[events]]
+t = 0.5
+type = "grid-frequency"
+f_hz = 49.9
+rate = 1.0
+[[events]]
+t = 0.6
+type = "grid-impedance"
+L_g = 2.0
+R_g = 1.0
+[[events]]
+t = 0.7
+type = "grid-breaker"
+closed = false
+"""
+
+
+def _shipped(*folders: Path) -> list[str]:
+    return [path.read_text("utf-8") for f in folders for path in sorted(f.glob("*.toml"))]
+
+
+@contextlib.contextmanager
+def _scenario(place: Path) -> Iterator[Take]:
+    file, again = place / "scenario.toml", place / "again.toml"
+
+    def take(text: bytes) -> None:
+        file.write_bytes(text)
+        try:
+            found = load_scenario(str(file))
+        except UserError as problem:
+            one_line_each(str(problem))
+            return
+        again.write_text(scenario_toml(found), "utf-8")
+        assert load_scenario(str(again)) == found
+
+    yield take
+
+
+@contextlib.contextmanager
+def _law(place: Path) -> Iterator[Take]:
+    file = place / "law.toml"
+
+    def take(text: bytes) -> None:
+        file.write_bytes(text)
+        try:
+            for law in load_law(str(file)).laws:
+                found = discretise(law, 1e-4)
+                assert all(np.isfinite(matrix).all() for matrix in (found.A, found.C))
+        except LawError as problem:
+            one_line_each(str(problem))
+
+    yield take
+
+
+@contextlib.contextmanager
+def _campaign(place: Path) -> Iterator[Take]:
+    file, tried = place / "campaign.toml", loading._TRIED
+
+    def take(text: bytes) -> None:
+        file.write_bytes(text)
+        try:
+            loading.load_campaign(str(file))
+        except UserError as problem:
+            one_line_each(str(problem))
+
+    loading._TRIED = 20  # of a million runs, for the sake of time
+    try:
+        yield take
+    finally:
+        loading._TRIED = tried
+
+
+def one_line_each(text: str) -> None:
+    """What is told of a mistake is short and cannot command a terminal."""
+    assert len(text) < 20_000, f"{len(text)} characters"
+    assert all(line.isprintable() for line in text.split("\n")), repr(text)
+
+
+@contextlib.contextmanager
+def _run_folder(place: Path) -> Iterator[Take]:
+    """An input is the name of a file in the run folder, a line end, and the file's new content."""
+    finished, going = _runs(place)
+
+    def take(message: bytes) -> None:
+        name, _, content = message.partition(b"\n")
+        for folder in (finished, going):
+            path = folder / name.decode("ascii", "replace")
+            if path.name not in {p.name for p in folder.rglob("*")}:
+                continue
+            before = path.read_bytes()
+            try:
+                path.write_bytes(content.replace(b"@held@", os.fsencode(place / "held")))
+                (_look_back if folder is finished else _look_on)(folder)
+            finally:
+                path.write_bytes(before)
+
+    hold = scratch.hold(place / "held")
+    try:
+        yield take
+    finally:
+        scratch.let_go(hold)
+
+
+def _runs(place: Path) -> tuple[Path, Path]:
+    """The folder of a run that is over, and of one that seems to go on."""
+    scenario = check_scenario(
+        {
+            "title": "over", "duration": 0.002, "law": "vsg-2", "link": {"type": "inproc"},
+            "events": [{"t": 0.001, "type": "reference", "P_ref": 0.6}],
+        },
+        "",
+    )  # fmt: skip
+    finished, going, held = place / "finished", place / "going", place / "held"
+    run_scenario(scenario, finished, figures=False)
+    held.mkdir()
+    going.mkdir()
+    (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")
+    for side in ("plant", "controller"):
+        part = Part.create(going, side, scenario.ticks)
+        part.signals[:], part.progress[:] = 1.0, (10, 0)
+        (going / f"desk_{side}.json").write_text(
+            f'{{"endpoint": "ipc://{held}/{side}", "T_s": 0.0001, "names": ["vsg-2"], "laws":'
+            ' [{"label": "vsg-2", "name": "vsg-2", "gains": {"D_p": 0.01}},'
+            ' {"label": "b", "name": "b", "gains": {}}]}'
+        )
+        (going / f"events_{side}.jsonl").write_text('{"tick": 1, "t": 0.1, "event": "a"}\n')
+    return finished, going
+
+
+def _look_back(folder: Path) -> None:
+    """Everything that reads a run that is over."""
+    command("export", str(folder), "--format", "csv", "-o", str(folder.parent / "out.csv"))
+    with contextlib.suppress(UserError):
+        record = open_record(folder)
+        assert record.done() >= 0 and record.f_b > 0
+        record.events()
+        record.ended()
+
+
+def _look_on(folder: Path) -> None:
+    """Everything that reads a run that goes on."""
+    command("tell", str(folder))
+    with contextlib.suppress(UserError):
+        record = open_record(folder)
+        assert record.done() >= 0 and record.f_b > 0
+        record.events()
+        record.look_up_laws()
+    with contextlib.suppress(UserError):
+        follower = Follower(folder)
+        for rows in follower.news():
+            assert len(rows.signals) == len(rows.times)
+
+
+def command(*arguments: str) -> None:
+    """A command ends with an exit code and, if that is 2, in words."""
+    out, said = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        code = main(arguments)
+    assert code in (0, 2)
+    assert bool(said.getvalue()) == (code == 2)
+    one_line_each(said.getvalue())
+    assert "\x1b" not in out.getvalue()
+
+
+def _run_files() -> st.SearchStrategy[bytes]:
+    place = Path(os.environ.get("TMPDIR", "/tmp")) / f"gfmhil-fuzz-seeds-{os.getpid()}"
+    place.mkdir()
+    try:
+        kinds = []
+        for folder in _runs(place):
+            for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+                name = str(path.relative_to(folder)).encode() + b"\n"
+                content = path.read_bytes().replace(os.fsencode(place / "held"), b"@held@")
+                written = path.suffix in (".npz", ".npy")
+                made = blobs([content]) if written else texts([content.decode()])
+                kinds.append(made.map(lambda new, name=name: name + new))
+    finally:
+        shutil.rmtree(place)
+    return st.one_of(kinds)
+
+
+@contextlib.contextmanager
+def _segment(place: Path) -> Iterator[Take]:
+    """An input is what the memory of a link holds; ``@owner@`` stands for a living owner."""
+    name = f"fuzz-{os.getpid()}"
+    path = segment.FOLDER / f"{segment.PREFIX}{name}"
+
+    def take(content: bytes) -> None:
+        for side in ("plant", "controller"):
+            path.write_bytes(content.replace(_OWNER, segment._PLANT.pack(*segment.myself())))
+            path.chmod(0o600)
+            with contextlib.suppress(UserError):
+                link = ShmLink(side, f"shm://{name}")
+                try:
+                    link.wait(0.0)
+                    for _ in range(3):
+                        found = link.receive()
+                        assert found is None or len(found) < 1000
+                    link.send(b"x" * 48)
+                finally:
+                    link.close()
+
+    try:
+        yield take
+    finally:
+        path.unlink(missing_ok=True)
+
+
+_OWNER = b"@owner@ @owner@ @owner@!"  # as long as an identity
+
+
+def _segments() -> st.SearchStrategy[bytes]:
+    name = f"fuzz-seed-{time.monotonic_ns()}"
+    controller = ShmLink("controller", f"shm://{name}")
+    try:
+        controller.send(b"GFMHIL {}")
+        whole = (segment.FOLDER / f"{segment.PREFIX}{name}").read_bytes()
+    finally:
+        controller.close()
+    whole = whole.replace(segment._PLANT.pack(*segment.myself()), _OWNER)
+    head = st.builds(lambda new: new + whole[512:], blobs([whole[:512]]))
+    return head | blobs([whole[:512], whole])
+
+
+FILES = (
+    Parser("scenario", _scenario, lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS])),
+    Parser("law", _law, lambda: texts(_shipped(CATALOGUE))),
+    Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
+    Parser("run_folder", _run_folder, _run_files),
+    Parser("segment", _segment, _segments),
+)

@@ -1,0 +1,38 @@
+"""Every parser reads what it is given or refuses it as documented, whatever it is given.
+
+How many inputs are made up is said by hypothesis' profile, see CONTRIBUTING.md.
+"""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from .parsers_files import FILES
+from .parsers_peers import PEERS
+from .parsers_servers import SERVERS
+
+readers = pytest.mark.parametrize(
+    "reader", [*FILES, *PEERS, *SERVERS], ids=lambda parser: parser.name, indirect=True
+)
+
+
+@readers
+def test_corpus(reader):
+    """What once broke a parser, or is of a kind that may."""
+    files, broken = reader.corpus(), []
+    for file in files:
+        try:
+            reader.read(file.read_bytes())
+        except Exception as problem:
+            broken.append(f"{file.name}: {problem!r:.200}")
+    assert files and not broken, "\n".join(broken)
+
+
+@readers
+@given(data=st.data())
+@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@pytest.mark.attack("11.2", "thousands of made-up inputs to every parser", "never tried")
+def test_made_up_inputs(reader, data):
+    reader.read(data.draw(reader.inputs))
