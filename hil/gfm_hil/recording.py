@@ -174,7 +174,7 @@ def _rescue(notice: Callable[[str], None]) -> None:
     """Move parts that no process uses any more to where their run is, if that can be found."""
     for place, hold in scratch.left_behind(_PREFIX, _MEMORY):
         with contextlib.suppress(OSError):  # no room, no rights: they stay
-            recorded = sorted(_FILES.intersection(os.listdir(hold)))
+            recorded = sorted(_FILES.intersection(path.name for path in place.iterdir()))
             home = _home_of(place)
             if home is not None:
                 run, link = home

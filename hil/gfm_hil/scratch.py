@@ -79,7 +79,7 @@ def hold(place: Path) -> int:
         if not is_private(os.fstat(handle)):
             raise PermissionError(f"{place} is not a folder of our user alone")
         lock(handle, fcntl.LOCK_SH)
-        os.stat(place)  # it may have been removed meanwhile
+        place.stat()  # it may have been removed meanwhile
     except BaseException:
         let_go(handle)
         raise
@@ -153,10 +153,10 @@ def copy_files(names: list[str], source: int, target: int) -> None:
     """
     for name in names:
         handle = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=source)
-        with open(handle, "rb") as file:
+        with os.fdopen(handle, "rb") as file:
             found = os.fstat(handle)
             if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid():
                 raise PermissionError(f"{name} is not a file of our user")
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-            with open(os.open(name, flags, 0o600, dir_fd=target), "wb") as copy:
+            with os.fdopen(os.open(name, flags, 0o600, dir_fd=target), "wb") as copy:
                 shutil.copyfileobj(file, copy, 1 << 20)

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from gfm_hil.errors import UserError
-from gfm_hil.links.base import Side
+from gfm_hil.links.base import LONGEST, Side
 from gfm_hil.links.port import Port
 from gfm_hil.links.shm import ring, segment
 
@@ -23,8 +23,8 @@ class ShmLink:
         endpoint: ``shm://name``.
 
     Raises:
-        UserError: it is in use, or not of our user's making. Where the controller comes later, ``send``,
-            ``receive`` and ``wait`` of the plant may raise it too.
+        UserError: it is in use, or another user made it. Where the controller comes later,
+            ``send``, ``receive`` and ``wait`` of the plant may raise it too.
     """
 
     port: Port
@@ -33,14 +33,14 @@ class ShmLink:
         self._side, self._endpoint = side, endpoint
         self._segment: segment.Segment | None = None
         self._handle = np.zeros(ring.HANDLE, np.int64)
-        self._message = np.empty(ring.LONGEST, np.uint8)
+        self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 
     def send(self, message: bytes) -> bool:
         """Hand a message of 1 to 504 bytes over; False if the peer has no room or is not there."""
-        if len(message) > ring.LONGEST or not self._there():
+        if len(message) > LONGEST or not self._there():
             return False
         room = self._message[: len(message)]
         room[:] = np.frombuffer(message, np.uint8)
