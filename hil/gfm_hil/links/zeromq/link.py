@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from gfm_hil.links.zeromq.curve import Curve
 
 _LAST_WORDS, _FAREWELL = 500, 50  # ms
+_NEVER = 10**9  # ms, 11 days; -1 would drop what has arrived and is not read yet
 _LOOK_S = 0.01  # between two looks whether a controller listens
 
 # What a stalled peer leaves unread is bounded, and more is dropped: at each end so many messages,
@@ -95,8 +96,8 @@ class ZmqLink:
             if side == "controller":
                 self._bind()
             else:
-                if self._ipc:  # connected again only by us, who look whose socket it is
-                    self._socket.set(zmq.RECONNECT_IVL, -1)
+                if self._ipc:  # only ``_there`` connects again: it looks whose socket it is
+                    self._socket.set(zmq.RECONNECT_IVL, _NEVER)
                 self._there()
         except UserError:
             self.close()
@@ -166,8 +167,7 @@ class ZmqLink:
         """Reach out anew: libzmq turns a second plant away once and for all, even if the first
         one, of a run before, is about to leave."""
         if self._side == "plant" and self._open:
-            with contextlib.suppress(zmq.ZMQError):  # libzmq has parted from it already
-                self._socket.disconnect(self._endpoint)
+            self._socket.disconnect(self._endpoint)
             self._socket.poll(_FAREWELL)  # a PAIR takes no other peer while it parts from one
             self._open = False
             self._there()
