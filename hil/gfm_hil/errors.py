@@ -40,13 +40,19 @@ def _line(error: Any) -> str:
         return f"{path}: {text}" if path else text
     if error["type"] == "missing":
         return f"{path}: missing"
-    if error["type"] == "union_tag_not_found":
-        return f"{path}.type: missing"
-    if error["type"] == "union_tag_invalid":
+    shown = _cut(error["input"])
+    if error["type"] in ("union_tag_not_found", "union_tag_invalid"):
         context = error["ctx"]
-        return f"{path}.type = {context['tag']!r}: must be one of {context['expected_tags']}"
-    shown = repr(error["input"])
-    shown = shown if len(shown) < 60 else shown[:57] + "..."
+        key = ".".join(filter(None, (path, context["discriminator"].strip("'"))))
+        if "tag" not in context:
+            return f"{key}: missing"
+        return f"{key} = {_cut(context['tag'])}: must be one of {context['expected_tags']}"
     if error["type"] == "extra_forbidden":
         return f"{path} = {shown}: unknown key"
-    return f"{path}: {text}, not {shown}"
+    return f"{path}: {text}, not {shown}" if path else f"{text}, not {shown}"
+
+
+def _cut(value: Any) -> str:
+    """A value as Python writes it, at most 60 characters."""
+    shown = repr(value)
+    return shown if len(shown) < 60 else shown[:57] + "..."

@@ -50,6 +50,7 @@ _TRUE = NY + NU
 _SOON = 8  # rows; a page that is new to the processor would hold up the tick that begins it
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
+_FILES = frozenset(f"{s}_{what}.npy" for s in SIDES for what in ("signals", "times", "progress"))
 _HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
 _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
 
@@ -148,10 +149,13 @@ def keep_in_memory(
     """Have the parts of a run lie in memory until they are merged, if there is room.
 
     A page of a file on a disk is write-protected while it is written back: a loop that touches it
-    waits for the disk. ``folder``/parts becomes a link. To be called by every process of the run,
-    which then holds the place until it removes the parts or ends. What a run whose processes were
+    waits for the disk. ``folder``/parts becomes a link. Every process of the run calls this, and
+    then holds the place until it removes the parts or ends. What a run whose processes were
     all killed has left is first moved to its own folder, or stays, and ``notice`` is told where:
     nothing recorded is lost.
+
+    Raises:
+        UserError: ``folder``/parts is a link, but not one of our user to a place in memory.
     """
     if not _MEMORY.is_dir():
         return
@@ -170,39 +174,74 @@ def keep_in_memory(
         except FileExistsError:  # another process of this run was first
             shutil.rmtree(place)
             scratch.let_go(_holds.pop(parts))
-    _holds[parts] = scratch.hold(parts.resolve())
+    place = parts.readlink()
+    ours = parts.lstat().st_uid == os.geteuid()
+    if not ours or place.parent != _MEMORY or not place.name.startswith(_PREFIX):
+        raise UserError(f"{parts}: is a link to {place}, not to a recording in memory of our user")
+    try:
+        _holds[parts] = scratch.hold(place)
+    except OSError as problem:
+        raise UserError(f"{parts}: {place}: {problem.strerror or problem}") from None
 
 
 def _rescue(notice: Callable[[str], None]) -> None:
-    """Move parts that nobody uses any more to where their run is, if that can be found."""
+    """Move parts that no process uses any more to where their run is, if that can be found."""
     for place, hold in scratch.left_behind(_PREFIX, _MEMORY):
         with contextlib.suppress(OSError):  # no room, no rights: they stay
-            home, recorded = _home_of(place), any(place.glob("*.npy"))
+            recorded = sorted(_FILES.intersection(path.name for path in place.iterdir()))
+            home = _home_of(place)
             if home is not None:
-                copy = home.with_name(f"parts-{secrets.token_hex(4)}")
-                shutil.copytree(place, copy, ignore=shutil.ignore_patterns(_HOME))
-                home.unlink()
-                copy.rename(home)
+                run, link = home
+                try:
+                    _move(recorded, hold, run, link)
+                finally:
+                    os.close(run)
             elif recorded:
                 gone = (place / _HOME).readlink().parent
                 notice(
-                    f"{place}: kept, the recording of a killed run whose folder {gone} is gone; "
-                    "move it where it belongs, or remove it"
+                    f"{place}: kept, the recording of a killed run whose folder {gone} is gone or "
+                    "belongs to another user; move it where it belongs, or remove it"
                 )
             if home is not None or not recorded:
                 shutil.rmtree(place)
         scratch.let_go(hold)
 
 
-def _home_of(place: Path) -> Path | None:
-    """The link to a folder in memory, in its run's folder: where it was made, or, if that has been
-    renamed, beside there."""
+def _home_of(place: Path) -> tuple[int, str] | None:
+    """The folder of a run, opened, and the name of the link in it to a folder in memory: where it
+    was made, or, if the run's folder has been renamed, beside there. None if there is no such
+    folder of our user."""
     with contextlib.suppress(OSError):
         made = (place / _HOME).readlink()
         for link in (made, *sorted(made.parent.parent.glob(f"*/{made.name}"))):
-            if link.is_symlink() and link.resolve() == place:
-                return link
+            with contextlib.suppress(OSError):
+                run = os.open(link.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+                ours = os.fstat(run).st_uid == os.geteuid()
+                with contextlib.suppress(OSError):  # it is no link
+                    if ours and os.readlink(link.name, dir_fd=run) == str(place):
+                        return run, link.name
+                os.close(run)
     return None
+
+
+def _move(names: list[str], source: int, run: int, link: str) -> None:
+    """Replace the link in a run's folder by a folder with copies of some files; every folder is
+    given by its descriptor, so that no other user can put another one in its place."""
+    copy = f"parts-{secrets.token_hex(4)}"
+    os.mkdir(copy, 0o700, dir_fd=run)
+    try:
+        target = os.open(copy, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=run)
+        try:
+            if not scratch.is_private(os.fstat(target)):
+                raise PermissionError
+            scratch.copy_files(names, source, target)
+        finally:
+            os.close(target)
+        os.unlink(link, dir_fd=run)
+        os.rename(copy, link, src_dir_fd=run, dst_dir_fd=run)
+    except OSError:
+        shutil.rmtree(copy, dir_fd=run)
+        raise
 
 
 def remove_parts(folder: Path) -> None:

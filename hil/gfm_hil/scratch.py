@@ -1,7 +1,9 @@
-"""Folders that last as long as the processes that use them, and what killed ones have left.
+"""Folders that last as long as the processes that use them, and what killed processes have left.
 
-Whoever uses such a folder holds a shared lock on it, which the kernel takes back however the
-process ends. A folder that can be locked exclusively has been left.
+A process that uses such a folder holds a shared lock on it, which the kernel takes back however the
+process ends. A folder that can be locked exclusively has been left. Only folders and files of our
+own user are locked, read or removed: another user of the machine may put anything beside them,
+under any name, and may hold a lock on whatever that user can open.
 """
 
 from __future__ import annotations
@@ -10,22 +12,77 @@ import contextlib
 import fcntl
 import os
 import shutil
+import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
+
+PATIENCE_S = 10.0  # a process of ours holds an exclusive lock for milliseconds
+_LOOK_S = 0.01
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
+
+
+def is_private(found: os.stat_result) -> bool:
+    """Whether something belongs to our user and no other user may do anything with it."""
+    return found.st_uid == os.geteuid() and not found.st_mode & 0o077
+
+
+def is_guarded(folder: os.stat_result) -> bool:
+    """Whether no other user (but root) can remove or replace what our user has in a folder."""
+    if folder.st_uid not in (0, os.geteuid()):
+        return False
+    return not folder.st_mode & 0o022 or bool(folder.st_mode & stat.S_ISVTX)
+
+
+def lock(handle: int, operation: int, patience_s: float = PATIENCE_S) -> None:
+    """Lock an open file or folder of our own user.
+
+    Args:
+        handle: file descriptor.
+        operation: ``fcntl.LOCK_SH`` or ``fcntl.LOCK_EX``.
+        patience_s: how long another process may keep its own lock, s.
+
+    Raises:
+        TimeoutError: it keeps it for longer.
+    """
+    give_up = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(handle, operation | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() >= give_up:
+                text = f"another process has kept it locked for {patience_s:g} s"
+                raise TimeoutError(text) from None
+        time.sleep(_LOOK_S)
 
 
 def make(prefix: str, where: Path) -> tuple[Path, int]:
     """A new folder in ``where`` and the hold on it, to be given to ``let_go``."""
-    with _locked(where):  # until it is held it looks as if it had been left
+    while True:
         place = Path(tempfile.mkdtemp(prefix=prefix, dir=where))
-        return place, hold(place)
+        with contextlib.suppress(FileNotFoundError):  # it looked left before it was held: another
+            return place, hold(place)
 
 
 def hold(place: Path) -> int:
-    """Use a folder that another process has made."""
-    handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
-    fcntl.flock(handle, fcntl.LOCK_SH)
+    """Use a folder that another process of our user has made.
+
+    Raises:
+        FileNotFoundError: it is gone.
+        PermissionError: it belongs to another user, or is open to others.
+        TimeoutError: a process that removes what was left keeps it locked.
+    """
+    handle = os.open(place, _FOLDER)
+    try:
+        if not is_private(os.fstat(handle)):
+            raise PermissionError(f"{place} is not a folder of our user alone")
+        lock(handle, fcntl.LOCK_SH)
+        place.stat()  # it may have been removed meanwhile
+    except BaseException:
+        let_go(handle)
+        raise
     return handle
 
 
@@ -69,26 +126,41 @@ def held(place: Path) -> bool:
 
 
 def left_behind(prefix: str, where: Path) -> Iterator[tuple[Path, int]]:
-    """Folders of ours that nobody uses any more, each with a hold that keeps others from it."""
-    for place in sorted(where.glob(f"{prefix}*")):
-        try:
-            handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except OSError:  # another user's, or just removed
-            continue
-        try:
-            with _locked(where):
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            let_go(handle)
-            continue
-        yield place, handle
-
-
-@contextlib.contextmanager
-def _locked(where: Path) -> Iterator[None]:
-    handle = os.open(where, os.O_RDONLY | os.O_DIRECTORY)
+    """Folders of our user that no process uses any more, each with a hold that keeps others from
+    it. There are none in a folder where another user could replace them."""
+    parent = os.open(where, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+        if not is_guarded(os.fstat(parent)):
+            return
+        for place in sorted(where.glob(f"{prefix}*")):
+            try:
+                handle = os.open(place.name, _FOLDER, dir_fd=parent)
+            except OSError:  # a file, a link, another user's, or just removed
+                continue
+            try:
+                if not is_private(os.fstat(handle)):
+                    raise PermissionError
+                lock(handle, fcntl.LOCK_EX, patience_s=0.0)
+            except OSError:
+                let_go(handle)
+                continue
+            yield place, handle
     finally:
-        os.close(handle)
+        os.close(parent)
+
+
+def copy_files(names: list[str], source: int, target: int) -> None:
+    """Copy regular files of our user from one open folder to another, readable by our user alone.
+
+    Raises:
+        OSError: a file is not one of ours, or there is no room.
+    """
+    for name in names:
+        handle = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=source)
+        with os.fdopen(handle, "rb") as file:
+            found = os.fstat(handle)
+            if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid():
+                raise PermissionError(f"{name} is not a file of our user")
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+            with os.fdopen(os.open(name, flags, 0o600, dir_fd=target), "wb") as copy:
+                shutil.copyfileobj(file, copy, 1 << 20)

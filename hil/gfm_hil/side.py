@@ -142,7 +142,7 @@ def _meet_and_run(
         link.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link that sees more than whole messages
-    faults = {**reader.faults, **counted}
+    faults = {**reader.faults, **counted, "refused_greetings": start.refused}
     return {"faults": faults, "one_clock": start.one_clock, **injected}
 
 

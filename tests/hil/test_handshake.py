@@ -171,20 +171,6 @@ def test_a_run_does_without_START(kind, end, options, make, tmp_path, monkeypatc
         assert found.signals[name].tobytes() == column.tobytes(), name
 
 
-@pytest.mark.parametrize(
-    "message", [b"GFMHIL {}", b"GFMHIL nonsense", b'GFMHIL {"kind": "start"}', b"GFMHIL []"]
-)
-def test_a_stranger_is_refused_in_words(message, make, endpoint):
-    link, stranger = ZmqLink("controller", endpoint), ZmqLink("plant", endpoint)
-    try:
-        stranger.send(message)
-        with pytest.raises(PeerLost, match="another language"):
-            shake_hands("controller", link, make(link=PATIENT), lambda: False, print)
-    finally:
-        stranger.close()
-        link.close()
-
-
 @pytest.mark.parametrize("side", SIDES)
 def test_nobody_comes(side, make, endpoint):
     said: list[str] = []

@@ -18,7 +18,6 @@ from gfm_hil.links.base import Side
 _SLOTS = 2 * 1024  # bytes, two slot_t
 _WORD = ctypes.c_int64
 _ORDER: dict[Side, int] = {"controller": 1, "plant": -1}
-_ROOM, _KERNEL_ROOM = 64, 16384  # messages and bytes, as in the link
 
 
 class CEnd:
@@ -92,14 +91,12 @@ def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
     import zmq
     from zmq.backend.cython import _zmq
 
+    from gfm_hil.links.zeromq.link import pair_socket
+
     keep = ExitStack()
     context = keep.enter_context(zmq.Context())
-    end = keep.enter_context(context.socket(zmq.PAIR))
+    end = keep.enter_context(pair_socket(context))
     end.set(zmq.LINGER, 0)
-    end.set(zmq.SNDHWM, _ROOM)
-    end.set(zmq.RCVHWM, _ROOM)
-    end.set(zmq.SNDBUF, _KERNEL_ROOM)
-    end.set(zmq.RCVBUF, _KERNEL_ROOM)
     if side == "controller":
         end.bind(endpoint)
     else:

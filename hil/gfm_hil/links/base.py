@@ -15,12 +15,18 @@ from gfm_hil.links.port import Port
 Side = Literal["controller", "plant"]
 SIDES: tuple[Side, ...] = ("controller", "plant")
 
+LONGEST = 504  # bytes of a message that every link carries, be it a frame or a greeting
+
 
 class Link(Protocol):
     """One side's end of a link to exactly one peer.
 
     A message is delivered whole or not at all, and in order. Nothing is queued without bound:
     a message that the peer has no room for is dropped, and ``send`` says so.
+
+    A link may have two more methods, which the handshake calls where they are: ``again()`` reaches
+    out anew to a peer that has not come, and ``connected()`` says whether a peer is at the other
+    end, with None where the link cannot know it.
     """
 
     @property

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from multiprocessing.shared_memory import SharedMemory
 
 import numpy as np
 
 from gfm_hil.errors import UserError
-from gfm_hil.links.base import Side
+from gfm_hil.links.base import LONGEST, Side
 from gfm_hil.links.port import Port
 from gfm_hil.links.shm import ring, segment
 
@@ -24,24 +23,24 @@ class ShmLink:
         endpoint: ``shm://name``.
 
     Raises:
-        UserError: it is in use or not of our making. Where the controller comes later, ``send``,
-            ``receive`` and ``wait`` of the plant may raise it too.
+        UserError: it is in use, or another user made it. Where the controller comes later,
+            ``send``, ``receive`` and ``wait`` of the plant may raise it too.
     """
 
     port: Port
 
     def __init__(self, side: Side, endpoint: str) -> None:
         self._side, self._endpoint = side, endpoint
-        self._memory: SharedMemory | None = None
+        self._segment: segment.Segment | None = None
         self._handle = np.zeros(ring.HANDLE, np.int64)
-        self._message = np.empty(ring.LONGEST, np.uint8)
+        self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 
     def send(self, message: bytes) -> bool:
         """Hand a message of 1 to 504 bytes over; False if the peer has no room or is not there."""
-        if len(message) > ring.LONGEST or not self._there():
+        if len(message) > LONGEST or not self._there():
             return False
         room = self._message[: len(message)]
         room[:] = np.frombuffer(message, np.uint8)
@@ -69,29 +68,34 @@ class ShmLink:
         """Let go of the memory; what was sent last stays readable to a peer that has joined."""
         self._closed = True
         self._handle[:] = 0
-        memory, self._memory = self._memory, None
-        if memory is not None:
-            (segment.remove if self._side == "controller" else segment.leave)(memory)
+        mine, self._segment = self._segment, None
+        if mine is not None:
+            (segment.remove if self._side == "controller" else segment.leave)(mine)
+
+    def connected(self) -> bool:
+        """Whether the other side has its end of the memory open."""
+        if self._side == "controller":
+            return self._segment is not None and segment.has_plant(self._segment)
+        return self._there()
 
     def _there(self) -> bool:
-        if self._memory is None and not self._closed:
+        if self._segment is None and not self._closed:
             self._open()
-        return self._memory is not None
+        return self._segment is not None
 
     def _open(self) -> None:
         name = self._endpoint.removeprefix("shm://")
         owner = self._side == "controller"
         try:
-            memory = segment.create(name) if owner else segment.join(name)
+            found = segment.create(name) if owner else segment.join(name)
         except segment.Refused as problem:
             verb = "created" if owner else "joined"
             raise UserError(
                 f"link.endpoint = {self._endpoint!r}: cannot be {verb}: {problem}"
             ) from None
-        if memory is None:
+        if found is None:
             return
-        assert memory.buf is not None
-        words = np.frombuffer(memory.buf, np.int64)
+        words = np.frombuffer(found.memory, np.int64)
         out, into = (1, 0) if owner else (0, 1)
         h = self._handle
         h[ring.SEEN] = words[segment.HEADS[out] // ring.WORD]
@@ -102,4 +106,4 @@ class ShmLink:
         base = words.ctypes.data
         h[ring.OUT_HEAD], h[ring.IN_HEAD] = base + np.array(segment.HEADS)[[out, into]]
         h[ring.OUT], h[ring.IN] = base + np.array(segment.RINGS)[[out, into]]
-        self._memory = memory
+        self._segment = found

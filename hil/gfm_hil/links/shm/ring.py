@@ -13,13 +13,13 @@ from __future__ import annotations
 from numba import njit
 
 from gfm_hil.atomics import copy, load_acquire, pause, store_release
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import PORT_CALL, free_port_function
 from gfm_runtime.compiled import FREE
 
 SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
-SLOT = 512  # bytes
 WORD = 8  # bytes
-LONGEST = SLOT - WORD  # bytes of a message
+SLOT = WORD + LONGEST  # bytes
 RING = SLOTS * SLOT  # bytes
 
 #: bits of the stamp for the length; the number of the message, from 1, is above them

@@ -1,23 +1,24 @@
 """The memory itself: made by the controller, joined by the plant, gone when the controller is.
 
-Its header says whose it is. A process is known by its number and start time, so that what a
-killed run left is told from what a living one uses. Whoever makes or joins a segment holds a lock
-on the folder of all segments meanwhile; nobody holds it during a run.
+Its header says which process made it. A process is known by its number and start time, so that what
+a killed run left is told from what a living one uses. A process that makes, joins or removes a
+segment holds a lock on its file meanwhile; no process holds it during a run. Only files of our own
+user are used, locked or removed: another user may put any file under the same name.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import mmap
 import os
+import stat
 import struct
-import sys
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
-from multiprocessing.shared_memory import SharedMemory
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from gfm_hil import scratch
 from gfm_hil.links.shm.ring import RING
 
 FOLDER = Path("/dev/shm")  # of shm_open(3) on Linux
@@ -51,112 +52,169 @@ def myself() -> Identity:
     return os.getpid(), start, _namespace()
 
 
-def create(name: str) -> SharedMemory:
+@dataclass(frozen=True)
+class Segment:
+    """A segment that this process has mapped.
+
+    Attributes:
+        path: of its file.
+        memory: ``SIZE`` bytes.
+    """
+
+    path: Path
+    memory: mmap.mmap
+
+    @property
+    def plant(self) -> Identity:
+        """The plant that has joined last, ``NOBODY`` if none has or it has left."""
+        plant: Identity = _PLANT.unpack_from(self.memory, _PLANT_AT)
+        return plant
+
+
+def create(name: str) -> Segment:
     """Make the segment of that name, after clearing away what dead owners left.
 
     Raises:
         Refused: a living process has it, it is none of ours, or there is no room.
     """
     path = FOLDER / (PREFIX + name)
-    with _locked():
-        for other in FOLDER.glob(PREFIX + "*"):
-            with contextlib.suppress(Refused, OSError):
-                if _owner(other) is None:
-                    other.unlink()
-        if path.exists():
-            owner = _owner(path)
-            by = f"by another run (process {owner[0]})" if owner else "by a file of another user"
-            raise Refused(f"occupied {by}")
-        try:
-            memory = _open(path.name, create=True, size=SIZE)
-            with path.open("r+b") as file:  # a full file system would only tell by a signal
-                os.posix_fallocate(file.fileno(), 0, SIZE)
-        except OSError as problem:
-            path.unlink(missing_ok=True)
-            raise Refused(problem.strerror) from None
-        _OWNER.pack_into(_buffer(memory), 0, MAGIC, VERSION, *myself())
-    return memory
+    for other in FOLDER.glob(PREFIX + "*"):
+        with contextlib.suppress(Refused, OSError), _locked(other, patience_s=0.0) as handle:
+            if handle is not None and _owner(other, handle) is None:
+                other.unlink()
+    while True:
+        with _locked(path, os.O_CREAT) as handle:
+            assert handle is not None
+            found = os.fstat(handle)
+            if found.st_size == 0 and scratch.is_private(found):  # no process has it in use
+                return _made(path, handle)
+            if owner := _owner(path, handle):
+                raise Refused(f"occupied by another run (process {owner[0]})")
+            path.unlink()
 
 
-def join(name: str) -> SharedMemory | None:
+def _made(path: Path, handle: int) -> Segment:
+    """Turn an empty file into a segment of this process."""
+    try:
+        os.posix_fallocate(handle, 0, SIZE)  # a full file system would only tell by a signal
+    except OSError as problem:
+        path.unlink()
+        raise Refused(problem.strerror) from None
+    segment = Segment(path, mmap.mmap(handle, SIZE))
+    _OWNER.pack_into(segment.memory, 0, MAGIC, VERSION, *myself())
+    return segment
+
+
+def join(name: str) -> Segment | None:
     """Join the segment of that name as the plant; None if no living controller has made it yet.
 
     Raises:
-        Refused: it has another layout, is none of ours, or another living plant has joined it.
+        Refused: it has another layout, is none of ours, is open to other users, or another living
+            plant has joined it.
     """
     path = FOLDER / (PREFIX + name)
-    if not path.exists():
-        return None
-    with _locked():
-        if not path.exists() or _owner(path) is None:
+    with _locked(path) as handle:
+        if handle is None or _owner(path, handle) is None:
             return None
-        with path.open("rb") as file:
-            content = file.read(_PLANT_AT + _PLANT.size)
-        version = _OWNER.unpack_from(content)[1]
+        version = _OWNER.unpack(os.pread(handle, _OWNER.size, 0))[1]
         if version != VERSION:
             raise Refused(f"made by another version (layout {version}, ours is {VERSION})")
-        plant: Identity = _PLANT.unpack_from(content, _PLANT_AT)
-        if _lives(plant):
-            raise Refused(f"another plant has joined it (process {plant[0]})")
-        memory = _open(path.name)
-        _PLANT.pack_into(_buffer(memory), _PLANT_AT, *myself())
-    return memory
+        found = os.fstat(handle)
+        if not scratch.is_private(found):
+            mode = stat.S_IMODE(found.st_mode)
+            raise Refused(f"other users may open {path} (mode {mode:04o}, must be 0600)")
+        if found.st_size < SIZE:
+            raise Refused(f"{path} is there and is no link of ours")
+        segment = Segment(path, mmap.mmap(handle, SIZE))
+        if _lives(segment.plant):
+            raise Refused(f"another plant has joined it (process {segment.plant[0]})")
+        _PLANT.pack_into(segment.memory, _PLANT_AT, *myself())
+    return segment
 
 
-def leave(memory: SharedMemory) -> None:
+def leave(segment: Segment) -> None:
     """Undo ``join``; another plant may come, unless the controller was killed: then it goes."""
-    path = FOLDER / memory.name
-    _PLANT.pack_into(_buffer(memory), _PLANT_AT, *NOBODY)
-    with _locked(), contextlib.suppress(Refused, FileNotFoundError):
-        if _owner(path) is None:
-            path.unlink()
-    memory.close()
+    _PLANT.pack_into(segment.memory, _PLANT_AT, *NOBODY)
+    _remove_if(segment, None)
 
 
-def remove(memory: SharedMemory) -> None:
+def remove(segment: Segment) -> None:
     """Undo ``create``; a plant that has joined keeps the memory until it leaves."""
-    path = FOLDER / memory.name
-    with _locked(), contextlib.suppress(Refused, FileNotFoundError):
-        if _owner(path) == myself():
-            path.unlink()
-    memory.close()
+    _remove_if(segment, myself())
+
+
+def has_plant(segment: Segment) -> bool:
+    """Whether a living plant has joined."""
+    return _lives(segment.plant)
+
+
+def _remove_if(segment: Segment, owner: Identity | None) -> None:
+    """Unmap a segment, and remove its file if that is its living owner."""
+    with contextlib.suppress(Refused, OSError), _locked(segment.path) as handle:
+        if handle is not None and _owner(segment.path, handle) == owner:
+            segment.path.unlink()
+    segment.memory.close()
 
 
 @contextlib.contextmanager
-def _locked() -> Iterator[None]:
-    handle = os.open(FOLDER, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
+def _locked(
+    path: Path, flags: int = 0, patience_s: float = scratch.PATIENCE_S
+) -> Iterator[int | None]:
+    """The file at a path, opened and locked, or None if there is none.
 
-
-def _open(name: str, **how: Any) -> SharedMemory:
-    """Without the resource tracker, which would remove it when any of its users ends."""
-    if sys.version_info >= (3, 13):
-        return SharedMemory(name, track=False, **how)
-    memory = SharedMemory(name, **how)
-    resource_tracker.unregister(f"/{memory.name}", "shared_memory")
-    return memory
-
-
-def _buffer(memory: SharedMemory) -> memoryview:
-    assert memory.buf is not None
-    return memory.buf
-
-
-def _owner(path: Path) -> Identity | None:
-    """The living owner of a segment, None if it is dead. To be called under the lock.
+    Args:
+        path: of a segment.
+        flags: ``os.O_CREAT`` to make an empty one if there is none.
+        patience_s: how long another process may keep its lock, s.
 
     Raises:
-        Refused: it cannot be read or is none of ours.
+        Refused: it is not a file of our user, or another process keeps it locked.
     """
+    while True:
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o600)
+        except FileNotFoundError:
+            yield None
+            return
+        except PermissionError:
+            raise Refused("belongs to another user") from None
+        except OSError as problem:
+            raise Refused(f"{path}: {problem.strerror}") from None
+        try:
+            _refuse_foreign(path, os.fstat(handle))
+            try:
+                scratch.lock(handle, fcntl.LOCK_EX, patience_s)
+            except TimeoutError as problem:
+                raise Refused(str(problem)) from None
+            if _is_at(path, handle):  # it was not replaced while we waited
+                yield handle
+                return
+        finally:
+            fcntl.flock(handle, fcntl.LOCK_UN)  # a mapping of the file would keep the lock
+            os.close(handle)
+
+
+def _refuse_foreign(path: Path, found: os.stat_result) -> None:
+    if found.st_uid != os.geteuid():
+        raise Refused(f"belongs to another user (uid {found.st_uid})")
+    if not stat.S_ISREG(found.st_mode):
+        raise Refused(f"{path} is there and is no link of ours")
+
+
+def _is_at(path: Path, handle: int) -> bool:
     try:
-        with path.open("rb") as file:
-            content = file.read(_OWNER.size)
-    except PermissionError:
-        raise Refused("belongs to another user") from None
+        return os.path.samestat(path.lstat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False
+
+
+def _owner(path: Path, handle: int) -> Identity | None:
+    """The living owner of a locked segment, None if it is dead.
+
+    Raises:
+        Refused: it is none of ours.
+    """
+    content = os.pread(handle, _OWNER.size, 0)
     if not content.strip(b"\0"):
         return None  # its maker was killed while it held the lock
     if len(content) < _OWNER.size or not content.startswith(MAGIC):

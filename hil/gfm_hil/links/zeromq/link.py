@@ -9,7 +9,8 @@ each wake-up preempts the loop, and a round trip takes twice as long.
 from __future__ import annotations
 
 import contextlib
-import socket
+import os
+import time
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,30 +18,50 @@ from typing import TYPE_CHECKING
 import zmq
 
 from gfm_hil.errors import UserError
-from gfm_hil.links.base import Side
+from gfm_hil.links.base import LONGEST, Side
 from gfm_hil.links.port import Port
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.links.zeromq.options import ZmqOptions
+from gfm_hil.links.zeromq.unix_socket import SCHEME, is_served, path_of
 
 if TYPE_CHECKING:
     from gfm_hil.links.zeromq.curve import Curve
 
 _LAST_WORDS, _FAREWELL = 500, 50  # ms
+_NEVER = 10**9  # ms, 11 days; -1 would drop what has arrived and is not read yet
+_LOOK_S = 0.01  # between two looks whether a controller listens
 
 # What a stalled peer leaves unread is bounded, and more is dropped: at each end so many messages,
 _ROOM = 64
 # and in the kernel 500 to 800 more: a Unix socket takes no more by itself, tcp is told (bytes; by
 # itself it takes 40,000). A frame's tick says how old it is; PAIR ignores CONFLATE.
 _KERNEL_ROOM = 16384
+# libzmq parts with a peer that announces a longer message, before it takes memory for it; CURVE
+# adds 33 bytes to a message
+_LARGEST = LONGEST + 64
 
 _DEFAULT = ZmqOptions()
+
+
+def pair_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
+    """A PAIR socket with the link's settings, neither bound nor connected."""
+    made = context.socket(zmq.PAIR)
+    for option, value in (
+        (zmq.SNDHWM, _ROOM),
+        (zmq.RCVHWM, _ROOM),
+        (zmq.SNDBUF, _KERNEL_ROOM),
+        (zmq.RCVBUF, _KERNEL_ROOM),
+        (zmq.MAXMSGSIZE, _LARGEST),
+    ):
+        made.set(option, value)
+    return made
 
 
 class ZmqLink:
     """One end of the link; implements ``gfm_hil.links.Link``.
 
     Args:
-        side: the controller binds, the plant connects (and keeps trying while nobody listens).
+        side: the controller binds, the plant connects, however late the controller comes.
         endpoint: ``ipc:///path`` or ``tcp://host:port``.
         options: of the link.
 
@@ -49,31 +70,35 @@ class ZmqLink:
             if it has no library that could be called (it says so).
 
     Raises:
-        UserError: it cannot be bound, as when it is in use; keys are missing.
+        UserError: it cannot be bound, as when it is in use; another user has it or could take it
+            over; keys are missing. Where the controller comes later, ``send``, ``receive`` and
+            ``wait`` of the plant may raise it too.
     """
 
     port: Port | None = None
 
     def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
-        if side == "controller" and endpoint.startswith("ipc://"):
-            _refuse_if_served(endpoint)
-        self._side, self._endpoint = side, endpoint
+        self._side, self._endpoint, self._ipc = side, endpoint, endpoint.startswith(SCHEME)
+        if side == "controller" and self._ipc and is_served(endpoint):
+            # libzmq would take the file over and leave the other run deaf
+            raise UserError(
+                f"link.endpoint = {endpoint!r}: cannot be bound: occupied by another run"
+            )
         self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.PAIR)
-        self._socket.set(zmq.SNDHWM, _ROOM)
-        self._socket.set(zmq.RCVHWM, _ROOM)
-        self._socket.set(zmq.SNDBUF, _KERNEL_ROOM)
-        self._socket.set(zmq.RCVBUF, _KERNEL_ROOM)
+        self._socket = pair_socket(self._context)
         self._curve: Curve | None = None
+        self._open = False
         try:
             if options.curve is not None:
                 from gfm_hil.links.zeromq.curve import Curve  # 0.1 s, most runs need none
 
                 self._curve = Curve(self._socket, side, Path(options.curve))
             if side == "controller":
-                self._socket.bind(endpoint)
+                self._bind()
             else:
-                self._socket.connect(endpoint)
+                if self._ipc:  # only ``_there`` connects again: it looks whose socket it is
+                    self._socket.set(zmq.RECONNECT_IVL, _NEVER)
+                self._there()
         except UserError:
             self.close()
             raise
@@ -87,8 +112,33 @@ class ZmqLink:
             if self.port is None:
                 warnings.warn("no libzmq that could be called: frames go by pyzmq", stacklevel=2)
 
+    def _bind(self) -> None:
+        """Listen; on this machine to processes of our own user alone."""
+        if self._ipc:
+            self._socket.set(zmq.IPC_FILTER_UID, os.geteuid())  # by SO_PEERCRED
+        self._socket.bind(self._endpoint)
+        if self._ipc:
+            path_of(self._endpoint).chmod(0o600)
+        self._open = True
+
+    def _there(self) -> bool:
+        """Whether the socket is bound or connected; connects it once that can be."""
+        if not self._open and (not self._ipc or is_served(self._endpoint)):
+            self._socket.connect(self._endpoint)
+            self._open = True
+        return self._open
+
+    def connected(self) -> bool | None:
+        """Whether a peer is at the other end; None for a plant on tcp, which cannot know it."""
+        if self._side == "plant" and not self._ipc:
+            return None
+        return self._open and bool(self._socket.poll(0, zmq.POLLOUT))
+
     def send(self, message: bytes) -> bool:
-        """Hand a message over; False if the peer has no room or is not there."""
+        """Hand a message of at most 504 bytes over; False if the peer has no room or is not
+        there."""
+        if len(message) > LONGEST or not self._there():
+            return False
         try:
             self._socket.send(message, zmq.NOBLOCK)
         except zmq.Again:
@@ -97,21 +147,30 @@ class ZmqLink:
 
     def receive(self) -> bytes | None:
         """The next message, or None."""
-        with contextlib.suppress(zmq.Again):
-            return self._socket.recv(zmq.NOBLOCK)
+        if self._there():
+            with contextlib.suppress(zmq.Again):
+                return self._socket.recv(zmq.NOBLOCK)
         return None
 
     def wait(self, seconds: float) -> bool:
         """Sleep until a message is there, at most ``seconds`` (rounded up to a millisecond)."""
-        return bool(self._socket.poll(max(1, round(seconds * 1000)), zmq.POLLIN))
+        until = time.monotonic() + seconds
+        while not self._there():
+            left = until - time.monotonic()
+            if left <= 0:
+                return False
+            time.sleep(min(_LOOK_S, left))
+        left = until - time.monotonic()
+        return bool(self._socket.poll(max(1, round(left * 1000)), zmq.POLLIN))
 
     def again(self) -> None:
         """Reach out anew: libzmq turns a second plant away once and for all, even if the first
         one, of a run before, is about to leave."""
-        if self._side == "plant":
+        if self._side == "plant" and self._open:
             self._socket.disconnect(self._endpoint)
             self._socket.poll(_FAREWELL)  # a PAIR takes no other peer while it parts from one
-            self._socket.connect(self._endpoint)
+            self._open = False
+            self._there()
 
     def close(self) -> None:
         """Free the endpoint; the last words get a moment to leave."""
@@ -121,14 +180,3 @@ class ZmqLink:
         if self._curve is not None:
             self._curve.close()
         self._context.term()
-
-
-def _refuse_if_served(endpoint: str) -> None:
-    """See that nobody listens there: libzmq would take the file over and leave them deaf.
-
-    Raises:
-        UserError: somebody does.
-    """
-    with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
-        probe.connect(endpoint.removeprefix("ipc://"))
-        raise UserError(f"link.endpoint = {endpoint!r}: cannot be bound: occupied by another run")
