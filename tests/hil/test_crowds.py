@@ -140,7 +140,7 @@ def test_the_operator_goes_on_in_a_crowd(lab, attack_now) -> None:
         later.start()
         later.say(kind="hello", token=control.partition("#token=")[2])
         wait_for(lambda: later.granted)
-        assert plain.read_holding_registers(lost, count=1, device_id=1).registers == [0]
+        assert plain.read_holding_registers(lost, count=2, device_id=1).registers == [0, 0]
         assert crowded[2] > 0 and scope.poll() is None and modbus.poll() is None
     attack_now(
         f"the page's commands, its {crowded[2]} pictures and the heartbeat go on; misses "

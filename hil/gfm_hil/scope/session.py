@@ -23,7 +23,7 @@ from gfm_hil.scope.view import Look, View
 #: carries an event out, says at which tick; raises UserError with the reason of a refusal
 Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
 
-SEND_S = 5.0  # in which a page must take what it is sent
+SEND_S = 5.0  # in which a page must take a message
 PER_S, BURST = 20.0, 40  # commands from one page
 
 _LOG = logging.getLogger("gfmhil.scope")
@@ -73,7 +73,7 @@ class Session:
     Three things go out to a page, each in its own way, so that a page that is slow, or that does
     not read at all, keeps nothing from another page: answers wait for the page, which alone waits
     for them; of news and of pictures only the newest is kept, and ``run`` sends it when there is
-    room. A page that takes nothing for ``SEND_S`` is dropped.
+    room. A page that does not take a message in ``SEND_S`` is dropped.
 
     Args:
         socket: to the page.
@@ -139,7 +139,9 @@ class Session:
             async with asyncio.timeout(SEND_S):
                 await self._socket.send(message)
         except TimeoutError:
-            _LOG.warning("%s: has taken nothing for %g s: the page is dropped", self.peer, SEND_S)
+            _LOG.warning(
+                "%s: has not taken a message in %g s: the page is dropped", self.peer, SEND_S
+            )
             self._socket.transport.abort()
 
     async def run(self) -> None:
