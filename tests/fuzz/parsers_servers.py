@@ -85,8 +85,12 @@ def _modbus(place: Path) -> Iterator[Take]:
 
     block = SimData(BASE, values=device.image.registers, datatype=DataType.REGISTERS)
 
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
     async def listen() -> Server:
-        server = Server(SimDevice(id=1, simdata=[block], action=action), ("127.0.0.1", 0), None)
+        server = Server(SimDevice(id=1, simdata=[block], action=action), ("127.0.0.1", port), None)
         await server.serve_forever(background=True)
         return server
 
@@ -109,14 +113,14 @@ def _modbus(place: Path) -> Iterator[Take]:
 
     def take(message: bytes) -> None:
         with (
-            socket.create_connection(("127.0.0.1", server.port), PATIENCE_S) as one,
+            socket.create_connection(("127.0.0.1", port), PATIENCE_S) as one,
             contextlib.suppress(ConnectionError, TimeoutError),
         ):
             one.sendall(message)
             ask(one, 0xFFFF)
             one.settimeout(0.05)  # half a request has no answer
             answers(one, 0xFFFF)
-        with socket.create_connection(("127.0.0.1", server.port), PATIENCE_S) as other:
+        with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as other:
             ask(other, 1)
             assert other.recv(13, socket.MSG_WAITALL)[9:] == b"SunS"
         served.nothing_wrong()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -72,7 +73,10 @@ def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of:
 def _beside(path: Path, name: str) -> str:
     """A file that lies beside the campaign's, or the name as it is."""
     beside = path.parent / name
-    return str(beside.resolve()) if beside.is_file() else name
+    with contextlib.suppress(OSError):  # longer than the name of a file may be
+        if beside.is_file():
+            return str(beside.resolve())
+    return name
 
 
 def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ def put(content: dict[str, Any], path: str, value: Any) -> None:
 def _step(place: Any, key: str, path: str, above: str) -> Any:
     if isinstance(place, dict) and key in place:
         return place[key]
-    if isinstance(place, list) and key.isdecimal() and int(key) < len(place):
+    if isinstance(place, list) and key in map(str, range(len(place))):
         return place[int(key)]
     raise KeyError(_words(place, path, above))
 
