@@ -172,7 +172,7 @@ def shake_hands(
                 _check_time(greeting.t0, begin, now)
                 return Start(greeting.t0, one_clock, heard.refused)
             elif message is not None and greeting is None:
-                tick = _tick(message) if met else None
+                tick = _tick(message, scenario) if met else None
                 if tick is not None:  # it runs: START was lost
                     t0 = now - round(tick * scenario.T_s * 1e9)
                     return Start(t0, one_clock, heard.refused)
@@ -219,10 +219,10 @@ def _boot() -> str:
         return ""
 
 
-def _tick(message: bytes) -> int | None:
-    """Of a frame of the plant; None if it is none."""
+def _tick(message: bytes, scenario: Scenario) -> int | None:
+    """The tick of a plant's frame that a controller would accept as its first; None otherwise."""
     try:
-        return FrameReader("y").unpack(message, np.empty(NY))
+        return FrameReader.of("controller", scenario).unpack(message, np.empty(NY))
     except FrameError:
         return None
 
