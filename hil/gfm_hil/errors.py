@@ -9,6 +9,8 @@ from pydantic import ValidationError
 
 from gfm_runtime.errors import printable
 
+_SHOWN = 20
+
 
 class UserError(Exception):
     """Wrong input or a bench that cannot start; the message names the field, value and remedy."""
@@ -29,12 +31,14 @@ def need(module: str, package: str, what: str, extra: str) -> None:
 
 
 def lines(problem: ValidationError) -> list[str]:
-    """What pydantic found, one line a mistake: path, what is wrong, the value."""
-    return [_line(error) for error in problem.errors()]
+    """What pydantic found, one line a mistake, 20 at most: path, what is wrong, the value."""
+    errors = problem.errors()
+    more = [f"and {len(errors) - _SHOWN} more mistakes"] if len(errors) > _SHOWN else []
+    return [printable(_line(error)) for error in errors[:_SHOWN]] + more
 
 
 def _line(error: Any) -> str:
-    path = printable(".".join(str(part) for part in error["loc"]))
+    path = ".".join(str(part) for part in error["loc"])
     text = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{path}: {text}" if path else text

@@ -12,6 +12,7 @@ from gfm_hil.events import GridImpedance, apply_grid_event
 from gfm_hil.scenario_model import INPROC, LatePolicy, Link, References, Scenario
 from gfm_plant import make_plant
 from gfm_runtime import LawError, discretise, load_law
+from gfm_runtime.errors import printable
 from gfm_runtime.toml_file import read_toml
 
 __all__ = [
@@ -50,13 +51,13 @@ def find_file(kind: str, name: str, pattern: str) -> Path:
     try:
         is_file, exists = given.is_file(), given.exists()
     except OSError as problem:  # such as a name of 300 characters
-        raise UserError(f"{kind} {name}: {problem.strerror}") from None
+        raise UserError(printable(f"{kind} {name}: {problem.strerror}")) from None
     if is_file:
         return given
     if given.name.removesuffix(".toml") in shipped:
         return shipped[given.name.removesuffix(".toml")]
     what = "is not a regular file" if exists else "no such file"
-    raise UserError(f"{kind} {name}: {what}; shipped are {sorted(shipped)}")
+    raise UserError(printable(f"{kind} {name}: {what}; shipped are {sorted(shipped)}"))
 
 
 def _shipped(pattern: str) -> dict[str, Path]:
@@ -106,6 +107,7 @@ def check_scenario(content: dict[str, Any], where: str) -> Scenario:
     Raises:
         UserError: as ``load_scenario``.
     """
+    where = printable(where)
     try:
         scenario = Scenario.model_validate(content)
     except ValidationError as problem:

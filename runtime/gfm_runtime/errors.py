@@ -13,9 +13,9 @@ class LawError(ValueError):
 
     def __init__(self, where: str, why: str) -> None:
         self.where, self.why = where, why
-        super().__init__(f"{where}: {why}")
+        super().__init__(printable(f"{where}: {why}"))
 
 
 def printable(text: str) -> str:
-    """The text with line breaks and control characters, as a quoted TOML key may have, escaped."""
+    """The text in one line: line breaks and control characters, which TOML allows, are escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
-from gfm_runtime.errors import LawError, printable
+from gfm_runtime.errors import LawError
 from gfm_runtime.expressions import evaluate
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.signals import U_NAMES
@@ -146,6 +146,7 @@ class LawFile(_Model):
     schedule: Schedule | None = None
 
 
+_SHOWN = 10
 _NUMBERS = {
     "P": ({"k"}, {"k"}),
     "I": ({"T"}, {"k_i"}),
@@ -271,7 +272,9 @@ def read_law_file(path: str | Path) -> LawFile:
 
 
 def _lines(errors: list[Any]) -> list[str]:
-    return [
-        f"{printable('.'.join(map(str, e['loc'])))}: {e['msg']} (got {e['input']!r:.200})"
-        for e in errors
+    """One part a mistake, of at most ``_SHOWN`` of them."""
+    shown = [
+        f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r:.200})"
+        for e in errors[:_SHOWN]
     ]
+    return shown + ([f"and {len(errors) - _SHOWN} more"] if len(errors) > _SHOWN else [])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,9 @@ def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of:
         text = read_text(path)
         file = CampaignFile.model_validate(parse_toml(text))
     except ValidationError as problem:
-        raise UserError("\n".join(f"{path}: {_line(e)}" for e in problem.errors())) from None
+        raise UserError(
+            "\n".join(f"{path}: {printable(_line(e))}" for e in problem.errors())
+        ) from None
     except ValueError as problem:
         raise UserError(f"{path}: {problem}") from None
     base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
@@ -73,9 +75,8 @@ def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of:
 def _beside(path: Path, name: str) -> str:
     """A file that lies beside the campaign's, or the name as it is."""
     beside = path.parent / name
-    with contextlib.suppress(OSError):  # longer than the name of a file may be
-        if beside.is_file():
-            return str(beside.resolve())
+    with suppress(OSError):  # a name too long, which its loader refuses
+        return str(beside.resolve()) if beside.is_file() else name
     return name
 
 
@@ -99,7 +100,7 @@ def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> Non
     if len(set(file.laws)) < len(file.laws):
         problems.append(f"laws = {file.laws}: each once")
     if problems:
-        raise UserError("\n".join(f"{path}: {p}" for p in problems))
+        raise UserError("\n".join(f"{path}: {printable(p)}" for p in problems))
 
 
 def _end_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
@@ -109,7 +110,7 @@ def _end_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]
         content = copy.deepcopy(campaign.base)
         for target in d.paths():
             put(content, target, value)
-        check_scenario(content, f"{path}: draw.{k}, {d.path} = {value}")
+        check_scenario(content, f"{path}: draw.{k}, {d.path} = {value!r}")
 
     for k, d in enumerate(campaign.file.draw):
         yield from (partial(check, k, d, value) for value in d.ends())
@@ -131,7 +132,7 @@ def _run_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]
 
 
 def _line(error: Any) -> str:
-    where = printable(".".join(str(part) for part in error["loc"]))
+    where = ".".join(str(part) for part in error["loc"])
     text = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{where}: {text}"

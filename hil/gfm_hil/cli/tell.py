@@ -77,7 +77,7 @@ def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
     if options.event is not None:
         try:
             event = json.loads(options.event)
-        except ValueError as problem:
+        except (ValueError, RecursionError) as problem:
             raise UserError(f"--event: not JSON: {problem}") from None
         if not isinstance(event, dict):
             raise UserError(f"--event {options.event}: must be an object")
