@@ -10,6 +10,7 @@ from gfm_hil import scratch
 from gfm_hil.links.base import SIDES, Side
 
 SCHEME = "ipc://"
+LARGEST = 65536  # bytes of a command, and of its answer
 
 
 def announcement(folder: Path, side: Side) -> Path:

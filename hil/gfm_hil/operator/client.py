@@ -10,7 +10,7 @@ import zmq
 from gfm_hil.errors import UserError
 from gfm_hil.events import CONTROLLER_EVENTS
 from gfm_hil.links.base import Side
-from gfm_hil.operator.announced import announced, present
+from gfm_hil.operator.announced import LARGEST, announced, present
 from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
 from gfm_plant import TRIP_REASONS
 from gfm_runtime.controller import REASONS, STATES
@@ -95,6 +95,7 @@ class Operator:
             raise UserError(f"{self._folder}: the {side} is not running")
         with self._context.socket(zmq.REQ) as socket:
             socket.set(zmq.LINGER, 0)
+            socket.set(zmq.MAXMSGSIZE, LARGEST)
             socket.connect(desk["endpoint"])
             socket.send_json(content)
             if not socket.poll(_ANSWER_MS):
