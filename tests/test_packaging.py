@@ -125,7 +125,7 @@ def committed(folder: str) -> set[str]:
 
 
 @pytest.mark.attack(
-    "10.6", "deploying from a wheel", "deploy/ was not in it: units and scripts only by a checkout"
+    "10.7", "deploying from a wheel", "deploy/ was not in it: units and scripts only by a checkout"
 )
 def test_deploy_writes_what_is_committed_and_keeps_what_is_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], attack_now: Callable[[str], None]
@@ -161,7 +161,7 @@ LOCKED = re.compile(r"^([a-z0-9][a-z0-9._-]*)(==[^ ]+(?:.|\n(?=    --))*)", re.M
     [("ci.txt", ("test", "docs")), ("container.txt", ("can", "modbus", "scope", "metrics"))],
 )
 @pytest.mark.attack(
-    "10.7",
+    "10.8",
     "a package of the same version but other content, in CI and in the image",
     "it was installed: no version was fixed and no hash checked",
 )

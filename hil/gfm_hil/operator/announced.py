@@ -11,6 +11,7 @@ from gfm_hil.errors import UserError
 from gfm_hil.links.base import SIDES, Side
 
 SCHEME = "ipc://"
+LARGEST = 65536  # bytes of a command, and of its answer
 
 
 def announcement(folder: Path, side: Side) -> Path:

@@ -11,7 +11,7 @@ import zmq
 from gfm_hil.errors import UserError
 from gfm_hil.events import CONTROLLER_EVENTS
 from gfm_hil.links.base import Side
-from gfm_hil.operator.announced import announced, present
+from gfm_hil.operator.announced import LARGEST, announced, present
 from gfm_hil.operator.identity import Identity, local
 from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
 from gfm_plant import TRIP_REASONS
@@ -136,6 +136,7 @@ class Operator:
     def _exchange(self, side: Side, endpoint: str, content: dict[str, Any]) -> dict[str, Any]:
         with self._context.socket(zmq.REQ) as socket:
             socket.set(zmq.LINGER, 0)
+            socket.set(zmq.MAXMSGSIZE, LARGEST)
             socket.connect(endpoint)
             socket.send_json(content)
             if not socket.poll(_ANSWER_MS):

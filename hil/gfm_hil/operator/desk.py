@@ -33,7 +33,7 @@ from gfm_hil.events import (
     apply_grid_event,
 )
 from gfm_hil.links.base import Side
-from gfm_hil.operator.announced import SCHEME, announcement
+from gfm_hil.operator.announced import LARGEST, SCHEME, announcement
 from gfm_hil.operator.identity import Identity
 from gfm_hil.operator.rate import Rate
 from gfm_hil.retune import retuned
@@ -41,7 +41,7 @@ from gfm_hil.timeline import Timeline
 
 _LOOK_MS = 100
 _TAKEN_OVER_S = 5.0  # in lockstep a tick may take as long as the other side likes
-_LARGEST = 65536  # bytes of a command
+_ROOM = 16  # commands that wait, of one operator
 _PER_S, _BURST = 100.0, 200  # commands to one side, of all operators together
 
 _EVENT: TypeAdapter[Any] = TypeAdapter(Event)
@@ -77,7 +77,8 @@ class Desk:
     def __enter__(self) -> Desk:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.REP)
-        self._socket.set(zmq.MAXMSGSIZE, _LARGEST)
+        self._socket.set(zmq.MAXMSGSIZE, LARGEST)
+        self._socket.set(zmq.RCVHWM, _ROOM)
         with contextlib.ExitStack() as stack:
             stack.callback(self._context.destroy, linger=0)
             place = stack.enter_context(scratch.temporary("gfmhil-desk-"))

@@ -16,11 +16,14 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from gfm_hil.links.base import SIDES
 from gfm_hil.telemetry.follow import COLUMNS, TIMES, Rows
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
 _TOPIC = "gfmhil/"
 _MOST = 5000  # rows a message: about 1 MB
+_HEAD = 4096  # bytes of a .npy file before its rows, at most
+ROOM = 500  # messages that wait for a slow reader, on either side: 5 s of a run in real time
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,10 @@ class BlockReader:
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, side: str = "") -> None:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
-        self._socket.set(zmq.RCVHWM, 0)  # what waits here is ours to lose, not libzmq's
+        self._socket.set(zmq.RCVHWM, ROOM)
+        self._socket.set(
+            zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s).itemsize for s in SIDES)
+        )
         self._socket.subscribe(f"{_TOPIC}{side}")
         self._socket.connect(endpoint)
 

@@ -17,6 +17,8 @@ from gfm_hil.telemetry.samples import Sampler
 
 _LOOK_S = 0.02
 _LINGER_MS = 500  # for what is still to leave in the end
+_LONGEST = 256  # bytes of a subscription; ours have 17
+_WAITING = 100  # subscriptions of one subscriber that are still to be read
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,9 @@ def _bind(
     context: zmq.Context[zmq.Socket[bytes]], host: str, port: int, option: str
 ) -> zmq.Socket[bytes]:
     socket = context.socket(zmq.PUB)
+    socket.set(zmq.MAXMSGSIZE, _LONGEST)
+    socket.set(zmq.RCVHWM, _WAITING)
+    socket.set(zmq.SNDHWM, blocks.ROOM)
     where = f"tcp://{f'[{host}]' if ':' in host else host}:{port or '*'}"
     try:
         socket.set(zmq.IPV6, int(":" in host))
