@@ -44,6 +44,12 @@ jitter = 2e-4
 """
 WARM_UP = 0.25  # of the rounds: imports, caches and threads that a process makes once
 GROWTH = 8 * MB  # of a process's own memory after the warm-up
+# glibc gives freed memory back at once: what it would keep for later is no growth of ours
+AT_ONCE = {
+    "MALLOC_ARENA_MAX": "1",
+    "MALLOC_MMAP_THRESHOLD_": "65536",
+    "MALLOC_TRIM_THRESHOLD_": "65536",
+}
 MORE_THREADS = 2  # that asyncio's pool may add when a call comes while the others are busy
 EXTREMES = 2 * 4 / 7  # bytes of the scope's pyramid, for each channel and tick
 
@@ -64,7 +70,7 @@ def bench(link: str, place: Path) -> Iterator[tuple[Clients, dict[str, subproces
             )  # fmt: skip
         return started[name]
 
-    environment = {**os.environ, "TMPDIR": str(place)}
+    environment = {**os.environ, **AT_ONCE, "TMPDIR": str(place)}
     try:
         stream = start("stream", "stream", str(folder), "--wait", "--port", "0",
                        "--prometheus", "0")  # fmt: skip
