@@ -34,6 +34,7 @@ from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.summary import summarise
 from gfm_hil.timeline import Outcome, read_log, worst
 
+_LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 _COLUMNS = ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *PLANT_TIMES, *CONTROLLER_TIMES)
 
@@ -138,27 +139,43 @@ def recover(folder: Path) -> Run:
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """While this process runs the run of ``folder``, ``recover`` refuses it."""
-    hold = scratch.hold(folder)
-    try:
+    """While this process runs the run of ``folder``, ``recover`` refuses it.
+
+    Raises:
+        UserError: another process is just recovering it.
+    """
+    with contextlib.ExitStack() as stack:
+        handle = _open_lock(folder)
+        stack.callback(os.close, handle)
+        try:
+            scratch.lock(handle, fcntl.LOCK_SH)
+        except TimeoutError as problem:
+            raise UserError(f"{folder}: {problem}") from None
         yield
-    finally:
-        scratch.let_go(hold)
 
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Keep others from a folder, and from its parts where those lie elsewhere."""
     with contextlib.ExitStack() as stack:
-        hold = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        stack.callback(os.close, hold)
+        handle = _open_lock(folder)
+        stack.callback(os.close, handle)
         try:
-            fcntl.flock(hold, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            scratch.lock(handle, fcntl.LOCK_EX, patience_s=0.0)
+        except TimeoutError:
             raise UserError(f"{folder}: the run is still going on") from None
-        if (folder / "parts").is_dir():
+        if (folder / "parts").is_symlink() and (folder / "parts").is_dir():
             stack.callback(scratch.let_go, scratch.hold((folder / "parts").resolve()))
         yield
+
+
+def _open_lock(folder: Path) -> int:
+    """The file that is locked while a run folder is in use; only our user can open it, so that no
+    other user can keep it locked."""
+    try:
+        return os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError as problem:
+        raise UserError(f"{folder}: {problem.strerror}") from None
 
 
 @contextlib.contextmanager
@@ -222,7 +239,7 @@ def _complete(
 def _clear(folder: Path) -> None:
     """Remove what the files of a complete run were made of, and what a killed process left."""
     remove_parts(folder)
-    for pattern in ("events_*", "link_*.json", "desk_*.json", _ENDED):
+    for pattern in (_LOCK, "events_*", "link_*.json", "desk_*.json", _ENDED):
         for path in folder.glob(pattern):
             path.unlink()
     for path in unfinished(folder):
