@@ -9,28 +9,50 @@ import numpy as np
 
 from gfm_hil.crc import crc32
 from gfm_runtime.compiled import inlined
+from gfm_runtime.controller import REASONS, SAFE, STOPPED
 from gfm_runtime.signals import TABLE_VERSION
 
 MAGIC = 0x4647  # "GF"
 
-FAULTS = ("size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence")
-SIZE, BAD_MAGIC, VERSION, SOURCE, CRC, REPEATED, LOST, OUT_OF_SEQUENCE = range(len(FAULTS))
+FAULTS = (
+    "size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence", "tick",
+    "state",
+)  # fmt: skip
+(
+    SIZE, BAD_MAGIC, VERSION, SOURCE, CRC, REPEATED, LOST, OUT_OF_SEQUENCE, TICK, STATE,
+) = range(len(FAULTS))  # fmt: skip
 
-#: what a reader knows; ``fault`` is that of the frame last refused
+#: the state of the end-to-end protection (E2E): no good frame yet; good frames with newer ticks
+#: come; for too long none came
+E2E = ("initial", "valid", "invalid")
+INITIAL, VALID, INVALID = range(len(E2E))
+
+#: what a reader knows, and the limits within which it accepts a frame
 reader_dtype = np.dtype(
     [
         ("faults", "i8", (len(FAULTS),)),
+        ("fault", "i8"),  # of the frame last refused
+        ("e2e", "i8"),
         ("next", "i8"),  # sequence expected
         ("tick", "i8"),  # of the last good frame, -1 before the first
+        ("repeats", "i8"),  # how often that tick came again
         ("state", "i8"),
         ("reason", "i8"),
-        ("fault", "i8"),
+        # the limits
+        ("newest", "i8"),  # the highest tick that a peer which runs can be at
+        ("behind", "i8"),  # how many ticks below ``newest`` its frame may be
+        ("delta", "i8"),  # how many ticks it may advance from one good frame to the next
+        ("jump", "i8"),  # how many frames in a row may be missing
+        ("again", "i8"),  # how often it may send one tick again
+        ("leaving", "i8"),  # the lowest state by which the peer says that it leaves
     ],
     align=True,
 )
 
 _CRC_BYTES = 4  # at the end
 _WRAP = 0x1_0000_0000
+LONGEST_JUMP = _WRAP // 2 - 1  # beyond it a sequence counts as older
+_NO_LIMIT = 2**63 - 1
 _HEADER = (
     ("magic", "<u2"),
     ("version", "u1"),
@@ -56,9 +78,12 @@ def buffer(count: int, data_id: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_reader() -> np.ndarray:
-    """A reader that has seen nothing yet."""
+    """A reader that has seen nothing yet and limits neither ticks nor missing frames."""
     reader = np.zeros(1, reader_dtype)
-    reader["tick"] = -1
+    reader["tick"], reader["leaving"] = -1, SAFE
+    for limit in ("newest", "behind", "delta", "again"):
+        reader[limit] = _NO_LIMIT
+    reader["jump"] = LONGEST_JUMP
     return reader
 
 
@@ -88,6 +113,10 @@ def pack(sequence, frame, message, tick, state, reason, values):
 def unpack(reader, data_id, frame, message, size, values):
     """Check a frame and take its values.
 
+    A refused frame leaves all but the counters of the reader as it was. The tick of a good frame
+    never goes back. A peer that leaves says so under its last tick or the next one, however far
+    the reader has gone on since.
+
     Args:
         reader: one-element array of ``reader_dtype``.
         data_id: the frame's that is expected.
@@ -111,15 +140,54 @@ def unpack(reader, data_id, frame, message, size, values):
         fault = VERSION
     elif f.data_id != data_id:
         fault = SOURCE
-    elif ahead >= _WRAP // 2:
+    elif ahead > r.jump:
         fault = REPEATED if ahead == _WRAP - 1 else OUT_OF_SEQUENCE
+    elif f.state > STOPPED or f.reason >= len(REASONS):
+        fault = STATE
+    elif _implausible(r, np.int64(f.tick), f.state >= r.leaving):
+        fault = TICK
     if fault >= 0:
         r.faults[fault] += 1
         r.fault = fault
         return -1
     r.faults[LOST] += ahead
     r.next = (np.int64(f.sequence) + 1) % _WRAP
-    r.tick, r.state, r.reason = np.int64(f.tick), f.state, f.reason
+    tick = np.int64(f.tick)
+    if tick > r.tick:
+        r.repeats = 0
+        if r.e2e == INITIAL:
+            r.e2e = VALID
+    else:
+        r.repeats += 1
+    r.tick, r.state, r.reason = tick, f.state, f.reason
     for j in range(len(values)):
         values[j] = f.values[j]
-    return r.tick
+    return tick
+
+
+@inlined
+def _implausible(r, tick, leaves):
+    """Whether the peer cannot be at that tick; one of 2**63 or more arrives here as negative."""
+    if tick < 0 or tick < r.tick or tick - max(r.tick, 0) > r.delta:
+        return True
+    if leaves:
+        return tick - 1 > r.newest
+    if tick == r.tick and r.repeats >= r.again:
+        return True
+    return tick > r.newest or tick < r.newest - r.behind
+
+
+@inlined
+def judge(reader, overdue, latched):
+    """Move the E2E state on, apart from what ``unpack`` does when a frame comes.
+
+    Args:
+        reader: one-element array of ``reader_dtype``.
+        overdue: no newer good frame came for longer than the caller allows.
+        latched: the caller is in its safe state, or tripped; only a reset ends that, and with it
+            INVALID.
+    """
+    if overdue:
+        reader[0].e2e = INVALID
+    elif reader[0].e2e == INVALID and not latched:
+        reader[0].e2e = INITIAL

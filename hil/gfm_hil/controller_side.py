@@ -32,7 +32,7 @@ def run_controller(
     realtime = scenario.mode == "realtime"
     T_ns = round(scenario.T_s * 1e9)
     patience_ns = int(scenario.link.peer_timeout_s * 1e9)
-    reader, writer = FrameReader("y"), FrameWriter("u")
+    reader, writer = FrameReader.of("controller", scenario), FrameWriter("u")
     signals, times, progress = part.signals, part.times, part.progress
     waits = scenario.after_trip == "wait"
     done, tick = 0, 0  # ticks processed; the tick of the newest frame
@@ -48,25 +48,29 @@ def run_controller(
             part_from(link, writer, reader, tick, SAFE, int(c.ctl["reason"][0]), bench.u)
 
     while timeline.running:
-        wait_ns = T_ns if realtime else patience_ns
-        frame = await_message(link, time.monotonic_ns() + wait_ns, stopped)
+        reader.judge(False, c.ctl["state"][0] == SAFE)
+        until = time.monotonic_ns() + T_ns if realtime else heard + patience_ns
+        frame = await_message(link, until, stopped)
         now = time.monotonic_ns()
         if stopped():
             leave("interrupted", "stopped by the operator", STOPPED, 0)
             break
-        newest = -1
+        newest, before = -1, reader.tick
         if frame is not None:
             with contextlib.suppress(FrameError):  # counted; in lockstep the plant will ask again
                 newest = reader.unpack(frame, bench.y)
         if newest < 0:
             if now - heard >= patience_ns:
+                reader.judge(True, True)
                 leave("safe", REASONS[LOST_PEER], SAFE, LOST_PEER)
             elif realtime and done:  # before tick 0 nothing can be stale
                 while int(c.ctl["stale"][0]) < (now - heard) // T_ns:
                     missed(c.ctl)
+                reader.judge(c.ctl["stale"][0] > c.ctl["hold"][0], True)
                 look()
             continue
-        heard = now
+        if newest > before:  # nothing else is a sign of life
+            heard = now
         if reader.state == SAFE and not waits:
             leave("tripped", REASONS[PLANT_TRIP], SAFE, PLANT_TRIP)
             break
@@ -77,7 +81,7 @@ def run_controller(
                 timeline.finish(tick)
                 part_from(link, writer, reader, tick, STOPPED, 0, bench.u)
             break
-        if done and newest <= tick:  # the plant asks again: our answer was lost
+        if newest <= before:  # the plant asks again: our answer was lost
             link.send(writer.pack(tick, int(c.ctl["state"][0]), int(c.ctl["reason"][0]), bench.u))
             continue
         tick = newest

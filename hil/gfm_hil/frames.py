@@ -7,18 +7,29 @@ before it. Two data ids exist: y (plant to controller) and u (controller to plan
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.codec import E2E, LONGEST_JUMP, buffer, judge, make_reader, pack, unpack, wire_dtype
 from gfm_hil.codec import FAULTS as FAULT_NAMES
-from gfm_hil.codec import buffer, make_reader, pack, unpack, wire_dtype
+from gfm_runtime.controller import STOPPED
 from gfm_runtime.signals import Group, names
+
+if TYPE_CHECKING:
+    from gfm_hil.links.base import Side
+    from gfm_hil.scenario import Scenario
+
+LAST_TIMES = 3  # how often a side sends the frame by which it leaves
 
 DATA_IDS: dict[Group, int] = {"y": 1, "u": 2}
 
-Fault = Literal["size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence"]
+Fault = Literal[
+    "size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence", "tick",
+    "state",
+]  # fmt: skip
 FAULTS: tuple[Fault, ...] = FAULT_NAMES  # type: ignore[assignment]
 
 
@@ -58,11 +69,34 @@ class FrameReader:
     """Unpacks the other side's vector and counts every frame that fails a check, by its fault.
 
     A gap in the sequence is counted as that many ``lost`` frames, and the frame is used; a frame
-    that is not newer than the last is ``repeated`` or ``out_of_sequence`` and is refused.
+    that is not newer than the last is ``repeated`` or ``out_of_sequence`` and is refused. A frame
+    whose tick the sender cannot be at is refused as ``tick``, one whose state or reason byte has
+    no meaning as ``state``.
 
     Args:
-        group: ``"y"`` or ``"u"``.
+        group: ``"y"`` or ``"u"``. Without ``of``, the reader limits neither the tick nor the gap.
     """
+
+    @classmethod
+    def of(cls, side: Side, scenario: Scenario) -> FrameReader:
+        """The reader of one side, with the limits that its scenario sets.
+
+        A gap of more ticks than ``link.peer_timeout_s`` has is that of a peer that is gone. The
+        plant's loop writes its own tick into ``newest`` at every tick.
+        """
+        reader, link = cls("u" if side == "plant" else "y"), scenario.link
+        lockstep, r = scenario.mode == "lockstep", reader.record
+        r["delta"] = math.ceil(link.peer_timeout_s / scenario.T_s) + 1
+        asked = math.ceil(min(link.peer_timeout_s / link.repeat_s, LONGEST_JUMP))
+        r["jump"] = min(int(r["delta"][0]) + asked + LAST_TIMES, LONGEST_JUMP)
+        r["again"] = asked if lockstep else 0
+        if side == "controller":
+            r["newest"] = scenario.ticks - 1
+        elif not lockstep:
+            r["behind"] = scenario.late_policy.hold
+        if scenario.after_trip == "wait":
+            r["leaving"] = STOPPED
+        return reader
 
     def __init__(self, group: Group) -> None:
         self.group = group
@@ -89,6 +123,20 @@ class FrameReader:
     def reason(self) -> int:
         """The sender's reason in the last good frame."""
         return int(self.record["reason"][0])
+
+    @property
+    def left(self) -> bool:
+        """The last good frame said that its sender leaves."""
+        return bool(self.record["state"][0] >= self.record["leaving"][0])
+
+    @property
+    def e2e(self) -> str:
+        """State of the end-to-end protection, one of ``gfm_hil.codec.E2E``."""
+        return E2E[int(self.record["e2e"][0])]
+
+    def judge(self, overdue: bool, latched: bool) -> None:
+        """Move the E2E state on; see ``gfm_hil.codec.judge``."""
+        judge(self.record, bool(overdue), bool(latched))
 
     def unpack(self, message: bytes, values: NDArray[np.float64]) -> int:
         """Write the values of a good frame into ``values``; returns its tick.

@@ -98,7 +98,7 @@ def shake_hands(
             elif met:
                 return Start(content["t0"] if one_clock else now + _LEAD_NS, one_clock)
         elif message is not None and met:
-            tick = _tick(message)
+            tick = _tick(message, scenario)
             if tick is not None:  # it runs: START was lost
                 return Start(now - round(tick * scenario.T_s * 1e9), one_clock)
         if now >= deadline:
@@ -141,10 +141,10 @@ def _boot() -> str:
         return ""
 
 
-def _tick(message: bytes) -> int | None:
-    """Of a frame of the plant; None if it is none."""
+def _tick(message: bytes, scenario: Scenario) -> int | None:
+    """The tick of a plant's frame that a controller would accept as its first; None otherwise."""
     try:
-        return FrameReader("y").unpack(message, np.empty(NY))
+        return FrameReader.of("controller", scenario).unpack(message, np.empty(NY))
     except FrameError:
         return None
 

@@ -22,6 +22,8 @@ from gfm_plant import NO_FRESH_U, plant_ahead, plant_go_on, plant_sample, plant_
 from gfm_plant.protection import CONTROLLER, SAFE_STATE, SILENT, trip
 from gfm_runtime.controller import PLANT_TRIP, READY, REASONS, SAFE, STOPPED
 
+_QUEUED = 64  # frames that the plant still takes in a tick whose time is over
+
 
 @dataclass
 class _Plant:
@@ -34,7 +36,8 @@ class _Plant:
     stopped: Callable[[], bool]
 
     def __post_init__(self) -> None:
-        self.reader, self.writer = FrameReader("u"), FrameWriter("y")
+        self.reader = FrameReader.of("plant", self.bench.scenario)
+        self.writer = FrameWriter("y")
         self.T_ns = round(self.bench.scenario.T_s * 1e9)
         self.patience_ns = int(self.bench.scenario.link.peer_timeout_s * 1e9)
         self.repeat_ns = int(self.bench.scenario.link.repeat_s * 1e9)
@@ -46,6 +49,7 @@ class _Plant:
 
     def sample(self, tick: int) -> None:
         b = self.bench
+        self.reader.record["newest"] = tick
         self.timeline.carry_out(tick)
         plant_sample(b.par, b.st, b.y)
         self.tripped = int(b.st["trip"][0])
@@ -78,6 +82,7 @@ class _Plant:
         if self.reader.state == STOPPED:
             self.timeline.end("interrupted", CONTROLLER_LEFT, tick)
             return
+        self.reader.judge(self.late > self.bench.scenario.late_policy.hold, self.tripped != 0)
         if self.tripped and fresh and self.reader.state == READY:
             b.restore_plant(tick + 1)
             self.u_last = self.u_before = b.u.copy()
@@ -85,7 +90,7 @@ class _Plant:
         plant_take(b.par, b.st, b.u)
         if not self.ahead:
             plant_go_on(b.par, b.st)
-        if self.waits and self.late > self.bench.scenario.late_policy.hold:
+        if self.waits and self.reader.e2e == "invalid":
             trip(b.st[0], CONTROLLER, SILENT)
 
     def lockstep(self, tick: int) -> None:
@@ -94,19 +99,19 @@ class _Plant:
         deadline, again = now + self.patience_ns, now + self.repeat_ns
         while True:
             frame = await_message(self.link, min(deadline, again), self.stopped)
-            if frame is None:
-                if again >= deadline or self.stopped():
-                    break
-                again = time.monotonic_ns() + self.repeat_ns  # y[k] or u[k] was lost: ask again
-                self.link.send(self.frame(tick))
-                continue
             # a controller that leaves says so under the last tick it saw
-            leaves = (STOPPED,) if self.waits else (SAFE, STOPPED)
-            if self.take(frame) == tick or self.reader.state in leaves:
+            if frame is not None and (self.take(frame) == tick or self.reader.left):
                 self.part.times[tick, 3] = time.monotonic_ns()
                 self.advance(tick, True)
                 return
+            now = time.monotonic_ns()
+            if now >= deadline or self.stopped():
+                break
+            if now >= again:  # y[k] or u[k] was lost: ask again
+                again = now + self.repeat_ns
+                self.link.send(self.frame(tick))
         if not self.stopped():
+            self.reader.judge(True, True)
             self.timeline.end("safe", "the controller's process is gone", tick)
 
     def realtime(self, tick: int, deadline: int) -> None:
@@ -115,12 +120,14 @@ class _Plant:
         self.sample(tick)
         newest = -1
         until = deadline + self.T_ns
-        while newest < tick:
+        in_queue = _QUEUED
+        while newest < tick and in_queue > 0:
             frame = self.link.receive()
             now = time.monotonic_ns()
             if frame is not None:
                 newest = max(newest, self.take(frame))
                 times[3] = now if newest == tick else -1
+                in_queue -= now >= until
             elif now >= until:
                 break
             else:
@@ -136,8 +143,9 @@ class _Plant:
         while time.monotonic_ns() < until:
             os.sched_yield()
         if self.late * self.T_ns >= self.patience_ns:
+            self.reader.judge(True, True)
             self.timeline.end("safe", "the controller's process is gone", tick)
-        elif self.late > self.bench.scenario.late_policy.hold and not self.waits:
+        elif self.reader.e2e == "invalid" and not self.waits:
             self.timeline.end("safe", NO_FRESH_U, tick)
 
 

@@ -140,7 +140,7 @@ def _meet_and_run(
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link that sees more than whole messages
     faults = {**reader.faults, **counted}
-    return {"faults": faults, "one_clock": start.one_clock, **injected}
+    return {"faults": faults, "e2e": reader.e2e, "one_clock": start.one_clock, **injected}
 
 
 def compile_side(side: Side, bench: Bench, part: Part) -> None:
@@ -152,7 +152,9 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
     warm_up(bench.controller)
     for group in DATA_IDS:
         values = np.zeros(len(names(group)))
-        FrameReader(group).unpack(FrameWriter(group).pack(0, 0, 0, values), values)
+        reader = FrameReader(group)
+        reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
+        reader.judge(False, False)
     compile_loops(side, bench, part)
     if side == "plant":
         record_sample(part.signals[0].copy(), y, par, st)

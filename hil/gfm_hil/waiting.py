@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.errors import PeerLost
-from gfm_hil.frames import FrameError, FrameReader, FrameWriter
+from gfm_hil.frames import LAST_TIMES, FrameError, FrameReader, FrameWriter
 from gfm_hil.links import Link
 from gfm_runtime.controller import SAFE, STOPPED
 from gfm_runtime.signals import names
 
 _SPIN_NS = 50_000  # longer takes processor time from the very threads that bring the answer
 
-_LAST_NS, _LAST_TIMES = 500_000_000, 3
+_LAST_NS = 500_000_000
 
 
 def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
@@ -49,7 +49,7 @@ def send_last(
     while to make some.
     """
     give_up = time.monotonic_ns() + _LAST_NS
-    for _ in range(_LAST_TIMES):
+    for _ in range(LAST_TIMES):
         message = writer.pack(tick, state, reason, values)
         while not link.send(message) and time.monotonic_ns() < give_up:
             time.sleep(0.001)

@@ -216,6 +216,28 @@ def test_lost_vectors_are_counted(name, fd, gap):
     assert bus.hear(*bus.frames(gap + 2)) == [gap + 2]
 
 
+@pytest.mark.attack("1.18", "CAN: the first status says tick 2**31 + 5", "taken for tick 0")
+@given(vectors, either, st.sampled_from([2**31 + 5, 2**32 - 1]))
+def test_a_tick_below_zero_is_refused(name, fd, tick):
+    bus = Bus(name, fd)
+    assert bus.hear(*bus.frames(tick)) == ["tick"]
+
+
+@pytest.mark.attack("1.19", "CAN: the status of an old tick comes again", "its tick is used")
+@given(vectors, either, st.integers(2, 200))
+def test_an_old_status_moves_no_tick_back(name, fd, last):
+    bus = Bus(name, fd, heartbeat=10)
+    old, *values = bus.frames(0)
+    bus.hear(old, *values)
+    for tick in range(1, last):
+        bus.hear(*bus.frames(tick))
+    bus.hear(old)
+    for tick in range(last, last + 40):  # until a heartbeat says where the sender is
+        found = bus.hear(*bus.frames(tick))
+        assert found in ([], ["tick"], [tick])
+    assert found == [tick]
+
+
 @pytest.mark.parametrize("gap", [300, 70_000])
 def test_after_a_long_gap_a_heartbeat_finds_in_again(gap):
     bus = Bus("y", heartbeat=50)

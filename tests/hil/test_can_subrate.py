@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_runtime.controller import RUNNING, SAFE, STOPPED
@@ -107,3 +108,22 @@ def test_damage_and_the_last_word_come_through_at_once():
     side.inbox = [frame("u", 4, 4)[:-1] + b"?", frame("u", 2, 3, SAFE)]
     assert side.heard() == ["crc", (2, 2)]
     assert side.reader.state == SAFE
+
+
+@pytest.mark.attack("1.17", "CAN, every = 4: a u for tick 16 comes at tick 0", "acts at tick 20")
+def test_a_command_from_the_future_is_not_kept_until_it_fits(attack_now):
+    side = Side("u")
+    found, lie = [], 16
+    for tick in range(28):
+        side.stage.goes(frame("y", tick, tick))
+        side.reader.record["newest"] = tick  # as the plant does
+        if tick == 0:
+            side.inbox += [frame("u", 0, 0), frame("u", lie, 1)]
+        elif tick % EVERY == 0 and tick != lie:
+            side.inbox.append(frame("u", tick, tick))
+        found += side.heard()
+    assert found.count("tick") == 1
+    taken = [heard for heard in found if heard != "tick"]
+    assert [tick for tick, _ in taken] == [t for t in range(28) if not 20 <= t < 24]
+    assert lie not in [value for _, value in taken]
+    attack_now("refused; ticks 20 to 23 hold u")

@@ -74,7 +74,7 @@ def check(pair: Pair, link: str, ticks: int) -> None:
         assert gone <= faults["lost"] <= gone + refused
         late = faults["repeated"] + faults["out_of_sequence"]
         assert late <= i["duplicated"] + i["reordered"] <= late + i["waiting"]
-        assert not any(faults[f] for f in ("size", "magic", "version", "source"))
+        assert not any(faults[f] for f in ("size", "magic", "version", "source", "tick", "state"))
 
 
 @pytest.mark.parametrize("kind", IMPAIRMENTS)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.frames import FAULTS, FrameError, FrameReader, FrameWriter, frame_dtype
+from gfm_runtime.controller import REASONS, STOPPED
 from gfm_runtime.signals import TABLE_VERSION, names
 
 GROUPS = ("y", "u")
@@ -46,8 +47,8 @@ def refused(reader: FrameReader, message: bytes) -> str:
     return found.value.fault
 
 
-@given(st.data(), st.sampled_from(GROUPS), st.integers(0, 2**63 - 1), st.integers(0, 255),
-       st.integers(0, 255))  # fmt: skip
+@given(st.data(), st.sampled_from(GROUPS), st.integers(0, 2**63 - 1), st.integers(0, STOPPED),
+       st.integers(0, len(REASONS) - 1))  # fmt: skip
 def test_what_is_packed_is_unpacked_bit_for_bit(data, group, tick, state, reason):
     sent = np.array(data.draw(st.lists(numbers, min_size=WIDTH[group], max_size=WIDTH[group])))
     message = FrameWriter(group).pack(tick, state, reason, sent)

@@ -363,7 +363,7 @@ def test_a_tick_beyond_the_run_is_refused(place, make):
     scenario = make(link=LIVE, law="vsg-2", duration=0.001)
     heard = after(frames("y", 0, 1, 10_000_000), "y", 2, STOPPED)
     found = alone("controller", scenario, place, heard)
-    assert found.faults["out_of_sequence"] == 1
+    assert found.faults["tick"] == 1
     assert answered(found) == [0, 1]
 
 

@@ -7,7 +7,7 @@ received so far foretells: it needs no clock in common with the plant.
 
 from __future__ import annotations
 
-from gfm_hil.codec import OUT_OF_SEQUENCE, pack, unpack
+from gfm_hil.codec import judge, pack, unpack
 from gfm_hil.loops.clock import AHEAD_NS, between_looks, give_way, now_ns, sleep_until
 from gfm_hil.loops.records import (
     BELL,
@@ -55,8 +55,7 @@ def controller_ticks(
         if not r.pending:
             before = r.tick
             why = _next_frame(
-                receive, patient, handle, spins, into, reader, r, told, ctl, y, times, len(rows),
-                sent,
+                receive, patient, handle, spins, into, reader, r, told, ctl, y, times, sent
             )  # fmt: skip
             if why >= 0:
                 return why
@@ -91,7 +90,7 @@ def controller_ticks(
 
 @inlined
 def _next_frame(
-    receive, patient, handle, spins, into, reader, r, told, ctl, y, times, ticks, sent
+    receive, patient, handle, spins, into, reader, r, told, ctl, y, times, sent
 ):  # fmt: skip
     """Wait for a good frame of the plant: -1, its tick in ``r``; or why to come back.
 
@@ -99,6 +98,7 @@ def _next_frame(
     gap between two looks like any other.
     """
     got, got_bytes = into
+    judge(reader, False, ctl[0].state == SAFE)
     if told[RING] != r.bell:
         r.bell = told[RING]
         return BELL
@@ -126,16 +126,17 @@ def _next_frame(
             before = now
             if size > 0:
                 k = unpack(reader, _Y_ID, got, got_bytes, size, y)
-                if k >= ticks and reader[0].state != SAFE and reader[0].state != STOPPED:
-                    reader[0].faults[OUT_OF_SEQUENCE] += 1
-                elif k >= 0:
+                if k > r.tick:  # nothing else is a sign of life
                     r.heard = now
+                if k >= 0:
                     break
             if now - r.heard >= r.patience:
+                judge(reader, True, True)
                 return SILENT
             if r.realtime and r.done > 0:  # before tick 0 nothing can be stale
                 while ctl[0].stale < (now - r.heard) // r.T and ctl[0].state != SAFE:
                     missed(ctl)
+                judge(reader, ctl[0].stale > ctl[0].hold, True)
                 if ctl[0].state != r.seen:
                     r.seen = ctl[0].state
                     return LOOK

@@ -40,7 +40,6 @@ from gfm_hil.timeline import CONTROLLER_LEFT, PLANT_LEFT, Timeline
 from gfm_hil.waiting import part_from
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.controller import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
-from gfm_runtime.signals import Group
 
 _FAR = 2**62  # as of a timeline without events
 _NAP_NS = 100_000
@@ -56,8 +55,8 @@ class _Loop:
         scenario, port, self.part = bench.scenario, link.port, part
         plant = side == "plant"
         self.bench, self.link = bench, link
-        own: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
-        self.writer, self.reader = FrameWriter(own[0]), FrameReader(own[1])
+        self.writer = FrameWriter("y" if plant else "u")
+        self.reader = FrameReader.of(side, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         self.loop["looks"] = port.looks
         w, r, c = self.writer, self.reader, bench.controller

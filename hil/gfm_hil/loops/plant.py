@@ -5,7 +5,7 @@ The same rules as ``gfm_hil.plant_side``, which does it in Python for links with
 
 from __future__ import annotations
 
-from gfm_hil.codec import pack, unpack
+from gfm_hil.codec import INVALID, judge, pack, unpack
 from gfm_hil.loops.clock import AHEAD_NS, between_looks, give_way, now_ns, sleep_until, wait_until
 from gfm_hil.loops.records import (
     BELL,
@@ -66,7 +66,7 @@ def plant_ticks(
             r.bell = told[RING]
             why = BELL
             break
-        k = r.tick
+        k = reader[0].newest = r.tick
         due = r.t0 + k * r.T
         gap = 0
         if r.realtime:
@@ -129,10 +129,12 @@ def plant_ticks(
         if came != FRESH:
             if not r.realtime:
                 why = SILENT if came == OVERDUE else STOPPED_HERE
+                judge(reader, came == OVERDUE, True)
                 break
             r.misses += 1
             progress[1] = r.misses
         r.late = 0 if came == FRESH else r.late + 1
+        judge(reader, r.late > r.hold, tripped != 0)
         times[k, 4] = gap
         r.tick = k + 1
         if tripped != 0 and reader[0].state == READY and came == FRESH:
@@ -141,15 +143,16 @@ def plant_ticks(
         plant_take(par, st, u)
         if not ahead:
             plant_go_on(par, st)
-        if r.waits and r.late > r.hold:
+        if r.waits and reader[0].e2e == INVALID:
             trip(st[0], CONTROLLER, NOT_HEARD)
         if st[0].trip != tripped:
             why = LOOK
             break
         if r.late * r.T >= r.patience:
+            judge(reader, True, True)
             why = SILENT
             break
-        if r.late > r.hold and not r.waits:
+        if reader[0].e2e == INVALID and not r.waits:
             why = LATE
             break
     if unseen >= 0:
@@ -173,7 +176,7 @@ def _answer(
         if size > 0:
             tick = unpack(reader, _U_ID, got, got_bytes, size, u)
             # a controller that leaves says so under the last tick it saw
-            leaves = reader[0].state == STOPPED or (reader[0].state == SAFE and not r.waits)
+            leaves = reader[0].state >= reader[0].leaving
             if tick == k or leaves:
                 if hurried:
                     return FRESH if tick == k else LEAVING, gap

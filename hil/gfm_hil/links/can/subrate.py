@@ -25,7 +25,7 @@ from gfm_hil.links.can.bench_frame import (
     size_and_head,
     undamaged,
 )
-from gfm_runtime.controller import RUNNING
+from gfm_runtime.controller import RUNNING, STOPPED
 from gfm_runtime.signals import Group
 
 NOTHING = -1
@@ -49,6 +49,7 @@ subrate_dtype = np.dtype(
         ("next", "u1", (_ROOM,)),
         # the plant
         ("due", "i8"),  # tick for which it wants a command
+        ("asked", "i8"),  # the newest tick that it was at
         ("again", "i8"),  # commands that were sent again
         ("given", "i8"),  # sequence given out last
         ("ticks", "i8", (_KEPT + 1,)),  # that the commands at hand answer; NOTHING: none
@@ -66,7 +67,7 @@ def set_subrate(subrate: np.ndarray, side: Side, every: int) -> None:
     for k, group in enumerate(groups):
         s["size"][k], s["head"][k] = size_and_head(group)
     s["ordinary"] = (0, RUNNING) if plant else (RUNNING, 0)
-    s["due"] = s["given"] = s["ticks"] = NOTHING
+    s["due"] = s["asked"] = s["given"] = s["ticks"] = NOTHING
 
 
 @njit(cache=True, nogil=True)
@@ -82,8 +83,9 @@ def goes(subrate, message):
     s = subrate[0]
     if not _good(s, 0, message, len(message)):
         return True
-    s.due = number(message, TICK, 8)
-    return s.due % s.every == 0 or message[STATE] != s.ordinary[0]
+    tick = s.asked = number(message, TICK, 8)
+    s.due = NOTHING if message[STATE] == STOPPED else tick  # a plant that leaves wants no command
+    return tick % s.every == 0 or message[STATE] != s.ordinary[0]
 
 
 @njit(cache=True, nogil=True)
@@ -147,7 +149,7 @@ def _command(s, message, size):
             return _under(message, size, tick, s.given)
         if s.ticks[k] == NOTHING:
             free = k
-    if message[STATE] != s.ordinary[1]:
+    if message[STATE] != s.ordinary[1] or not s.asked - _KEPT * s.every <= tick <= s.asked:
         return _under(message, size, tick, s.given + 1)
     s.ticks[free], s.sequences[free] = tick, sequence - s.again
     s.commands[free * _ROOM : free * _ROOM + size] = message[:size]

@@ -271,7 +271,7 @@ def _put(r, part, data, message):
     message[STATE], message[REASON] = r.told[0], r.told[1]
     put_number(message, SPARE, SEQUENCE - SPARE, 0)
     put_number(message, SEQUENCE, 4, sequence & _LOW)
-    put_number(message, TICK, 8, max(sequence - r.lag, 0))
+    put_number(message, TICK, 8, sequence - r.lag)  # below 0: beyond 2**63, so the reader refuses
     copy(message.ctypes.data + FIRST, r.values.ctypes.data, r.size - FIRST - CRC_BYTES)
     seal(message, r.size)
     return r.size

@@ -1,0 +1,187 @@
+"""Frames with a good CRC and wrong content: the reader refuses and counts each, and uses none."""
+
+from __future__ import annotations
+
+import struct
+import time
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.errors import PeerLost
+from gfm_hil.frames import FrameError, FrameReader, FrameWriter
+from gfm_hil.handshake import shake_hands
+from gfm_hil.links.base import SIDES, Side
+from gfm_hil.scenario import Scenario
+from gfm_runtime.controller import REASONS, SAFE, STOPPED
+from gfm_runtime.signals import Group, names
+
+ONES = {"y": np.array([1.0, 0.5, 1.0, 0.0, 1.0]), "u": np.array([0.3, 1.0, 1.0])}
+HOLD = 500
+FAR = 39_995  # in a run of 40,000 ticks
+REALTIME = {
+    "mode": "realtime",
+    "duration": 4.0,
+    "link": {"type": "shm"},
+    "late_policy": {"hold": HOLD},
+}
+T_NS = 100_000
+
+by_side = pytest.mark.parametrize("side", SIDES)
+
+
+class Forger(FrameWriter):
+    """Packs frames with a good CRC of any tick below 2**64."""
+
+    def __init__(self, group: Group, sequence: int = 0) -> None:
+        super().__init__(group)
+        self.usual, self.sequence[0] = (ONES[group], sequence % 2**32)
+
+    def forge(self, tick: int, state: int, reason: int = 0, values: Any = None) -> bytes:
+        good = self.pack(0, state, reason, self.usual if values is None else values)
+        body = good[:12] + struct.pack("<Q", tick % 2**64) + good[20:-4]
+        return body + struct.pack("<I", zlib.crc32(body))
+
+
+def limited(side: Side, scenario: Scenario) -> FrameReader:
+    """The reader of a side in real time, the plant's at tick 100, after a good frame of tick 90."""
+    reader = FrameReader.of(side, scenario)
+    if side == "plant":
+        reader.record["newest"] = 100
+    reader.unpack(Forger(reader.group).forge(90, 0), np.zeros(len(names(reader.group))))
+    return reader
+
+
+def fault_of(reader: FrameReader, sequence: int, tick: int, state: int = 0, reason: int = 0) -> str:
+    """Why a reader refuses a frame with a good CRC, or "" if it takes it; refused, it is unused."""
+    message = Forger(reader.group, sequence).forge(tick, state, reason)
+    values = np.full(len(names(reader.group)), 7.0)
+    faults = ("faults", "fault")
+    before = {n: reader.record[n].tobytes() for n in reader.record.dtype.names if n not in faults}
+    try:
+        reader.unpack(message, values)
+    except FrameError as problem:
+        assert (values == 7.0).all()
+        assert before == {n: reader.record[n].tobytes() for n in before}
+        return problem.fault
+    return ""
+
+
+@pytest.mark.attack("1.1", "a good CRC, and a frozen, far, old or skipped tick", "used")
+@by_side
+@pytest.mark.parametrize("tick", [90, 89, FAR, 90 + 5_002, 2**63 + 91, 2**64 - 1])
+def test_a_tick_at_which_the_peer_cannot_be_is_refused(side, tick, make):
+    reader = limited(side, make(**REALTIME))
+    assert fault_of(reader, 1, tick) == "tick"
+    assert fault_of(reader, 1, 91) == ""  # as if the other had never come
+
+
+@pytest.mark.attack("1.2", "a u from the future, or older than late_policy.hold", "acts")
+def test_u_is_taken_from_k_minus_hold_to_k_and_no_other(make, attack_now):
+    scenario, taken = make(**{**REALTIME, "late_policy": {"hold": 50}}), []
+    for tick in range(91, 300):
+        reader = limited("plant", scenario)
+        reader.record["newest"] = 200
+        taken += [tick] if not fault_of(reader, 1, tick) else []
+    assert taken == list(range(150, 201))
+    attack_now(f"of u[91] to u[299], the plant at k = 200 takes k − {200 - taken[0]} to k")
+
+
+@pytest.mark.attack("1.3", "a state byte of 99 or a reason byte of 200", "running; IndexError")
+@by_side
+@pytest.mark.parametrize(("state", "reason"), [(5, 0), (99, 0), (255, 0), (SAFE, 7), (0, 200)])
+def test_a_state_or_reason_without_a_meaning_is_refused(side, state, reason, make):
+    reader = limited(side, make(**REALTIME))
+    assert fault_of(reader, 1, 91, state, reason) == "state"
+    assert fault_of(reader, 1, 91, SAFE, len(REASONS) - 1) == ""
+
+
+@pytest.mark.attack("1.4", "a frame replayed after the sequence has wrapped", "used")
+@by_side
+def test_a_replay_after_the_wrap_is_refused_for_its_tick(side, make):
+    reader = limited(side, make(**REALTIME))
+    reader.record["next"] = 5  # the sequence has wrapped; once, 7 belonged to tick 7
+    assert fault_of(reader, 7, 7) == "tick"
+    assert fault_of(reader, 5, 91) == ""
+
+
+@pytest.mark.attack("1.5", "a sequence that jumps by two thousand million", "used")
+@by_side
+def test_a_jump_of_the_sequence_is_bounded(side, make, attack_now):
+    reader = limited(side, make(**REALTIME))
+    jump = int(reader.record["jump"][0])
+    assert fault_of(reader, 2 + jump, 91) == "out_of_sequence"
+    assert fault_of(reader, 2**31, 91) == "out_of_sequence"
+    assert fault_of(reader, 1 + jump, 91) == ""
+    assert reader.faults["lost"] == jump
+    attack_now(f"refused beyond {jump} missing frames")
+
+
+@by_side
+def test_a_peer_that_leaves_is_heard_under_its_last_tick_and_the_next(side, make):
+    for tick, fault in ((90, ""), (101, ""), (89, "tick"), (2**62, "tick")):
+        reader = limited(side, make(**REALTIME))
+        reader.record["newest"] = 100
+        assert fault_of(reader, 1, tick, STOPPED) == fault
+        assert reader.left == (not fault)
+    late = limited(side, make(**REALTIME, after_trip="wait"))
+    assert fault_of(late, 1, 90, SAFE) == "tick"  # there a side that is safe goes on running
+
+
+def test_in_lockstep_a_tick_comes_again_as_often_as_the_plant_may_ask(make):
+    link = {"type": "inproc", "peer_timeout_s": 0.1, "repeat_s": 0.01}
+    reader = FrameReader.of("controller", make(link=link))
+    assert [fault_of(reader, n, 0) for n in range(13)] == [""] * 11 + ["tick"] * 2
+    assert fault_of(reader, 13, 1) == ""  # a newer tick may come again as often
+    assert [fault_of(reader, 14 + n, 1) for n in range(11)] == [""] * 10 + ["tick"]
+
+
+def test_the_states_of_the_protection(make):
+    reader = FrameReader.of("controller", make(**REALTIME))
+    assert reader.e2e == "initial"
+    assert (fault_of(reader, 0, FAR), reader.e2e) == ("tick", "initial")
+    assert (fault_of(reader, 0, 0), reader.e2e) == ("", "valid")
+    reader.judge(False, False)
+    assert reader.e2e == "valid"
+    reader.judge(True, False)
+    assert reader.e2e == "invalid"
+    assert (fault_of(reader, 1, 1), reader.e2e) == ("", "invalid")  # a frame alone re-arms nothing
+    reader.judge(False, True)
+    assert reader.e2e == "invalid"
+    reader.judge(False, False)  # the safe state was reset
+    assert reader.e2e == "initial"
+    assert (fault_of(reader, 2, 2), reader.e2e) == ("", "valid")
+
+
+class Played:
+    """A link that brings what it was given and keeps what is sent."""
+
+    port = None
+
+    def __init__(self, *messages: bytes) -> None:
+        self.messages, self.said = list(messages), list[bytes]()
+
+    def receive(self) -> bytes | None:
+        return self.messages.pop(0) if self.messages else None
+
+    def send(self, message: bytes) -> bool:
+        self.said.append(message)
+        return True
+
+    def wait(self, seconds: float) -> bool:
+        return bool(self.messages)
+
+
+@pytest.mark.attack("1.16", "START is lost, and the first y has a far tick", "tick 0 is years ago")
+def test_a_far_first_tick_does_not_set_the_clock(make, attack_now):
+    scenario, plant, forger = make(**REALTIME), Played(), Forger("y")
+    with pytest.raises(PeerLost, match="interrupted"):
+        shake_hands("plant", plant, scenario, lambda: bool(plant.said), print)
+    far, good = (forger.forge(tick, 0) for tick in (2**62, 7))
+    link = Played(plant.said[0], far, good)
+    begin = time.monotonic_ns()
+    start = shake_hands("controller", link, scenario, lambda: False, print)
+    assert begin <= start.t0_ns + 7 * T_NS <= time.monotonic_ns()
+    attack_now("the next good y says when tick 0 was")
