@@ -123,7 +123,7 @@ def test_a_long_message_costs_a_link_nothing(portable, child, endpoint, attack_n
         peer.connect(endpoint)
         peer.send(b"good")
         assert line(process) == "good"  # the place is free again
-    attack_now(f"libzmq parts with the peer; peak memory grew by {grown / 1000:.1f} MB")
+    attack_now(f"libzmq parts with the peer; peak memory grew by {grown / 1000:.0f} MB")
 
 
 def test_the_longest_message_gets_through_encrypted(tmp_path):
@@ -175,7 +175,7 @@ def test_a_long_subscription_costs_the_stream_nothing(which, child, attack_now):
         subscriber.connect(where)
         assert subscriber.poll(PATIENCE_S * 1000)
         assert subscriber.recv() == b"x"
-    attack_now(f"the subscriber is turned away; peak memory grew by {grown / 1000:.1f} MB")
+    attack_now(f"the subscriber is turned away; peak memory grew by {grown / 1000:.0f} MB")
 
 
 READER = """
@@ -204,7 +204,7 @@ def test_a_long_block_costs_a_reader_nothing(reader, attack_now):
     assert flood(zmq.PUB, where, b"gfmhil/plant" + bytes(BIG), times=1, bind=True) == 1
     grown = peak_kb(process) - before
     assert grown < LOOSE_KB
-    attack_now(f"the reader parts with the stream; peak memory grew by {grown / 1000:.1f} MB")
+    attack_now(f"the reader parts with the stream; peak memory grew by {grown / 1000:.0f} MB")
 
 
 @pytest.mark.attack("6.4", "a stream sends blocks to a reader that does not read", "all were kept")
@@ -281,4 +281,4 @@ def test_a_long_answer_costs_an_operator_nothing(child, tmp_path, attack_now):
     grown = peak_kb(process) - before
     assert said == f"{tmp_path}: the controller does not answer"
     assert grown < LOOSE_KB
-    attack_now(f"refused as no answer; peak memory grew by {grown / 1000:.1f} MB")
+    attack_now(f"refused as no answer; peak memory grew by {grown / 1000:.0f} MB")

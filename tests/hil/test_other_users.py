@@ -219,7 +219,7 @@ def test_memory_of_another_user_is_refused(side, shared, other, monkeypatch, att
     with pytest.raises(UserError, match=rf"belongs to another user \(uid {OTHER}\)") as found:
         ShmLink(side, "shm://x")
     assert path.stat().st_uid == OTHER
-    attack_now(str(found.value).partition(": ")[2])
+    attack_now(f"either side refuses it: {str(found.value).rpartition(': ')[2]}")
 
 
 @as_root

@@ -164,6 +164,8 @@ def test_it_stays_where_its_folder_has_no_room(record, memory, tmp_path, monkeyp
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("shutil.copytree", full)
+    monkeypatch.setattr("shutil.copyfileobj", full)
     another_run(tmp_path)
+    assert (folder / "parts").is_symlink()
+    assert {path.name for path in folder.iterdir()} == {"parts"}  # no half of a copy
     assert recording.Part.open(folder, "plant") is not None
