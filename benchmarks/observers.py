@@ -32,9 +32,9 @@ from gfm_hil.benchmark.attribution import CAUSES, attribute
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import pair
-from gfm_hil.environment import environment, may_sched_fifo
-from gfm_hil.links.base import SIDES
-from gfm_hil.recording import CONTROLLER_TIMES, PLANT_TIMES, Part
+from gfm_hil.core.roles import SIDES
+from gfm_hil.realtime.environment import environment, may_sched_fifo
+from gfm_hil.recording.recorder import CONTROLLER_TIMES, PLANT_TIMES, Part
 
 T_S = 1e-4  # s
 _SETTLE_S = 0.5  # between two turns, not counted: clients come and go

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.benchmark.inproc_loop import Loop
-from gfm_hil.benchmark.turns import Spread, ratio, seconds, take_turns
-from gfm_hil.environment import environment
+from gfm_hil.benchmark.rounds import Spread, ratio, seconds, take_turns
+from gfm_hil.realtime.environment import environment
 
 try:
     from motulator.grid import control, model

@@ -20,12 +20,12 @@ import zmq
 from gfm_hil.benchmark.contenders import FRAME, Contender, free_port, memory_folder
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.pingpong import LinkEnd
-from gfm_hil.benchmark.turns import Spread, ratio
-from gfm_hil.environment import environment
-from gfm_hil.links.base import Side
+from gfm_hil.benchmark.rounds import Spread, ratio
+from gfm_hil.core.roles import Side
 from gfm_hil.links.zeromq.curve import Curve, write_keys
 from gfm_hil.links.zeromq.native import native_port
-from gfm_hil.realtime import PRIORITY
+from gfm_hil.realtime.environment import environment
+from gfm_hil.realtime.priority import PRIORITY
 
 # messages and bytes, as in the link
 ROOM = {zmq.SNDHWM: 64, zmq.RCVHWM: 64, zmq.SNDBUF: 16384, zmq.RCVBUF: 16384}

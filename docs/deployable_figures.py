@@ -15,10 +15,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_design.box import Box, Point
-from gfm_design.gains import free_gains
-from gfm_design.robust import Loops
-from gfm_hil.box_bench import step_run
+from gfm_design.model.box import Box, Point
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.robust import Loops
+from gfm_hil.studies.box import step_run
 from gfm_runtime import law_file
 
 FIGURES = Path(__file__).resolve().parent / "_static" / "figures"

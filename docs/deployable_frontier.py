@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_design.box import Box
-from gfm_design.deployable import deploy
-from gfm_design.gains import free_gains
-from gfm_design.robust import Wanted
+from gfm_design.model.box import Box
+from gfm_design.tuning.deployable import deploy
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.robust import Wanted
 from gfm_runtime import law_file
 
 TABLE = Path(__file__).resolve().parent / "deployable_frontier.csv"

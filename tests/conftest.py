@@ -6,7 +6,7 @@ from hypothesis import settings
 
 pytest_plugins = ["tests.attacks"]
 
-# One thread in BLAS: small matrices, and both processors are busy (see gfm_hil.blas).
+# One thread in BLAS: small matrices, and both processors are busy (see gfm_hil.core.blas).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Figures are drawn without a display.

@@ -17,9 +17,9 @@ import pytest
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE
 from gfm_hil.cli.main import parser
 from gfm_hil.links.can.options import CanOptions
-from gfm_hil.realtime import PRIORITY
-from gfm_hil.scenario_model import Link
-from gfm_hil.toml_out import toml_text
+from gfm_hil.realtime.priority import PRIORITY
+from gfm_hil.scenario.model import Link
+from gfm_hil.scenario.toml_out import toml_text
 
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 ROOT = DEPLOY.parent

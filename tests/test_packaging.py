@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "gfm_hil": ("gfm_runtime", "gfm_plant", "gfm_design"),
     "gfm_pytest": ("gfm_hil",),
 }
-RUNTIME_NEEDS = {"numpy", "numba"}
+RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 BESIDE_THE_LOOP = {"lawfile.py": {"pydantic", "pydantic_core"}}
 SOURCES = [

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfm_design.gains import FreeGain, tied
-from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.performance import PAPER_WEIGHTS, Channel
+from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
+from gfm_design.tuning.gains import FreeGain, tied
+from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_runtime import law_file
 
 #: column: law, gains that differ from its file

@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from gfm_design.linear import Mode, loop_modes
-from gfm_design.operating_point import operating_point
+from gfm_design.model.linear import Mode, loop_modes
+from gfm_design.model.operating_point import operating_point
 from gfm_hil.cli.laws import cell_text
 from gfm_plant import Plant, make_plant
 from gfm_runtime import discretise, law_file, law_names, load_law

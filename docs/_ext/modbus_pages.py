@@ -6,10 +6,10 @@ from gfm_hil.modbus.device import Device
 from gfm_hil.modbus.gains import Gains
 from gfm_hil.modbus.image import Point, definition
 from gfm_hil.modbus.view import Slack, View
-from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS
-from gfm_hil.scenario import load_scenario
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.scenario.model import load_scenario
 from gfm_runtime import law_names
-from gfm_runtime.controller import RUNNING
+from gfm_runtime.states import RUNNING
 
 _LAWS = ["mimo-gfm", "vsg-2"]
 _START = {"y_v_dc": 1.0, "y_V": 1.0, "y_omega_u": 1.0, "y_p": 0.5, "y_q": 0.1, "ref_V_ref": 1.0}

@@ -10,8 +10,8 @@ from pathlib import Path
 from unittest import mock
 
 from gfm_hil.cli import main
-from gfm_hil.errors import UserError
-from gfm_hil.scenario import load_scenario
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.model import load_scenario
 from gfm_runtime import LawError, build_law, discretise, parse_law
 
 DOCS = Path(__file__).resolve().parents[1]

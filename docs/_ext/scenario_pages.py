@@ -9,9 +9,10 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from gfm_hil import events, scenario
-from gfm_hil.expectation import END_REASONS
 from gfm_hil.links.impaired import Impairment
+from gfm_hil.scenario import events
+from gfm_hil.scenario import model as scenario
+from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
 from gfm_runtime import lawfile
 from gfm_runtime.signals import group

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gfm_hil.export import FORMATS
-from gfm_hil.export.columns import all_columns, describe
+from gfm_hil.results.export import FORMATS
+from gfm_hil.results.export.columns import all_columns, describe
 from gfm_hil.telemetry.metrics import METRICS
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 
-from gfm_hil.codec import MAGIC
-from gfm_hil.frames import DATA_IDS, frame_dtype
+from gfm_hil.links.frame import DATA_IDS, MAGIC, frame_dtype
 from gfm_hil.scope.view import HEAD
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.steps import Steps

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from gfm_design.linear import Mode, ideal_modes, loop_modes
-from gfm_design.operating_point import operating_point
-from gfm_hil.runner import Run, run_scenario
-from gfm_hil.scenario import Scenario, check_scenario, find_scenario
+from gfm_design.model.linear import Mode, ideal_modes, loop_modes
+from gfm_design.model.operating_point import operating_point
+from gfm_hil.results.runner import Run, run_scenario
+from gfm_hil.scenario.model import Scenario, check_scenario, find_scenario
 from gfm_plant import Plant, make_plant
 from gfm_runtime import discretise, get_law
 

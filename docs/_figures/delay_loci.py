@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_design.case import Case
-from gfm_design.sampled import SampledLoop
-from gfm_hil.figures import COLOURS
+from gfm_design.model.case import Case
+from gfm_design.model.sampled import SampledLoop
+from gfm_hil.results.figures import COLOURS
 from gfm_plant import Plant
 from gfm_runtime import discretise, get_law
 

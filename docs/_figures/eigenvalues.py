@@ -10,7 +10,7 @@ from _figures.common import FIGURES, GREY, LAWS, RIG, modes, number, signed, wit
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_hil.figures import COLOURS
+from gfm_hil.results.figures import COLOURS
 
 
 def ideal_table() -> None:

@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from gfm_design.full_order import full_order
-from gfm_design.gains import free_gains
-from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.paper_tune import tune_paper
-from gfm_design.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
-from gfm_design.synthesis import Tuned
-from gfm_hil.figures import COLOURS
+from gfm_design.norms.full_order import full_order
+from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.synthesis import Tuned
+from gfm_hil.results.figures import COLOURS
 from gfm_runtime import law_file
 
 LAW = "mimo-gfm"

@@ -22,9 +22,9 @@ from _figures.steps import window
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_design.operating_point import operating_point
-from gfm_hil.figures import COLOURS
-from gfm_hil.runner import Run
+from gfm_design.model.operating_point import operating_point
+from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.runner import Run
 from gfm_plant import Plant, make_plant
 from gfm_runtime import discretise, get_law
 

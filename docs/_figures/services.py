@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from gfm_hil.figures import COLOURS
+from gfm_hil.results.figures import COLOURS
 
 _INK, _LOOP, _WATCH = "#222222", COLOURS[0], COLOURS[2]
 #: service, its row, and who comes to it

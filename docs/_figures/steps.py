@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from _figures.common import DOCS, FIGURES, LAWS, number, run, scenario, write_table
 
-from gfm_hil.figures import draw_comparison, draw_run
-from gfm_hil.runner import Run
+from gfm_hil.results.figures import draw_comparison, draw_run
+from gfm_hil.results.runner import Run
 
 COLUMNS = (
     ("p_peak", "p peak [p.u.]", 3),

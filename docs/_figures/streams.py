@@ -10,9 +10,9 @@ from asammdf import MDF
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_hil.export import export_run
-from gfm_hil.figures import COLOURS
-from gfm_hil.runner import run_scenario
+from gfm_hil.results.export import export_run
+from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.runner import run_scenario
 
 _SHOWN = ("y_p", "y_omega_u", "u_i_u")
 

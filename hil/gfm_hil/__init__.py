@@ -1,8 +1,7 @@
-"""The bench: frames, links, the two processes, scenarios, recording, reports and the CLI."""
+"""The bench: links, scenarios, the two processes, recording, results, studies, command line."""
 
-import gfm_hil.blas  # noqa: F401  before NumPy
-from gfm_hil.errors import PeerLost, UserError
-from gfm_hil.runner import Run, run_scenario
-from gfm_hil.scenario import Scenario, load_scenario
+import lazy_loader
 
-__all__ = ["PeerLost", "Run", "Scenario", "UserError", "load_scenario", "run_scenario"]
+from gfm_hil.core import blas as _blas  # noqa: F401  before NumPy is first imported
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from gfm_plant.model import V_DC
+from gfm_plant.names import TRIPS
 from gfm_plant.options import COMMANDS, MEASURED, Plant
 from gfm_plant.parameters import load_converter
-from gfm_plant.protection import TRIPS
 from gfm_plant.records import PlantRecord, plant_par_dtype, plant_state_dtype
 
 MAX_RATE = 1.0

@@ -16,12 +16,13 @@ from gfm_plant.compiled import compiled
 from gfm_plant.grid import advance_grid
 from gfm_plant.integrator import Held, Vector, integrate
 from gfm_plant.model import DELTA, V_DC, rates, terminal
-from gfm_plant.protection import BAD_COMMAND, DIVERGED, protect, trip
+from gfm_plant.names import (
+    BAD_COMMAND,
+    DIVERGED,
+)
+from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.records import MAX_DELAY, PlantRecord
-
-TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip")
-"""What `plant_truth` writes, in this order; i = |i_dq|, delta in rad, trip a reason code."""
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 

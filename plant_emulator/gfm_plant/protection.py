@@ -6,37 +6,17 @@ import math
 from typing import Any
 
 from gfm_plant.compiled import compiled
-from gfm_plant.records import PlantRecord
-
-TRIPS = (
-    # option, quantity, sign (+1: trips above the threshold, -1: below)
-    ("over_current", "|i_dq|", +1),
-    ("over_voltage", "V", +1),
-    ("under_voltage", "V", -1),
-    ("dc_over_voltage", "v_dc", +1),
-    ("dc_under_voltage", "v_dc", -1),
-    ("over_frequency", "omega_u", +1),
-    ("under_frequency", "omega_u", -1),
+from gfm_plant.names import (
+    BAD_COMMAND,
+    CONTROLLER,
+    CONTROLLER_SAFE,
+    DIVERGED,
+    NO_FRESH_U,
+    SILENT,
+    TRIP_REASONS,
+    TRIPS,
 )
-"""The protections with a threshold; their place is their index in the records."""
-
-DIVERGED = len(TRIPS) + 1
-BAD_COMMAND = len(TRIPS) + 2
-CONTROLLER = len(TRIPS) + 3
-
-TRIP_REASONS: dict[int, str] = {
-    0: "none",
-    **{k + 1: name.replace("_", "-") for k, (name, *_) in enumerate(TRIPS)},
-    DIVERGED: "diverged",
-    BAD_COMMAND: "command not finite",
-    CONTROLLER: "blocked for the controller",
-}
-"""What the trip code in a plant's state means."""
-
-#: the value of a trip with the code CONTROLLER, and the words for it
-SAFE_STATE, SILENT = 0.0, 1.0
-CONTROLLER_SAFE = "the controller is in its safe state"
-NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
+from gfm_plant.records import PlantRecord
 
 
 @compiled

@@ -11,21 +11,18 @@ from numpy.typing import DTypeLike, NDArray
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import (
     MAX_STAGES,
-    OK,
-    READY,
-    RUNNING,
-    STATES,
     control,
     heed,
     make_controller,
     missed,
     set_reference,
 )
-from gfm_runtime.discretise import DiscreteLaw, discretise
 from gfm_runtime.errors import LawError
 from gfm_runtime.impedance import make_impedance
 from gfm_runtime.kernel import pack_law, state_dtype
 from gfm_runtime.signals import NU, NY, REF_NAMES
+from gfm_runtime.states import OK, READY, RUNNING, STATES
+from gfm_runtime.tustin import DiscreteLaw, discretise
 
 SPARE = 2  # places for laws with other gains: one may be in force while the other is filled
 X_MAX = 10.0  # p.u.; stands for "no upper end" of a schedule's last stage

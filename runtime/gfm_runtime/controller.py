@@ -20,21 +20,16 @@ from gfm_runtime.compiled import compiled
 from gfm_runtime.impedance import estimate
 from gfm_runtime.kernel import step
 from gfm_runtime.signals import NU, NY, group
-from gfm_runtime.switchover import change_law
-
-INIT, READY, RUNNING, SAFE, STOPPED = range(5)
-STATES = ("INIT", "READY", "RUNNING", "SAFE", "STOPPED")
-
-OK, BAD_Y, BAD_U, STALE, LOST_PEER, PLANT_TRIP, OPERATOR = range(7)
-REASONS = (
-    "",
-    "a measurement is not finite or out of range",
-    "an output is not finite",
-    "no fresh measurement for longer than late_policy allows",
-    "the plant's process is gone",
-    "the plant's protection tripped",
-    "stopped by the operator",
+from gfm_runtime.states import (
+    BAD_U,
+    BAD_Y,
+    PLANT_TRIP,
+    READY,
+    RUNNING,
+    SAFE,
+    STALE,
 )
+from gfm_runtime.switchover import change_law
 
 MAX_STAGES = 8
 

@@ -5,7 +5,7 @@ O ``k/(T^2 s^2+2T xi s+1)`` (note below Table II), and their sums and products.
 
 An element is kept as a numerator polynomial over a *product of named factors*, not over an
 expanded polynomial: ``s``, ``T s+1`` and ``T^2 s^2+2T xi s+1``. Equal factors are then recognised
-exactly, which is what makes shared denominators share states (``gfm_runtime.realise``) and
+exactly, which is what makes shared denominators share states (``gfm_runtime.realisation``) and
 cancelling ones disappear. Polynomials are coefficient tuples in ascending powers of s.
 """
 

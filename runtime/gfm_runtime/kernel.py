@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from gfm_runtime.compiled import inlined
-from gfm_runtime.discretise import DiscreteLaw
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY
+from gfm_runtime.tustin import DiscreteLaw
 
 N_MAX = 12  # states; the largest law of Table II has five
 NEGLIGIBLE = 2.0**-100  # p.u.; what decays is 0 below it; exact in float32 too

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gfm_design.encoding import Encoding
-from gfm_design.gains import FreeGain, free_gains, tied
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.synthesis import UNSTABLE
+from gfm_design.tuning.gains import Encoding, FreeGain, free_gains, tied
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import LawError, law_file, law_names
 from gfm_runtime.lawfile import parse_law
 

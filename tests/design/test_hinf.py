@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from gfm_design.hinf import Unstable, hinf_norm
+from gfm_design.norms.hinf import Unstable, hinf_norm
 
 Matrix = np.ndarray
 

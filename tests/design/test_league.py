@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gfm_design.gains import free_gains
-from gfm_design.league import T_S, as_it_is, gamma, late_case, search, stands
-from gfm_design.league_late import ALPHA, LateProblem
-from gfm_design.league_modes import Culprit, culprit, late_culprit
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.synthesis import UNSTABLE
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.law_comparison import T_S, as_it_is, gamma, late_case, search, stands
+from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
+from gfm_design.tuning.law_comparison_modes import Culprit, culprit, late_culprit
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
 
 SHORT = {"seed": 0, "evaluations": 64, "starts": 1}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gfm_design.linear import (
+from gfm_design.model.linear import (
     Mode,
     hold,
     ideal_modes,
@@ -18,11 +18,11 @@ from gfm_design.linear import (
     loop_modes,
     sampled_loop,
 )
-from gfm_design.operating_point import operating_point
-from gfm_hil.bench import Bench, make_bench
-from gfm_hil.inproc import run_ticks
-from gfm_hil.recording import PLANT_COLUMNS, Part
-from gfm_hil.scenario import check_scenario
+from gfm_design.model.operating_point import operating_point
+from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.recording.recorder import PLANT_COLUMNS, Part
+from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant, make_plant
 from gfm_plant.model import DELTA, N_X, f, g
 from gfm_runtime import discretise, get_law, law_names

@@ -10,24 +10,29 @@ import control
 import numpy as np
 import pytest
 
-from gfm_design.case import Case
-from gfm_design.classical import gain_phase
-from gfm_design.delays import delay_at_u, delay_at_y, longest, overall_delay
-from gfm_design.disk import disk_margin, mu_bound
-from gfm_design.limits import first_loss
-from gfm_design.linear import LinearLaw, LinearPlant, sampled_loop
-from gfm_design.locus import locus_at_u, locus_at_y
-from gfm_design.margins import loop_margins
-from gfm_design.operating_point import operating_point
-from gfm_design.region import stable_region
-from gfm_design.sampled import SampledLoop, outermost
-from gfm_design.tolerance import CEILING, FLOOR, element_ranges, grid_strength, radius
-from gfm_hil.bench import make_bench
+from gfm_design.margins.all_margins import loop_margins
+from gfm_design.margins.classical import gain_phase
+from gfm_design.margins.delays import delay_at_u, delay_at_y, first_loss, longest, overall_delay
+from gfm_design.margins.disk import disk_margin, mu_bound
+from gfm_design.margins.locus import locus_at_u, locus_at_y
+from gfm_design.margins.tolerance import (
+    CEILING,
+    FLOOR,
+    element_ranges,
+    grid_strength,
+    radius,
+    stable_region,
+)
+from gfm_design.model.case import Case
+from gfm_design.model.linear import LinearLaw, LinearPlant, sampled_loop
+from gfm_design.model.operating_point import operating_point
+from gfm_design.model.sampled import SampledLoop, outermost
 from gfm_hil.cli import main
-from gfm_hil.inproc import run_ticks
-from gfm_hil.loop_delay import read_loop_delay
-from gfm_hil.recording import PLANT_COLUMNS, Part
-from gfm_hil.scenario import check_scenario, load_scenario
+from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.recording.recorder import PLANT_COLUMNS, Part
+from gfm_hil.results.loop_delay import read_loop_delay
+from gfm_hil.scenario.model import check_scenario, load_scenario
 from gfm_plant import make_plant
 from gfm_plant.model import DELTA
 from gfm_runtime import discretise, load_law

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gfm_design.box import T_S, Box, Point
-from gfm_design.deployable import Round, deploy, steps
-from gfm_design.gains import FreeGain, free_gains
-from gfm_design.linear import linearise_law, linearise_plant, sampled_loop
-from gfm_design.operating_point import operating_point
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.robust import Loops, RobustProblem, Wanted, paper_problem
-from gfm_design.synthesis import UNSTABLE
-from gfm_hil.box_bench import step_run
+from gfm_design.model.box import T_S, Box, Point
+from gfm_design.model.linear import linearise_law, linearise_plant, sampled_loop
+from gfm_design.model.operating_point import operating_point
+from gfm_design.tuning.deployable import Round, deploy, steps
+from gfm_design.tuning.gains import FreeGain, free_gains
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.robust import Loops, RobustProblem, Wanted, paper_problem
+from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_hil.cli.design.box import delay_margin
+from gfm_hil.studies.box import step_run
 from gfm_plant import make_plant
 from gfm_runtime import discretise, get_law, law_file
 
@@ -48,7 +48,7 @@ def sigma(points: list[Point], law: str = LAW) -> np.ndarray:
     ],
 )
 def test_stack_is_the_sampled_loop(point: Point) -> None:
-    """Another program: the law discretised by the runtime, the loop by gfm_design.linear."""
+    """Another program: the law discretised by the runtime, the loop by gfm_design.model.linear."""
     par, _ = make_plant(point.plant(), T_S)
     # the printed k_35 is k_34/D_q to four digits; a search ties it exactly
     law = discretise(get_law("mimo-gfm", k_35=1.0844 / 0.05), T_S)

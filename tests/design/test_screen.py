@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gfm_design.encoding import Encoding
-from gfm_design.gains import free_gains
-from gfm_design.league_modes import culprit
-from gfm_design.paper_problem import PaperProblem
-from gfm_design.peaks import model, peaks
-from gfm_design.performance import StateSpace
-from gfm_design.polish import polish
-from gfm_design.synthesis import UNSTABLE
+from gfm_design.norms.peaks import model, peaks
+from gfm_design.norms.performance import StateSpace
+from gfm_design.tuning.gains import Encoding, free_gains
+from gfm_design.tuning.law_comparison_modes import culprit
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.polish import polish
+from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
 
 FILE = law_file("mimo-gfm")

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from gfm_design.encoding import Encoding
-from gfm_design.gains import FreeGain, free_gains
-from gfm_design.league_modes import culprit
-from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.paper_tune import tune_paper
-from gfm_design.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
+from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
+from gfm_design.tuning.law_comparison_modes import culprit
+from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
 from gfm_runtime import law_file
 
 pytest.importorskip("cma")

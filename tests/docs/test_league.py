@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_design.gains import free_gains
-from gfm_design.league import as_it_is, gamma
-from gfm_design.league_late import ALPHA, LateProblem
-from gfm_design.league_modes import Culprit
-from gfm_design.paper_problem import PaperProblem
-from gfm_hil.league import LEFT_OUT, as_shipped
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.law_comparison import as_it_is, gamma
+from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
+from gfm_design.tuning.law_comparison_modes import Culprit
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_hil.studies.law_comparison.row import LEFT_OUT, as_shipped
 from gfm_runtime import law_file, law_names, tuned_names
 
 TABLES = Path(__file__).resolve().parents[2] / "docs" / "tables"

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_design.linear import loop_modes
-from gfm_design.operating_point import operating_point
-from gfm_design.performance import PAPER_WEIGHTS
-from gfm_design.weights_file import read_weights
-from gfm_hil.runner import Run, run_scenario
-from gfm_hil.scenario import load_scenario
+from gfm_design.model.linear import loop_modes
+from gfm_design.model.operating_point import operating_point
+from gfm_design.norms.performance import PAPER_WEIGHTS
+from gfm_design.norms.weights import read_weights
+from gfm_hil.results.runner import Run, run_scenario
+from gfm_hil.scenario.model import load_scenario
 from gfm_plant import Plant, make_plant
 from gfm_runtime import discretise, get_law, load_law
 

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from gfm_hil import scratch
-from gfm_hil.campaign import loading
 from gfm_hil.cli import main
-from gfm_hil.errors import UserError
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
-from gfm_hil.recording import Part
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario
+from gfm_hil.recording.recorder import Part
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
+from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
+from gfm_hil.studies.campaign import loading
 from gfm_hil.telemetry.follow import Follower
-from gfm_hil.toml_out import scenario_toml
 from gfm_runtime import LawError, discretise, load_law
 
 from .conftest import Parser, Take

@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from gfm_hil.errors import PeerLost
-from gfm_hil.frames import FrameError, FrameReader, FrameWriter
-from gfm_hil.handshake import _what_runs, shake_hands
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.roles import SIDES
+from gfm_hil.engine.handshake import _what_runs, shake_hands
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
 from gfm_hil.links.can.layout import plan_of
 from gfm_hil.links.can.node import Node, bring, receive
@@ -23,7 +22,8 @@ from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import LONGEST, SegmentSender
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import frame_dtype
-from gfm_hil.scenario import check_scenario
+from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
+from gfm_hil.scenario.model import check_scenario
 from gfm_runtime.signals import NU, NY
 
 from .conftest import Parser, Take

@@ -20,18 +20,18 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from gfm_hil.bench import make_bench
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.roles import SIDES
+from gfm_hil.engine.announcement import announcement
+from gfm_hil.engine.command_server import Desk
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
 from gfm_hil.modbus.connection import Server
 from gfm_hil.modbus.image import BASE, VENDOR
-from gfm_hil.operator import Desk
-from gfm_hil.operator.announced import announcement
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import check_scenario
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import check_scenario
 from gfm_hil.scope import server as scope_server
 from gfm_hil.scope.access import Access
 from gfm_hil.scope.record import open_record
-from gfm_hil.timeline import Timeline
 
 from ..hil.test_modbus_device import Bench as MadeUp
 from .conftest import Parser, Take

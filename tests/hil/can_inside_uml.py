@@ -19,11 +19,11 @@ import can
 import numpy as np
 import pytest
 
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.roles import SIDES
 from gfm_hil.links.can.dbc import write_dbc
-from gfm_hil.recording import Part
-from gfm_hil.scenario import load_scenario
-from gfm_hil.toml_out import toml_text
+from gfm_hil.recording.recorder import Part
+from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario.toml_out import toml_text
 
 from .can_reference import quantised_run
 

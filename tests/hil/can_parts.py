@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gfm_hil.links.base import Side
+from gfm_hil.core.roles import Side
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.segments import LONGEST, join, joiner_dtype, set_joiner
 from gfm_hil.links.can.subrate import admit, goes, in_force, made, set_subrate, subrate_dtype

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from gfm_hil.run_folder import Run
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import Scenario, check_scenario
+from gfm_hil.results.run_folder import Run
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import Scenario, check_scenario
 from gfm_runtime import get_law
 
 from .uml import Kernel

@@ -9,20 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.bench import make_bench
-from gfm_hil.controller_side import run_controller
-from gfm_hil.handshake import shake_hands
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.controller_side import run_controller
+from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.loop_records import TOLD
+from gfm_hil.engine.loop_thread import run_compiled
+from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
-from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.impaired import ImpairedLink
-from gfm_hil.loops.records import TOLD
-from gfm_hil.loops.thread import run_compiled
-from gfm_hil.npz import Arrays
-from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part, merge, read_recording
-from gfm_hil.scenario import Scenario
-from gfm_hil.side import compile_side
-from gfm_hil.timeline import Timeline, read_log
+from gfm_hil.recording.log import read_log
+from gfm_hil.recording.npz import Arrays
+from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.scenario.model import Scenario
 
 from .test_links import in_threads
 

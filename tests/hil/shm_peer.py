@@ -14,7 +14,7 @@ from numba import njit
 
 from gfm_hil.links import open_link
 from gfm_hil.links.shm.ring import LONGEST
-from gfm_hil.loops.clock import give_way
+from gfm_hil.realtime.clock import give_way
 
 
 @njit

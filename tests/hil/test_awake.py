@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from gfm_hil import awake
-from gfm_hil.awake import kept_awake
+from gfm_hil.realtime import prevent_idle as awake
+from gfm_hil.realtime.prevent_idle import kept_awake
 
 HERE = sorted(os.sched_getaffinity(0))[0]
 _IDLE = 5  # SCHED_IDLE

@@ -14,10 +14,10 @@ import pytest
 
 from gfm_hil.benchmark.page import write_page
 from gfm_hil.benchmark.plots import figures
+from gfm_hil.benchmark.rounds import Spread
 from gfm_hil.benchmark.spread import summary
 from gfm_hil.benchmark.tables import tables
-from gfm_hil.benchmark.turns import Spread
-from gfm_hil.environment import caveats, environment
+from gfm_hil.realtime.environment import caveats, environment
 
 
 def times(median_us: float, seed: int) -> dict[str, Any]:

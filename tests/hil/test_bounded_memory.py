@@ -263,7 +263,7 @@ sys.stdin.readline()
 
 @pytest.mark.attack("6.5", "a side answers an operator with 50 MB", "it was read whole")
 def test_a_long_answer_costs_an_operator_nothing(child, tmp_path, attack_now):
-    from gfm_hil import scratch
+    from gfm_hil.core import temporary as scratch
 
     with scratch.temporary("gfmhil-desk-") as place:
         announced = {"endpoint": f"ipc://{place}/controller"}

@@ -17,17 +17,17 @@ from typing import Any
 
 import pytest
 
-from gfm_hil.campaign import worker
-from gfm_hil.campaign.axes import find_axes
-from gfm_hil.campaign.execute import WorkerLost, execute, processes
-from gfm_hil.campaign.figure import draw_map
-from gfm_hil.campaign.loading import load_campaign
-from gfm_hil.campaign.result import summary
-from gfm_hil.campaign.spec import Campaign
-from gfm_hil.campaign.store import Store
-from gfm_hil.campaign.worker import Record, run_chunk
 from gfm_hil.cli.main import main
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
+from gfm_hil.studies.campaign import worker
+from gfm_hil.studies.campaign.axes import find_axes
+from gfm_hil.studies.campaign.execute import WorkerLost, execute, processes
+from gfm_hil.studies.campaign.figure import draw_map
+from gfm_hil.studies.campaign.loading import load_campaign
+from gfm_hil.studies.campaign.result import summary
+from gfm_hil.studies.campaign.spec import Campaign
+from gfm_hil.studies.campaign.store import Store
+from gfm_hil.studies.campaign.worker import Record, run_chunk
 
 TEXT = """\
 title = "a small one"

@@ -15,26 +15,26 @@ import numpy as np
 import pytest
 from numba import njit
 
-from gfm_hil.bench import make_bench
-from gfm_hil.controller_side import run_controller
-from gfm_hil.errors import PeerLost
-from gfm_hil.frames import FrameWriter
-from gfm_hil.handshake import shake_hands
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.controller_side import run_controller
+from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.loop_records import TOLD
+from gfm_hil.engine.loop_thread import run_compiled
+from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
-from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.can.dbc import write_dbc
+from gfm_hil.links.can.layout import load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.options import CanOptions
-from gfm_hil.links.can.plan import load_plan
 from gfm_hil.links.can.segments import SegmentSender
-from gfm_hil.loops.records import TOLD
-from gfm_hil.loops.thread import run_compiled
-from gfm_hil.npz import Arrays
-from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part, merge, read_recording
-from gfm_hil.scenario import Scenario
-from gfm_hil.side import compile_side
-from gfm_hil.timeline import Timeline
+from gfm_hil.links.frame import FrameWriter
+from gfm_hil.recording.npz import Arrays
+from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
 
 from .can_reference import quantised_run

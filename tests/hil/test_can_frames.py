@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil.frames import FrameError, FrameReader, FrameWriter
 from gfm_hil.links.can.dbc import INT16, INVALID, VECTORS, offset, read_dbc, write_dbc
-from gfm_hil.links.can.e2e import crc8
 from gfm_hil.links.can.layout import plan_of, unpack_vector
 from gfm_hil.links.can.segments import OTHER_DBC, SegmentSender
 from gfm_hil.links.can.vectors import VectorSender
-from gfm_runtime.controller import RUNNING, SAFE
+from gfm_hil.links.can.wire import crc8
+from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_runtime.signals import Group, group, names
+from gfm_runtime.states import RUNNING, SAFE
 
 from .can_parts import Joiner, VectorReceiver
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.loopback import LoopbackBus

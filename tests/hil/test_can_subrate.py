@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gfm_hil.frames import FrameError, FrameReader, FrameWriter
-from gfm_runtime.controller import RUNNING, SAFE, STOPPED
+from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_runtime.signals import Group, names
+from gfm_runtime.states import RUNNING, SAFE, STOPPED
 
 from .can_parts import Subrate
 

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.links.can import KIND
 from gfm_hil.links.can.frame_time import classic_time, fd_time
 from gfm_hil.links.can.options import CanOptions

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.scenario import shipped_scenarios
-from gfm_hil.toml_out import toml_text
+from gfm_hil.scenario.model import shipped_scenarios
+from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime import law_names
 
 SUMMARY = {

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gfm_hil.crc import crc32, crc32_by_tables
+from gfm_hil.links.crc import crc32, crc32_by_tables
 
 FRAMES = [bytes(range(44)), bytes(range(60)), b"\xff" * 44, b"\x00" * 60]
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.errors import PeerLost
-from gfm_hil.frames import FrameError, FrameReader, FrameWriter
-from gfm_hil.handshake import shake_hands
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.scenario import Scenario
-from gfm_runtime.controller import REASONS, SAFE, STOPPED
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
+from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
+from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 ONES = {"y": np.array([1.0, 0.5, 1.0, 0.0, 1.0]), "u": np.array([0.3, 1.0, 1.0])}
 HOLD = 500

@@ -15,21 +15,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.bench import make_bench
-from gfm_hil.controller_side import run_controller
-from gfm_hil.frames import FrameReader
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.controller_side import run_controller
+from gfm_hil.engine.loop_records import TOLD
+from gfm_hil.engine.loop_thread import run_compiled
+from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.loops.records import TOLD
-from gfm_hil.loops.thread import run_compiled
-from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part
-from gfm_hil.scenario import Scenario
-from gfm_hil.side import compile_side
-from gfm_hil.timeline import Timeline, read_log
+from gfm_hil.links.frame import FrameReader
+from gfm_hil.recording.log import read_log
+from gfm_hil.recording.recorder import Part
+from gfm_hil.scenario.model import Scenario
 from gfm_plant import NO_FRESH_U
-from gfm_runtime.controller import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 from gfm_runtime.signals import NU, Group, names
+from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
 from .test_e2e import FAR, HOLD, REALTIME, T_NS, Forger
 from .test_faults import LINKS

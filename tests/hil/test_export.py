@@ -16,13 +16,13 @@ from pyarrow import parquet
 from scipy.io import loadmat
 
 from gfm_hil.cli import main
-from gfm_hil.errors import UserError
-from gfm_hil.export import FORMATS, RunTable, export_run, load_run
-from gfm_hil.export.columns import all_columns, describe
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import check_scenario
-from gfm_plant.protection import TRIP_REASONS
-from gfm_runtime.controller import STATES
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.export import FORMATS, RunTable, export_run, load_run
+from gfm_hil.results.export.columns import all_columns, describe
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import check_scenario
+from gfm_plant.names import TRIP_REASONS
+from gfm_runtime.states import STATES
 
 EVENTS = [
     {"type": "reference", "t": 0.01, "P_ref": 0.8},
@@ -142,7 +142,7 @@ def test_mf4_has_the_events_at_their_ticks_and_what_they_came_from(table, mdf):
 
 
 def test_a_package_that_is_missing_is_named(table, tmp_path, monkeypatch):
-    monkeypatch.setattr("gfm_hil.export.formats.find_spec", lambda name: None)
+    monkeypatch.setattr("gfm_hil.results.export.formats.find_spec", lambda name: None)
     for name in sorted(set(FORMATS) - {"csv"}):
         with pytest.raises(UserError, match=rf"--format {name} needs .*gfmhil\[export\]"):
             export_run(table.folder, name, tmp_path / "file")

@@ -10,12 +10,12 @@ import cantools
 import numpy as np
 import pytest
 
-from gfm_hil.errors import UserError
-from gfm_hil.export import export_run, load_run
+from gfm_hil.core.errors import UserError
 from gfm_hil.links.can.dbc import SEGMENT, STATUS, VECTORS
 from gfm_hil.links.can.loopback import LoopbackBus
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import check_scenario
+from gfm_hil.results.export import export_run, load_run
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import check_scenario
 
 BUS = "127.0.0.1:{port}"
 LAST = 4  # words of a side that end a run

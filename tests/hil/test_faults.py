@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.links.base import SIDES
-from gfm_hil.scenario import check_scenario
+from gfm_hil.core.roles import SIDES
+from gfm_hil.scenario.model import check_scenario
 
 from .pairs import PATIENT, Pair, run_pair
 

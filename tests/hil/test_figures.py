@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from gfm_hil.figures import draw_comparison, draw_run
+from gfm_hil.results.figures import draw_comparison, draw_run
 
 RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 0, "ticks": 0}
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil.frames import FAULTS, FrameError, FrameReader, FrameWriter, frame_dtype
-from gfm_runtime.controller import REASONS, STOPPED
+from gfm_hil.links.frame import FAULTS, FrameError, FrameReader, FrameWriter, frame_dtype
 from gfm_runtime.signals import TABLE_VERSION, names
+from gfm_runtime.states import REASONS, STOPPED
 
 GROUPS = ("y", "u")
 WIDTH = {group: len(names(group)) for group in GROUPS}

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil import handshake
-from gfm_hil.errors import PeerLost
-from gfm_hil.frames import FrameWriter
-from gfm_hil.handshake import Start, shake_hands
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine import handshake
+from gfm_hil.engine.handshake import Start, shake_hands
 from gfm_hil.links import Link, open_link
-from gfm_hil.links.base import LONGEST, SIDES, Side
-from gfm_hil.scenario import Scenario
+from gfm_hil.links.base import LONGEST
+from gfm_hil.links.frame import FrameWriter
+from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import NY
 
 from .test_links import PATIENT

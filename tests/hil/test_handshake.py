@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil import handshake
-from gfm_hil.errors import PeerLost
-from gfm_hil.frames import FrameWriter
-from gfm_hil.handshake import shake_hands
-from gfm_hil.links.base import SIDES, Side
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine import handshake
+from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links.can.link import CanLink
+from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
-from gfm_hil.scenario import Scenario
-from gfm_hil.summary import clock_drift
+from gfm_hil.results.summary import clock_drift
+from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import NU, NY
 
 from .pairs import run_pair
@@ -48,7 +48,7 @@ def test_both_sides_agree_on_the_start(make, endpoint):
 def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):
     """The plant's boot differs: tick 0 is told by when START came, and the drift is measured."""
     boots = iter(["one", "another"])
-    monkeypatch.setattr("gfm_hil.handshake._boot", lambda: next(boots))
+    monkeypatch.setattr("gfm_hil.engine.handshake._boot", lambda: next(boots))
     before = time.monotonic_ns()
     found = meet(dict.fromkeys(SIDES, make(link=PATIENT)), endpoint)
     assert not found["plant"].one_clock and not found["controller"].one_clock

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from gfm_hil.inproc import run_inproc
-from gfm_hil.links.base import SIDES
-from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
-from gfm_hil.runner import run_scenario
-from gfm_hil.timeline import Timeline
+from gfm_hil.core.roles import SIDES
+from gfm_hil.engine.inproc import run_inproc
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_hil.results.runner import run_scenario
 from gfm_runtime import law_names
 
 from .conftest import home_plant
@@ -46,7 +46,7 @@ def test_the_operating_point_knows_grid_references_and_sensors(run):
 
 
 def test_without_an_equilibrium_nothing_starts(make, tmp_path):
-    from gfm_hil.errors import UserError
+    from gfm_hil.core.errors import UserError
 
     scenario = make(references={"P_ref": 2.0}, plant={"factors": {"L_g": 100.0}})
     with pytest.raises(UserError, match=r"^references, plant\.grid: P = 2\.0 p\.u\."):
@@ -223,8 +223,8 @@ def test_a_measurement_out_of_range_leads_to_the_safe_state(run):
 
 
 def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
-    from gfm_hil.bench import make_bench
-    from gfm_hil.run_folder import finish
+    from gfm_hil.engine.setup import make_bench
+    from gfm_hil.results.run_folder import finish
 
     scenario = make(duration=2.0)
     bench = make_bench(scenario)
@@ -262,7 +262,7 @@ def test_the_folder_of_a_run_holds_what_the_design_says(make, tmp_path):
 
 
 def test_a_folder_that_holds_something_is_left_alone(make, tmp_path):
-    from gfm_hil.errors import UserError
+    from gfm_hil.core.errors import UserError
 
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="not empty"):
@@ -273,7 +273,7 @@ def test_a_folder_that_holds_something_is_left_alone(make, tmp_path):
 
 
 def test_a_recording_that_the_disk_has_no_room_for_is_refused(make, tmp_path):
-    from gfm_hil.errors import UserError
+    from gfm_hil.core.errors import UserError
 
     with pytest.raises(UserError, match=r"ticks need .* GB, free are"):
         run_scenario(make(duration=86400.0, T_s=1e-6), tmp_path / "run")

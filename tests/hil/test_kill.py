@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.roles import SIDES
 
 from .test_processes import end, has_run, sides_of, signals, summary, wait_for, write
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from gfm_hil.cli.main import main
-from gfm_hil.league import as_shipped
-from gfm_hil.league_bench import AT, TRACE_EVERY, experiment
-from gfm_hil.league_tables import number
+from gfm_hil.studies.law_comparison.experiments import AT, TRACE_EVERY, experiment
+from gfm_hil.studies.law_comparison.row import as_shipped
+from gfm_hil.studies.law_comparison.tables import number
 from gfm_runtime import law_file
 
 Capture = pytest.CaptureFixture[str]

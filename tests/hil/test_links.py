@@ -11,22 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.bench import make_bench
-from gfm_hil.controller_side import run_controller
-from gfm_hil.errors import UserError
-from gfm_hil.frames import FrameReader, FrameWriter, frame_dtype
-from gfm_hil.handshake import shake_hands
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.controller_side import run_controller
+from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.engine.waiting import send_last
 from gfm_hil.links import Link, open_link
-from gfm_hil.links.base import SIDES, Side
+from gfm_hil.links.frame import FrameReader, FrameWriter, frame_dtype
 from gfm_hil.links.zeromq.link import ZmqLink
-from gfm_hil.npz import Arrays
-from gfm_hil.plant_side import run_plant
-from gfm_hil.recording import Part, merge, read_recording
-from gfm_hil.scenario import Scenario
-from gfm_hil.side import compile_side
-from gfm_hil.timeline import Timeline, read_log, worst
-from gfm_hil.waiting import send_last
-from gfm_runtime.controller import RUNNING, SAFE
+from gfm_hil.recording.log import read_log, worst
+from gfm_hil.recording.npz import Arrays
+from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.scenario.model import Scenario
+from gfm_runtime.states import RUNNING, SAFE
 
 PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
 RIG = {

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gfm_hil.metrics import METRICS, dominant_oscillation, event_metrics
+from gfm_hil.results.metrics import METRICS, dominant_oscillation, event_metrics
 
 T_s, F_N = 1e-3, 50.0
 START, LENGTH = 200, 4000

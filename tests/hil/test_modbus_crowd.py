@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from pymodbus.constants import ExcCodes
 
-from gfm_hil.errors import UserError
-from gfm_hil.listener import Listener
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.listener import Listener
 from gfm_hil.modbus import connection, serve
 from gfm_hil.modbus.connection import CLIENTS, Server
 from gfm_hil.modbus.image import VENDOR
@@ -214,7 +214,7 @@ def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now) -> None:
     "the server ends as if the run were over",
 )  # fmt: skip
 def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, attack_now) -> None:
-    monkeypatch.setattr("gfm_hil.supervised.PAUSE_S", 0.01)
+    monkeypatch.setattr("gfm_hil.core.supervised.PAUSE_S", 0.01)
     full = OSError(errno.EMFILE, "Too many open files")
     failures = {"clock": [full] * 3, "look": [UserError("Too many open files"), full]}
     seen = {"clock": 0, "look": 0}

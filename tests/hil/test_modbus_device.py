@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymodbus.constants import ExcCodes
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE, VENDOR, Image
 from gfm_hil.modbus.measures import Measures
 from gfm_hil.modbus.view import View
-from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS
-from gfm_hil.scenario import check_scenario
-from gfm_runtime.controller import RUNNING, SAFE
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.scenario.model import check_scenario
+from gfm_runtime.states import RUNNING, SAFE
 
 LAWS = ["vsg-2", "mimo-gfm", "droop-1"]
 S_N = 4000.0

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_hil import scratch
-from gfm_hil.errors import UserError
-from gfm_hil.operator import Operator, present
-from gfm_hil.timeline import read_log
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.announcement import present
+from gfm_hil.operator import Operator
+from gfm_hil.recording.log import read_log
 
 SCENARIO = """
 title = "told"

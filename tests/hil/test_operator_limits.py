@@ -11,13 +11,17 @@ from typing import Any
 import pytest
 import zmq
 
-from gfm_hil import scratch
-from gfm_hil.bench import make_bench
-from gfm_hil.errors import UserError
-from gfm_hil.events import Reference
-from gfm_hil.operator import Desk, Operator, Rate, announced, present
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.rate import Rate
+from gfm_hil.engine.announcement import announced, present
+from gfm_hil.engine.command_server import Desk
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.operator import Operator
+from gfm_hil.recording.log import read_log
+from gfm_hil.scenario.events import Reference
 from gfm_hil.scope.record import open_record
-from gfm_hil.timeline import Timeline, read_log
 
 
 class Ends:

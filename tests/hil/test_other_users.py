@@ -17,11 +17,12 @@ from pathlib import Path
 
 import pytest
 
-from gfm_hil import recording, scratch
-from gfm_hil.errors import UserError
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
+from gfm_hil.recording import recorder as recording
 
 from .test_shm import header
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.links.base import SIDES
-from gfm_hil.recording import Part
-from gfm_hil.toml_out import toml_text
+from gfm_hil.core.roles import SIDES
+from gfm_hil.recording.recorder import Part
+from gfm_hil.scenario.toml_out import toml_text
 
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
 PATIENCE_S = 90.0

@@ -20,17 +20,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil import files, npz
-from gfm_hil.bench import make_bench
 from gfm_hil.cli import main
-from gfm_hil.errors import Unfinished, UserError
-from gfm_hil.export import export_run, load_run
-from gfm_hil.links.base import SIDES
-from gfm_hil.recording import Part, merge
-from gfm_hil.run_folder import finish, recover
-from gfm_hil.runner import run_scenario
+from gfm_hil.core import files
+from gfm_hil.core.errors import Unfinished, UserError
+from gfm_hil.core.roles import SIDES
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.recording import npz
+from gfm_hil.recording.recorder import Part, merge
+from gfm_hil.results.export import export_run, load_run
+from gfm_hil.results.run_folder import finish, recover
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
-from gfm_hil.toml_out import scenario_toml
 
 from .test_processes import has_run, sides_of, signals, summary, wait_for, write
 
@@ -76,7 +77,7 @@ def left(make, tmp_path, monkeypatch):
         raise Unfinished
 
     with monkeypatch.context() as patch:
-        patch.setattr("gfm_hil.runner.finish", stop)
+        patch.setattr("gfm_hil.results.runner.finish", stop)
         with pytest.raises(Unfinished):
             run_scenario(make(events=EVENTS), tmp_path / "left", figures=False)
     return found[0]
@@ -362,7 +363,7 @@ def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, att
 
 
 def test_metrics_of_a_file_are_those_of_arrays(run, make):
-    from gfm_hil.metrics import event_metrics
+    from gfm_hil.results.metrics import event_metrics
 
     done = run(duration=0.5, events=EVENTS)
     whole = dict(done.signals)
@@ -373,7 +374,7 @@ def test_metrics_of_a_file_are_those_of_arrays(run, make):
 
 @pytest.mark.parametrize("piece", [7, 100, 1 << 18])
 def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeypatch):
-    from gfm_hil import metrics
+    from gfm_hil.results import metrics
 
     whole = dict(run(duration=0.3, events=EVENTS).signals)
     expected = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
@@ -420,7 +421,7 @@ def test_the_memory_of_recover_does_not_grow_with_the_run(make, tmp_path, attack
         if side == "controller":
             part.signals[:, 5] = 0
     code = (
-        "import sys; from pathlib import Path; from gfm_hil.run_folder import recover\n"
+        "import sys; from pathlib import Path; from gfm_hil.results.run_folder import recover\n"
         "print(recover(Path(sys.argv[1])).summary['ticks'])\n"
         "print(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
     )

@@ -7,12 +7,12 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from gfm_hil.errors import UserError
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import Scenario
-from gfm_hil.timeline import read_log
+from gfm_hil.core.errors import UserError
+from gfm_hil.recording.log import read_log
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import Scenario
 from gfm_plant import CONTROLLER_SAFE
-from gfm_runtime.controller import READY, RUNNING, SAFE
+from gfm_runtime.states import READY, RUNNING, SAFE
 
 from .pairs import PATIENT, run_pair
 

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil.errors import UserError
-from gfm_hil.scenario import Scenario, check_scenario, load_scenario, shipped_scenarios
-from gfm_hil.toml_out import scenario_toml, toml_text
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario, shipped_scenarios
+from gfm_hil.scenario.toml_out import scenario_toml, toml_text
 
 LAW = """
 name = "broken"

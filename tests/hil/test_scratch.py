@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_hil import recording, scratch
+from gfm_hil.core import temporary as scratch
+from gfm_hil.recording import recorder as recording
 
 HOLD = """
 import sys, time
@@ -43,7 +44,10 @@ def record(memory) -> Iterator[Record]:
 
     def call(folder: Path, side: str) -> subprocess.Popen[str]:
         folder.mkdir(exist_ok=True)
-        where = f"import gfm_hil.recording as r, pathlib; r._MEMORY = pathlib.Path({str(memory)!r})"
+        where = (
+            "import gfm_hil.recording.recorder as r, pathlib; "
+            f"r._MEMORY = pathlib.Path({str(memory)!r})"
+        )
         process = subprocess.Popen(
             [sys.executable, "-c", where + HOLD, str(folder), side],
             text=True,

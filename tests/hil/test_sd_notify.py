@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_hil.sd_notify import Watched, notify
-from gfm_hil.toml_out import toml_text
+from gfm_hil.engine.sd_notify import Watched, notify
+from gfm_hil.scenario.toml_out import toml_text
 
 PATIENCE_S = 90.0
 

@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.shm import ring, segment

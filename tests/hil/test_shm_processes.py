@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm.link import ShmLink
 
 from .test_shm import endpoint, segment_of

@@ -18,10 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gfm_hil.engine.announcement import present
 from gfm_hil.modbus.image import Image
 from gfm_hil.modbus.measures import Measures
-from gfm_hil.operator import Operator, present
-from gfm_hil.scenario import load_scenario
+from gfm_hil.operator import Operator
+from gfm_hil.scenario.model import load_scenario
 from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.record import open_record
 

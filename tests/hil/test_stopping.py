@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from gfm_hil.stopping import Interrupt
+from gfm_hil.core.stopping import Interrupt
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

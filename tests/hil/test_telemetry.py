@@ -16,9 +16,9 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.roles import SIDES
 from gfm_hil.operator import Operator
-from gfm_hil.recording import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.recording.recorder import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
 from gfm_hil.telemetry import BlockReader
 from gfm_hil.telemetry.blocks import block_dtype, messages
 from gfm_hil.telemetry.follow import Follower, Rows
@@ -307,7 +307,7 @@ def test_a_port_that_is_taken_is_named(start, tmp_path):
     "3.6", "one exception in the stream's follower", "the stream ends while the run goes on"
 )
 def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now):
-    monkeypatch.setattr("gfm_hil.supervised.PAUSE_S", 0.01)
+    monkeypatch.setattr("gfm_hil.core.supervised.PAUSE_S", 0.01)
     ticks = 3000
     (tmp_path / "scenario.toml").write_text("T_s = 1e-4\n", encoding="utf-8")
     part = Part.create(tmp_path, "plant", ticks)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.checks import Window, damped, envelope, overshoot, read_envelope, settles
 

@@ -11,14 +11,13 @@ from pathlib import Path
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.errors import PeerLost, UserError
-from gfm_hil.handshake import shake_hands
+from gfm_hil.core.errors import PeerLost, UserError
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import open_link
-from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.zeromq.curve import key_files, write_keys
 from gfm_hil.links.zeromq.link import ZmqLink
-from gfm_hil.links.zeromq.options import ZmqOptions
-from gfm_hil.links.zeromq.reach import beyond_loopback
+from gfm_hil.links.zeromq.options import ZmqOptions, beyond_loopback
 
 from .test_links import PATIENT, assert_same, both_sides, in_threads
 from .test_zmq_port import deliver

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numba import njit, types
 
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.links import Link
-from gfm_hil.links.base import SIDES, Side
 from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.links.zeromq.options import ZmqOptions

@@ -5,7 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from gfm_plant import NoEquilibrium, Plant, make_plant, plant_advance, plant_equilibrium, plant_init
+from gfm_plant import (
+    NoEquilibrium,
+    Plant,
+    make_plant,
+    plant_advance,
+    plant_equilibrium,
+    plant_init,
+)
 from gfm_plant.model import f, g
 
 

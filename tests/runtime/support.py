@@ -33,7 +33,7 @@ LAWS = {
 class Blocks:
     """dx/dt = A x + B w, u = C x + D w with w = (r, y, u_0), element by element, loop closed.
 
-    Written without ``gfm_runtime.realise``: each element is its own block from SciPy, nothing is
+    Written without ``realisation``: each element is its own block from SciPy, nothing is
     shared, and the omega_u loop is closed in continuous time.
     """
 

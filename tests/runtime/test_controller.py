@@ -7,7 +7,9 @@ import pytest
 
 from gfm_runtime import LawError, LawSet, discretise, get_law, law_names, load_law
 from gfm_runtime.assembly import Controller, warm_up
-from gfm_runtime.controller import (
+from gfm_runtime.controller import make_controller, missed, set_reference
+from gfm_runtime.signals import NU, NY, REF_NAMES, SIGNALS, Y_NAMES, group
+from gfm_runtime.states import (
     BAD_U,
     BAD_Y,
     INIT,
@@ -19,11 +21,7 @@ from gfm_runtime.controller import (
     STALE,
     STATES,
     STOPPED,
-    make_controller,
-    missed,
-    set_reference,
 )
-from gfm_runtime.signals import NU, NY, REF_NAMES, SIGNALS, Y_NAMES, group
 
 from .support import LAWS, REF, Running, Vector
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.benchmark.c_code import load_c
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import Side
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
 
 _SLOTS = 2 * 1024  # bytes, two slot_t
 _WORD = ctypes.c_int64

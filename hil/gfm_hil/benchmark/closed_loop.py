@@ -25,18 +25,17 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import OURS, attribute, bursts, counts, missed_ticks
 from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.hogs import Load, hogs
+from gfm_hil.benchmark.cpu_load import Load, hogs
 from gfm_hil.benchmark.inproc_loop import Loop
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import Policy, pair
+from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, rounds
 from gfm_hil.benchmark.spread import summary
-from gfm_hil.benchmark.turns import RUNS, Spread, quickest, rounds
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES
 from gfm_hil.links import link_kind, open_link
-from gfm_hil.links.base import SIDES
-from gfm_hil.runner import Progress, run_scenario
-from gfm_hil.scenario import Scenario, check_scenario
-from gfm_hil.scenario_model import INPROC
+from gfm_hil.results.runner import Progress, run_scenario
+from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
 
 LAW = "mimo-gfm"
 T_S = 1e-4  # s

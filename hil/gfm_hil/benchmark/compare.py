@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.benchmark.tables import Table, lockstep_name, times
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 
 BELIEVED = 0.05  # of a corrected p value
 _EXACT = 200_000  # orders that are counted one by one; beyond, the normal approximation

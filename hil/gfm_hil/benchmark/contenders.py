@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.peers import Iceoryx2Link, has_iceoryx2
 from gfm_hil.benchmark.pingpong import LONGEST, LinkEnd, Messages, frames, plain
-from gfm_hil.codec import wire_dtype
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
 from gfm_hil.links import link_kind, open_link
-from gfm_hil.links.base import Side
+from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.signals import NY
 
 FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is then a u

@@ -17,12 +17,12 @@ import numpy as np
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
-from gfm_hil.bench import Bench, make_bench
-from gfm_hil.benchmark.turns import RUNS, Spread, quickest, seconds, take_turns
-from gfm_hil.errors import UserError
-from gfm_hil.inproc import run_ticks
-from gfm_hil.recording import Part, record_command, record_controller, record_sample
-from gfm_hil.scenario import load_scenario
+from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, seconds, take_turns
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.recording.recorder import Part, record_command, record_controller, record_sample
+from gfm_hil.scenario.model import load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import control

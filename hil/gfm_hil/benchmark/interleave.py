@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.benchmark.result import check_result, write_result
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 
 KINDS = ("latency", "jitter", "kernel", "loop")
 _LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # what grows with every turn

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import bursts
 from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.hogs import Load, hogs
+from gfm_hil.benchmark.cpu_load import Load, hogs
 from gfm_hil.benchmark.pair import Pair, Policy, pair
+from gfm_hil.benchmark.rounds import rounds
 from gfm_hil.benchmark.spread import REST, summary
-from gfm_hil.benchmark.turns import rounds
-from gfm_hil.loops.clock import now_ns, sleep_until, wait_until
+from gfm_hil.realtime.clock import now_ns, sleep_until, wait_until
 
 HYBRID, SPIN, SLEEP = range(3)
 WAITS = {"sleep+spin": HYBRID, "spin": SPIN, "nanosleep": SLEEP}

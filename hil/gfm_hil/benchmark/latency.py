@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.c_code import NoCompiler, compile_c
 from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
-from gfm_hil.benchmark.hogs import Load, hogs
+from gfm_hil.benchmark.cpu_load import Load, hogs
 from gfm_hil.benchmark.pair import Policy, pair
+from gfm_hil.benchmark.rounds import rounds
 from gfm_hil.benchmark.spread import REST, summary
-from gfm_hil.benchmark.turns import rounds
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 
 Mode = Literal["lockstep", "realtime"]
 MODES: tuple[Mode, ...] = ("lockstep", "realtime")

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.benchmark.contenders import Contender, End
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.realtime import ask_for_real_time, no_collector_pauses, own_processor
-from gfm_hil.stopping import end_with_parent
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.stopping import end_with_parent
+from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
 
 Policy = Literal["fifo", "other"]
 

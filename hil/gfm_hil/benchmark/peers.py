@@ -6,7 +6,7 @@ import ctypes
 from importlib.util import find_spec
 from typing import Any
 
-from gfm_hil.links.base import Side
+from gfm_hil.core.roles import Side
 from gfm_hil.links.port import Port
 
 _ROOM = 64  # messages, as in the links

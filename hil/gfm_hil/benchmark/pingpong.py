@@ -19,9 +19,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gfm_hil.frames import FrameWriter
 from gfm_hil.links import Port
-from gfm_hil.loops.clock import between_looks, now_ns, wait_until
+from gfm_hil.links.frame import FrameWriter
+from gfm_hil.realtime.clock import between_looks, now_ns, wait_until
 from gfm_runtime.signals import Group, names
 
 SILENCE_NS = 1_000_000_000

@@ -13,10 +13,10 @@ from typing import Any
 
 from gfm_hil.benchmark import closed_loop, inproc_loop, jitter, kernel, latency
 from gfm_hil.benchmark.contenders import FRAME, check_links
-from gfm_hil.benchmark.hogs import LOADS
+from gfm_hil.benchmark.cpu_load import LOADS
 from gfm_hil.benchmark.pair import Policy
-from gfm_hil.environment import may_sched_fifo
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
+from gfm_hil.realtime.environment import may_sched_fifo
 from gfm_runtime import get_law, law_names
 
 Tell = Callable[[str, float], None]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.attribution import CAUSES
 from gfm_hil.benchmark.histogram import dense, lower_ends
 from gfm_hil.benchmark.tables import lockstep_name
-from gfm_hil.figures import COLOURS
+from gfm_hil.results.figures import COLOURS
 
 _GREY, _TEXT = "#888888", "#222222"
 _BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS

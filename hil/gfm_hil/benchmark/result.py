@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.environment import StealTime, caveats, environment
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
+from gfm_hil.realtime.environment import StealTime, caveats, environment
 
 FORMAT = 1
 

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from gfm_hil.cli.common import new_folder
 from gfm_hil.links import link_names
-from gfm_hil.run_folder import check_free
+from gfm_hil.results.run_folder import check_free
 
 _WIDTH = 100  # columns: a table cut short is no use in a file
 

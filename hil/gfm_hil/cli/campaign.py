@@ -14,19 +14,18 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from gfm_hil.campaign.alone import run_alone
-from gfm_hil.campaign.axes import find_axes
-from gfm_hil.campaign.execute import WorkerLost, cluster, execute, processes
-from gfm_hil.campaign.figure import draw_map
-from gfm_hil.campaign.loading import load_campaign
-from gfm_hil.campaign.result import VERDICTS, summary, verdict
-from gfm_hil.campaign.spec import Campaign
-from gfm_hil.campaign.store import Store
-from gfm_hil.campaign.tables import print_campaign, print_record
-from gfm_hil.campaign.worker import Record, compile_once
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder
-from gfm_hil.errors import UserError
-from gfm_hil.stopping import Interrupt
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.studies.campaign.axes import find_axes
+from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
+from gfm_hil.studies.campaign.figure import draw_map
+from gfm_hil.studies.campaign.loading import load_campaign
+from gfm_hil.studies.campaign.result import VERDICTS, summary, verdict
+from gfm_hil.studies.campaign.spec import Campaign
+from gfm_hil.studies.campaign.store import Store
+from gfm_hil.studies.campaign.tables import print_campaign, print_record
+from gfm_hil.studies.campaign.worker import Record, compile_once
 
 _PATIENCE_S = 1.0  # how long the checks may go on without a word
 

@@ -15,10 +15,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gfm_hil.errors import UserError
-from gfm_hil.report import EVENT_COLUMNS, cell
-from gfm_hil.runner import Progress as TellProgress
-from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.results.runner import Progress as TellProgress
+from gfm_hil.scenario.model import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ABREAST = 4  # events in one table, so that it fits 80 columns

@@ -18,13 +18,13 @@ from gfm_hil.cli.common import (
     resolve,
     split_laws,
 )
-from gfm_hil.errors import UserError
-from gfm_hil.figures import draw_comparison
-from gfm_hil.files import write_text
-from gfm_hil.report import EVENT_COLUMNS, cell
-from gfm_hil.run_folder import Run, check_free
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import find_scenario
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.results.figures import draw_comparison
+from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.results.run_folder import Run, check_free
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import find_scenario
 
 
 def add(commands: Any) -> None:

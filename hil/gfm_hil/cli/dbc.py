@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 
 _RATES = {
     False: [(500_000, 0), (1_000_000, 0)],
@@ -54,8 +54,8 @@ def call(options: argparse.Namespace) -> int:
 def _budgets(T_s: float) -> Table:
     """Longest frames of y and u by bit rate, and the exchange that fits."""
     from gfm_hil.links.can.bus_budget import budget
+    from gfm_hil.links.can.layout import load_plan
     from gfm_hil.links.can.options import CanOptions
-    from gfm_hil.links.can.plan import load_plan
 
     table = Table(box=None, pad_edge=False, caption_justify="left")
     table.caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"

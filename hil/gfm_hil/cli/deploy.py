@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 
 _FOLDERS = (
     Path(__file__).resolve().parents[1] / "deploy",  # a wheel carries them here

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError
-from gfm_hil.export import FORMATS, export_run
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.export import FORMATS, export_run
 
 
 def add(commands: Any) -> None:

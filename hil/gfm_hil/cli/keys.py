@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.roles import SIDES
 
 
 def add(commands: Any) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from gfm_hil.errors import Unfinished, UserError
+from gfm_hil.core.errors import Unfinished, UserError
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError
 from gfm_runtime.errors import printable

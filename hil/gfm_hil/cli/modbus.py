@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError, need
-from gfm_hil.stopping import end_with_parent
+from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.stopping import end_with_parent
 
 PORT = 5020
 _LOOK_S = 0.1

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.cli.common import print_summary
-from gfm_hil.run_folder import recover
+from gfm_hil.results.run_folder import recover
 
 
 def add(commands: Any) -> None:

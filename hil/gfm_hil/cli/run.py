@@ -8,7 +8,6 @@ import json
 import sys
 from typing import Any
 
-from gfm_hil.beside import beside
 from gfm_hil.cli.common import (
     add_scenario_options,
     exit_code,
@@ -17,14 +16,14 @@ from gfm_hil.cli.common import (
     progress_bar,
     resolve,
 )
+from gfm_hil.cli.companion import beside
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.modbus import need_pysunspec2
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
-from gfm_hil.errors import UserError
-from gfm_hil.runner import run_scenario
-from gfm_hil.scenario import find_scenario
-from gfm_hil.scenario_model import INPROC
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import INPROC, find_scenario
 
 
 def add(commands: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Column, Table
 
-from gfm_hil.scenario import load_scenario, shipped_scenarios
+from gfm_hil.scenario.model import load_scenario, shipped_scenarios
 
 
 def add(commands: Any) -> None:

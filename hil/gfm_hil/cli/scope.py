@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError, need
-from gfm_hil.links.zeromq.reach import beyond_loopback
-from gfm_hil.stopping import end_with_parent
+from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.stopping import end_with_parent
+from gfm_hil.links.zeromq.options import beyond_loopback
 
 PORT = 8470
 _LOOK_S = 0.1

@@ -7,15 +7,15 @@ import sys
 import time
 from typing import Any
 
-from gfm_hil.bench import make_bench
 from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_hil.core.stopping import end_with_parent
+from gfm_hil.engine.process import run_side
+from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import link_names
-from gfm_hil.links.base import Side
-from gfm_hil.run_folder import check_free, finish, in_use
-from gfm_hil.scenario_model import INPROC
-from gfm_hil.side import run_side
-from gfm_hil.stopping import end_with_parent
+from gfm_hil.results.run_folder import check_free, finish, in_use
+from gfm_hil.scenario.model import INPROC
 
 
 def add(commands: Any) -> None:

@@ -11,9 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.zeromq.reach import beyond_loopback
-from gfm_hil.stopping import Interrupt, end_with_parent
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt, end_with_parent
+from gfm_hil.links.zeromq.options import beyond_loopback
 
 PORT = 9872  # what PlotJuggler's ZeroMQ subscriber connects to unless told otherwise
 _LOOK_S = 0.1

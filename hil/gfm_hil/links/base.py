@@ -6,14 +6,12 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
+from gfm_hil.core.roles import Side
 from gfm_hil.links.port import Port
-
-Side = Literal["controller", "plant"]
-SIDES: tuple[Side, ...] = ("controller", "plant")
 
 LONGEST = 504  # bytes of a message that every link carries, be it a frame or a greeting
 

@@ -11,8 +11,9 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import Link, LinkKind, Side
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import Link, LinkKind
 
 GROUP = "gfmhil.links"
 

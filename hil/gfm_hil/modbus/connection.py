@@ -21,8 +21,9 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import SimDevice
 
-from gfm_hil.listener import Listener
-from gfm_hil.operator import Identity, Rate, address
+from gfm_hil.core.identity import Identity, address
+from gfm_hil.core.listener import Listener
+from gfm_hil.core.rate import Rate
 
 UNIT = 1
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows it, unit

@@ -18,10 +18,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gfm_hil.events import check_reference
 from gfm_hil.modbus.image import Value
 from gfm_hil.modbus.plan import Plan
 from gfm_hil.modbus.view import View
+from gfm_hil.scenario.events import check_reference
 
 COMPLETED, FAILED = 1, 2
 _SPAN = 100.0  # %, of Var on either side, with which the droop in force is shown

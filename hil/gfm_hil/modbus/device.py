@@ -13,7 +13,7 @@ from typing import Any
 
 from pymodbus.constants import ExcCodes
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.modbus.connection import CLIENT
 from gfm_hil.modbus.curves import (
     DROOP,
@@ -31,7 +31,7 @@ from gfm_hil.modbus.operation import Direct, Heartbeat, Operation
 from gfm_hil.modbus.plan import Function, Plan, Refused
 from gfm_hil.modbus.setpoints import SetPoint
 from gfm_hil.modbus.view import Slack, View
-from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 
 #: carries a command out, or raises UserError

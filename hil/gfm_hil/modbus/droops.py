@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gfm_design.gains import tied
+from gfm_design.tuning.gains import tied
 from gfm_runtime.law import Law
 from gfm_runtime.lawfile import LawFile, build_law
 

@@ -10,11 +10,11 @@ from typing import Any
 
 from gfm_hil.modbus.image import VENDOR, Value
 from gfm_hil.modbus.view import Slack, View
-from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.model import Scenario
 from gfm_plant import Bases, load_converter
-from gfm_plant.protection import TRIPS
-from gfm_runtime.controller import INIT, READY, RUNNING, SAFE, STOPPED
+from gfm_plant.names import TRIPS
 from gfm_runtime.signals import SIGNALS
+from gfm_runtime.states import INIT, READY, RUNNING, SAFE, STOPPED
 
 _GRID_FORMING = 1 << 1  # bits of 701.DERMode, 702.CtrlModes, 702.IntIslandCat
 _CONTROLS = 1 << 1 | 1 << 2 | 1 << 4 | 1 << 5  # fixed W, fixed var, volt-var, frequency droop

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gfm_hil.events import check_reference
 from gfm_hil.modbus.gains import Gains
 from gfm_hil.modbus.image import VENDOR, Value
 from gfm_hil.modbus.plan import Plan
 from gfm_hil.modbus.view import View
-from gfm_runtime.controller import RUNNING
+from gfm_hil.scenario.events import check_reference
+from gfm_runtime.states import RUNNING
 
 STOP, START = 0, 1  # of OpCtl
 _SHORTEST_MS, _LONGEST_MS = 100, 3_600_000  # of HbTms

@@ -18,15 +18,17 @@ from typing import Any
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.identity import Identity
+from gfm_hil.core.roles import SIDES
+from gfm_hil.core.supervised import supervised
+from gfm_hil.engine.announcement import present
 from gfm_hil.modbus.connection import CLIENT, UNIT, Server
 from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE
 from gfm_hil.modbus.view import Watcher
-from gfm_hil.operator import Identity, Operator, present
-from gfm_hil.scenario import load_scenario
-from gfm_hil.supervised import supervised
+from gfm_hil.operator import Operator
+from gfm_hil.scenario.model import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.operator import Operator
-from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, PLANT_TIMES, Part
-from gfm_hil.scenario import Scenario
-from gfm_runtime.controller import SAFE
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.scenario.model import Scenario
+from gfm_runtime.states import SAFE
 
 _NAMES_S = 0.1  # how old names and gains may be
 _WINDOW_S = 1.0  # of ticks that the slack is taken over

@@ -1,9 +1,5 @@
-"""The operator's hand on a run: commands to a side that is running, and a look at what it does."""
+"""The operator of a run: sends commands to a role that is running, and reads what it records."""
 
-from gfm_hil.operator.announced import announced, present
 from gfm_hil.operator.client import Operator
-from gfm_hil.operator.desk import Desk
-from gfm_hil.operator.identity import Identity, address
-from gfm_hil.operator.rate import Rate
 
-__all__ = ["Desk", "Identity", "Operator", "Rate", "address", "announced", "present"]
+__all__ = ["Operator"]

@@ -8,14 +8,14 @@ from typing import Any, get_args
 
 import zmq
 
-from gfm_hil.errors import UserError
-from gfm_hil.events import CONTROLLER_EVENTS
-from gfm_hil.links.base import Side
-from gfm_hil.operator.announced import LARGEST, announced, present
-from gfm_hil.operator.identity import Identity, local
-from gfm_hil.recording import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.identity import Identity, local
+from gfm_hil.core.roles import Side
+from gfm_hil.engine.announcement import LARGEST, announced, present
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_hil.scenario.events import CONTROLLER_EVENTS
 from gfm_plant import TRIP_REASONS
-from gfm_runtime.controller import REASONS, STATES
+from gfm_runtime.states import REASONS, STATES
 
 _ANSWER_MS = 6000
 _CONTROLLERS = {get_args(e.model_fields["type"].annotation)[0] for e in CONTROLLER_EVENTS}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.metrics import Rows
+from gfm_hil.results.metrics import Rows
 from gfm_runtime.signals import Group, Signal, group
 
 Columns = Mapping[str, Rows]  #: of a recording, by name, one row a tick

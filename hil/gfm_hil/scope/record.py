@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from gfm_hil.errors import UserError, lines
-from gfm_hil.operator import announced, present
-from gfm_hil.recording import (
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.engine.announcement import announced, present
+from gfm_hil.recording.log import read_log
+from gfm_hil.recording.recorder import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
     PLANT_COLUMNS,
@@ -23,9 +24,8 @@ from gfm_hil.recording import (
     Part,
     read_recording,
 )
-from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.scope.channels import Columns
-from gfm_hil.timeline import read_log
 from gfm_plant import load_converter
 from gfm_runtime import LawError, load_law
 

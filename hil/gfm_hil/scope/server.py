@@ -19,19 +19,20 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
-from gfm_hil.errors import UserError
-from gfm_hil.listener import Listener
-from gfm_hil.operator import Identity, Operator
-from gfm_hil.scenario_model import INPROC
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.identity import Identity
+from gfm_hil.core.listener import Listener
+from gfm_hil.core.supervised import supervised
+from gfm_hil.operator import Operator
+from gfm_hil.scenario.model import INPROC
 from gfm_hil.scope.access import HEADERS, Access
 from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.record import Record
 from gfm_hil.scope.record import ready as ready_laws
 from gfm_hil.scope.session import SEND_S, Session, in_words
-from gfm_hil.supervised import supervised
-from gfm_runtime.controller import STATES
 from gfm_runtime.signals import group
+from gfm_runtime.states import STATES
 
 FRAMES_PER_S = 30
 _LOG_S = 0.25  # between two looks at what has happened

@@ -14,8 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from gfm_hil.errors import UserError, lines
-from gfm_hil.operator import Identity, Rate, address
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.identity import Identity, address
+from gfm_hil.core.rate import Rate
 from gfm_hil.scope.access import Access
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.view import Look, View

@@ -16,7 +16,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from gfm_hil.links.base import SIDES
+from gfm_hil.core.roles import SIDES
 from gfm_hil.telemetry.follow import COLUMNS, TIMES, Rows
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"

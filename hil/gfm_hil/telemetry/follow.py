@@ -10,9 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.recording import CONTROLLER_COLUMNS, CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.recording.recorder import (
+    CONTROLLER_COLUMNS,
+    CONTROLLER_TIMES,
+    PLANT_COLUMNS,
+    PLANT_TIMES,
+    Part,
+)
 
 COLUMNS = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
 TIMES = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}

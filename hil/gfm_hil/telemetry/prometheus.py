@@ -12,11 +12,11 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.operator import Operator
 from gfm_hil.telemetry.follow import Follower, Rows, slack_us
 from gfm_hil.telemetry.metrics import METRICS
-from gfm_runtime.controller import STATES
+from gfm_runtime.states import STATES
 
 _WINDOW_S = 10.0  # of the run's time, over which quantiles are taken
 _SLACK = (0.0, 0.001, 0.01, 0.5)  # little slack is bad

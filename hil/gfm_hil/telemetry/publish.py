@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import zmq
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.supervised import attempt
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.supervised import attempt
 from gfm_hil.telemetry import blocks
 from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.samples import Sampler

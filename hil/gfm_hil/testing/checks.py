@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.errors import UserError
-from gfm_hil.metrics import dominant_oscillation
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.metrics import dominant_oscillation
 from gfm_hil.testing.signals import unit
 
 Vector = NDArray[np.float64]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.testing import checks
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps

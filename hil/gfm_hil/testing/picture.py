@@ -13,9 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_hil.figures import COLOURS, draw_panel, draw_timing
-from gfm_hil.run_folder import Run
-from gfm_hil.scenario import Scenario
+from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
+from gfm_hil.results.run_folder import Run
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.testing.checks import Finding
 from gfm_hil.testing.signals import unit
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from gfm_hil.errors import UserError, lines
-from gfm_hil.events import Event
-from gfm_hil.scenario import Scenario, check_scenario
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.scenario.events import Event
+from gfm_hil.scenario.model import Scenario, check_scenario
 
 _EVENT: TypeAdapter[Any] = TypeAdapter(Event)
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.errors import UserError
-from gfm_hil.scenario import Scenario, load_scenario
-from gfm_hil.scenario_model import INPROC
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
 
 _PLAIN = "pref_step"  # of which the grid and the converter are meant, not the step
 _PATIENCE_S = 10.0  # in lockstep a busy machine is no reason to fail

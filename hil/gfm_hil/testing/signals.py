@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 
 
 class Signals(Mapping[str, NDArray[Any]]):

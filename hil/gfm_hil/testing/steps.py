@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gfm_hil.errors import UserError
-from gfm_hil.run_folder import Run
-from gfm_hil.runner import run_scenario
-from gfm_hil.summary import nominal_frequency
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.run_folder import Run
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.results.summary import nominal_frequency
 from gfm_hil.testing.plan import Plan
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
 from gfm_hil.testing.signals import Signals, same

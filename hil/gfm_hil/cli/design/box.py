@@ -13,17 +13,17 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from gfm_design.box import T_S, Box, Point, Source
-from gfm_design.delays import longest, overall_delay
-from gfm_design.gains import free_gains
-from gfm_design.hinf import Unstable
-from gfm_design.linear import Mode, linearise_law, linearise_plant, loop_modes
-from gfm_design.operating_point import operating_point
-from gfm_design.robust import Loops, paper_problem
-from gfm_design.sampled import SampledLoop
-from gfm_hil.box_bench import STEP, step_run
+from gfm_design.margins.delays import longest, overall_delay
+from gfm_design.model.box import T_S, Box, Point, Source
+from gfm_design.model.linear import Mode, linearise_law, linearise_plant, loop_modes
+from gfm_design.model.operating_point import operating_point
+from gfm_design.model.sampled import SampledLoop
+from gfm_design.norms.hinf import Unstable
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.robust import Loops, paper_problem
 from gfm_hil.cli.design.box_options import add_box, read_box
 from gfm_hil.cli.design.common import channels_as_json
+from gfm_hil.studies.box import STEP, step_run
 from gfm_plant import make_plant
 from gfm_runtime import discretise, law_file, load_law
 from gfm_runtime.lawfile import LawFile
@@ -75,7 +75,7 @@ def call(options: argparse.Namespace) -> int:
 def delay_margin(law: str, dc: Source = "controlled") -> float:
     """What may be added to the nominal loop's one sample of delay, s.
 
-    0 if it does not hold, inf if no loss is found (``gfm_design.delays``).
+    0 if it does not hold, inf if no loss is found (``gfm_design.margins.delays``).
     """
     point = Point(dc=dc)
     par, _ = make_plant(point.plant(), T_S)

@@ -9,9 +9,9 @@ from typing import Any, get_args
 
 import numpy as np
 
-from gfm_design.box import Box, Source
-from gfm_design.robust import Wanted
-from gfm_hil.errors import UserError
+from gfm_design.model.box import Box, Source
+from gfm_design.tuning.robust import Wanted
+from gfm_hil.core.errors import UserError
 
 _SOURCES = get_args(Source)
 #: the least and the largest that a plant of the box may be

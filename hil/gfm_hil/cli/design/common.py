@@ -11,11 +11,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gfm_design.performance import PAPER_WEIGHTS, Channel, Weight
-from gfm_design.weights_file import read_weights
-from gfm_hil.errors import UserError
-from gfm_hil.report import cell
-from gfm_hil.tuned_law import channels_as_json as channels_as_json
+from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
+from gfm_design.norms.weights import read_weights
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.report import cell
+from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
 
 
 def add_law_options(command: argparse.ArgumentParser) -> None:

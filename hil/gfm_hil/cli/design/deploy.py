@@ -9,16 +9,16 @@ from typing import Any
 
 from rich.console import Console
 
-from gfm_design.box import Box, Source
-from gfm_design.deployable import Round, deploy
-from gfm_design.gains import free_gains, tied
-from gfm_design.robust import Wanted, paper_problem
-from gfm_design.synthesis import NotStabilised
+from gfm_design.model.box import Box, Source
+from gfm_design.tuning.deployable import Round, deploy
+from gfm_design.tuning.gains import free_gains, tied
+from gfm_design.tuning.robust import Wanted, paper_problem
+from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.cli.design.box import delay_margin, margin_text
 from gfm_hil.cli.design.box_options import add_box, read_box, wanted
 from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
-from gfm_hil.errors import UserError
-from gfm_hil.toml_out import toml_text
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import LawFile
 

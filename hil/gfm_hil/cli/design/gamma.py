@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gfm_design.gains import FreeGain, tied
-from gfm_design.hinf import Unstable
-from gfm_design.paper_problem import PaperProblem
+from gfm_design.norms.hinf import Unstable
+from gfm_design.tuning.gains import FreeGain, tied
+from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
@@ -21,7 +21,7 @@ from gfm_hil.cli.design.common import (
     singular_is_users,
     weights_of,
 )
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_runtime import law_file
 
 

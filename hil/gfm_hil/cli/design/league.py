@@ -14,16 +14,16 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from gfm_design.paper_tune import EVALUATIONS
-from gfm_design.synthesis import UNSTABLE
-from gfm_hil.campaign.execute import WorkerLost
+from gfm_design.tuning.paper_tune import EVALUATIONS
+from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
-from gfm_hil.errors import UserError
-from gfm_hil.league import LEFT_OUT, Job, Row
-from gfm_hil.league_figures import draw
-from gfm_hil.league_run import kept, run
-from gfm_hil.league_tables import TABLES, markdown, print_league, ranked
-from gfm_hil.stopping import Interrupt
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.studies.campaign.execute import WorkerLost
+from gfm_hil.studies.law_comparison.execute import kept, run
+from gfm_hil.studies.law_comparison.figures import draw
+from gfm_hil.studies.law_comparison.row import LEFT_OUT, Job, Row
+from gfm_hil.studies.law_comparison.tables import TABLES, markdown, print_league, ranked
 from gfm_runtime import law_names
 
 

@@ -9,10 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from gfm_design.case import Case
-from gfm_design.region import Region
-from gfm_design.sampled import outermost
-from gfm_hil.figures import COLOURS
+from gfm_design.margins.tolerance import Region
+from gfm_design.model.case import Case
+from gfm_design.model.sampled import outermost
+from gfm_hil.results.figures import COLOURS
 
 _GREY = "#888888"
 _SPAN = 100.0  # 1/s; colours of sigma end there

@@ -9,12 +9,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gfm_design.disk import DiskMargin
-from gfm_design.linear import Mode
-from gfm_design.margins import ChannelMargins, Margins
-from gfm_design.region import Region
-from gfm_design.tolerance import End, GridStrength, Range
-from gfm_hil.loop_delay import LoopDelay
+from gfm_design.margins.all_margins import ChannelMargins, Margins
+from gfm_design.margins.disk import DiskMargin
+from gfm_design.margins.tolerance import End, GridStrength, Range, Region
+from gfm_design.model.linear import Mode
+from gfm_hil.results.loop_delay import LoopDelay
 
 
 def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, Any]:

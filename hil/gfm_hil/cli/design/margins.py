@@ -11,15 +11,15 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from gfm_design.case import Case
-from gfm_design.margins import UnstableLoop, margins
-from gfm_design.region import POINTS, Region, stable_region
+from gfm_design.margins.all_margins import UnstableLoop, margins
+from gfm_design.margins.tolerance import POINTS, Region, stable_region
+from gfm_design.model.case import Case
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.margin_figures import draw_delay, draw_region
 from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
-from gfm_hil.errors import UserError
-from gfm_hil.loop_delay import check_run, read_loop_delay
-from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.loop_delay import check_run, read_loop_delay
+from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
 

@@ -10,12 +10,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from gfm_design.full_order import Missing, full_order
-from gfm_design.gains import free_gains
-from gfm_design.league_modes import culprit
-from gfm_design.paper_problem import PAPER_START, PaperProblem
-from gfm_design.paper_tune import EVALUATIONS, starts_for, tune_paper
-from gfm_design.synthesis import NotStabilised, Tuned
+from gfm_design.norms.full_order import Missing, full_order
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.law_comparison_modes import culprit
+from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
+from gfm_design.tuning.synthesis import NotStabilised, Tuned
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
@@ -25,8 +25,8 @@ from gfm_hil.cli.design.common import (
     singular_is_users,
     weights_of,
 )
-from gfm_hil.errors import UserError
-from gfm_hil.tuned_law import write_law
+from gfm_hil.core.errors import UserError
+from gfm_hil.studies.tuned_law import write_law
 from gfm_runtime import law_file
 
 

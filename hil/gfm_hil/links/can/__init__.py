@@ -7,8 +7,9 @@ import socket
 from importlib.util import find_spec
 from pathlib import Path
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import Link, LinkKind, Side
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import Link, LinkKind
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
 
 _PLACES = 4  # of a loopback bus, UDP ports in a row

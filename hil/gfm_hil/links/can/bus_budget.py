@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 from gfm_hil.links.can.dbc import VECTORS
 from gfm_hil.links.can.frame_time import classic_time, fd_time
-from gfm_hil.links.can.layout import Plan
+from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.options import CanOptions
-from gfm_hil.links.can.plan import load_plan
 
 DATA_RATES = (2_000_000, 5_000_000, 8_000_000)  # that transceivers are made for
 

@@ -19,10 +19,10 @@ from cantools.database.can.formats.dbc.dbc_attribute_definition import DbcAttrib
 from cantools.database.can.formats.dbc.dbc_specifics import DbcSpecifics
 from cantools.database.conversion import BaseConversion
 
-from gfm_hil.links.base import Side
-from gfm_runtime.controller import REASONS, STATES
+from gfm_hil.core.roles import Side
 from gfm_runtime.signals import Group, group, table_hash
 from gfm_runtime.signals import Signal as Row
+from gfm_runtime.states import REASONS, STATES
 
 INT16 = 32767  # largest count; the range is symmetric
 INVALID = -32768

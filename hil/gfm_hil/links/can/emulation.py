@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gfm_hil.atomics import copy
 from gfm_hil.links.can.frame_time import PAYLOADS, classic_time, fd_time
 from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
+from gfm_hil.realtime.atomics import copy
 
 PLACES = 128  # for frames that wait for the bus, and again for those that have had it
 _LONGEST = PAYLOADS[-1]

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +16,20 @@ from cantools.database.can import Database, Message
 from numba import njit
 from numpy.typing import NDArray
 
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.links.can.dbc import COUNTER, CRC, INT16, INVALID, SEGMENT, STATUS, VECTORS
-from gfm_hil.links.can.e2e import crc8
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.links.can.dbc import (
+    COUNTER,
+    CRC,
+    INT16,
+    INVALID,
+    SEGMENT,
+    STATUS,
+    VECTORS,
+    read_dbc,
+    write_dbc,
+)
+from gfm_hil.links.can.options import CanOptions
+from gfm_hil.links.can.wire import crc8
 from gfm_runtime.signals import Group, names
 
 
@@ -183,3 +196,26 @@ def unpack_vector(payload, index, start, scale, offset, values):
         if count >= 0x8000:
             count -= 0x10000
         values[index[k]] = np.nan if count == INVALID else count * scale[k] + offset[k]
+
+
+@cache
+def load_plan(options: CanOptions) -> Plan:
+    """The frames of that DBC.
+
+    Raises:
+        ValueError: it cannot be read, or does not describe what the link needs.
+    """
+    if options.dbc is None:
+        return plan_of(read_dbc(write_dbc(options.fd)))
+    where = f"dbc = {options.dbc!r}"
+    try:
+        plan = plan_of(read_dbc(Path(options.dbc).read_text(encoding="utf-8")))
+    except OSError as problem:
+        raise ValueError(f"{where}: {problem.strerror}") from None
+    except Exception as problem:  # cantools has no common base of what its parser raises
+        said = " ".join(str(problem).split())
+        raise ValueError(f"{where}: {said}") from None
+    if plan.fd != options.fd:
+        kind = "CAN FD" if plan.fd else "classic CAN"
+        raise ValueError(f"{where}: describes {kind}; link.options.fd must agree")
+    return plan

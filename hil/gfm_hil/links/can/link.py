@@ -15,11 +15,10 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.errors import PeerLost, UserError
-from gfm_hil.frames import FrameWriter
-from gfm_hil.links.base import SIDES, Side
+from gfm_hil.core.errors import PeerLost, UserError
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.links.can.emulation import busy, has_room
-from gfm_hil.links.can.layout import Plan
+from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.node import (
     ANOTHER_DBC,
@@ -29,6 +28,7 @@ from gfm_hil.links.can.node import (
     Node,
     account,
     bring,
+    can_port,
     compose,
     fetch,
     put,
@@ -36,13 +36,12 @@ from gfm_hil.links.can.node import (
     room_to_send,
 )
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
-from gfm_hil.links.can.plan import load_plan
-from gfm_hil.links.can.port import can_port
 from gfm_hil.links.can.segments import LONGEST, SegmentSender
 from gfm_hil.links.can.sockets import FULL, set_socket
 from gfm_hil.links.can.sockets import LOOPBACK as UDP
 from gfm_hil.links.can.sockets import SOCKETCAN as KERNEL
 from gfm_hil.links.can.wire import BRS, FD, frame_dtype, pack, unpack
+from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
 from gfm_runtime.signals import Group, names
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gfm_hil.links.base import Side
+from gfm_hil.core.roles import Side
 from gfm_hil.links.can.emulation import (
     PLACES,
     arrive,
@@ -46,7 +46,8 @@ from gfm_hil.links.can.vectors import (
     set_sender,
 )
 from gfm_hil.links.can.wire import BUS_OFF, ERROR, EXTENDED, REMOTE, frame_dtype
-from gfm_hil.loops.clock import now_ns
+from gfm_hil.links.port import Port, port_function
+from gfm_hil.realtime.clock import now_ns
 
 NOTHING, LOST = -1, -2  # no message; the bus is gone, see ``lost``
 
@@ -307,3 +308,30 @@ def sleep(handle, ms):
     """Sleep until a frame comes by the socket, at most that long; not while one is on the bus."""
     if _state(handle)[0].open != 0 and not busy(_bus(handle)):
         sleep_for_frame(_sockets(handle), ms)
+
+
+_SPINS = 200  # looks, about 0.1 ms: the call that sends a frame also delivers it
+_PATIENCE = 1  # ms
+
+
+def can_port(node: Node) -> Port:
+    """The port of a node with an open socket."""
+    return Port(node.handle, _send, _receive, _SPINS, _await)
+
+
+@port_function
+def _send(handle, message):
+    return send(handle, message)
+
+
+@port_function
+def _receive(handle, message):
+    size = receive(handle, message)
+    return -1 if size == LOST else max(0, size)
+
+
+@port_function
+def _await(handle, message):
+    sleep(handle, _PATIENCE)
+    size = receive(handle, message)
+    return -1 if size == LOST else max(0, size)

@@ -14,10 +14,10 @@ import zlib
 import numpy as np
 from numba import njit
 
-from gfm_hil.crc import crc32
-from gfm_hil.links.base import SIDES, Side
-from gfm_hil.links.can.bench_frame import number
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.links.can.layout import Plan
+from gfm_hil.links.can.wire import number
+from gfm_hil.links.crc import crc32
 
 NOTHING, OTHER_DBC = -1, -2
 

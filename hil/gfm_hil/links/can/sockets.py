@@ -18,7 +18,7 @@ from numba import njit, types
 from numba.extending import intrinsic as _numba_intrinsic
 
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
-from gfm_hil.loops.clock import now_ns
+from gfm_hil.realtime.clock import now_ns
 
 intrinsic: Any = _numba_intrinsic  # its stubs count typingctx among the caller's arguments
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gfm_hil.links.base import Side
-from gfm_hil.links.can.bench_frame import (
+from gfm_hil.core.roles import Side
+from gfm_hil.links.can.wire import (
     MOST,
     SEQUENCE,
     STATE,
@@ -25,8 +25,8 @@ from gfm_hil.links.can.bench_frame import (
     size_and_head,
     undamaged,
 )
-from gfm_runtime.controller import RUNNING, STOPPED
 from gfm_runtime.signals import Group
+from gfm_runtime.states import RUNNING, STOPPED
 
 NOTHING = -1
 

@@ -18,9 +18,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gfm_hil.atomics import copy
-from gfm_hil.links.can.bench_frame import (
+from gfm_hil.links.can.dbc import SENDERS
+from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
+from gfm_hil.links.can.wire import (
+    BRS,
     CRC_BYTES,
+    FD,
     FIRST,
     REASON,
     SEQUENCE,
@@ -29,16 +32,15 @@ from gfm_hil.links.can.bench_frame import (
     TICK,
     VALUES,
     begins_with,
+    crc8,
+    frame_dtype,
     number,
     put_number,
     seal,
     size_and_head,
     undamaged,
 )
-from gfm_hil.links.can.dbc import SENDERS
-from gfm_hil.links.can.e2e import crc8
-from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
-from gfm_hil.links.can.wire import BRS, FD, frame_dtype
+from gfm_hil.realtime.atomics import copy
 from gfm_runtime.signals import Group
 
 #: a CAN frame: identifier and payload

@@ -10,7 +10,8 @@ from llvmlite import ir
 from numba import carray, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
-from gfm_hil.links.base import SIDES, Link, Side
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.links.base import Link
 from gfm_hil.links.impaired.settings import Impairment
 from gfm_hil.links.impaired.stage import (
     COUNTED,

@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from gfm_hil.links.base import LinkOptions, Side
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import LinkOptions
 
 
 class Impairment(LinkOptions):

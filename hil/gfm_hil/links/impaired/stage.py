@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.links.impaired.settings import Impairment
-from gfm_hil.loops.clock import end_this_process, now_ns
+from gfm_hil.realtime.clock import end_this_process, now_ns
 
 INNER, INNER_WORDS = 0, 1  # address and length of the handle of the link underneath
 _RANDOM, _LOSS, _LOSS_MORE, _CORRUPT, _BITS, _DUPLICATE, _REORDER = range(2, 9)

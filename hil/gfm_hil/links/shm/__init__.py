@@ -5,7 +5,8 @@ from __future__ import annotations
 import secrets
 from pathlib import Path
 
-from gfm_hil.links.base import Link, LinkKind, LinkOptions, Side
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import Link, LinkKind, LinkOptions
 
 
 def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:

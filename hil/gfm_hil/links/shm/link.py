@@ -6,8 +6,9 @@ import time
 
 import numpy as np
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import LONGEST, Side
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
 from gfm_hil.links.shm import ring, segment
 

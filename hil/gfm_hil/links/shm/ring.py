@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from numba import njit
 
-from gfm_hil.atomics import copy, load_acquire, pause, store_release
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import PORT_CALL, free_port_function
+from gfm_hil.realtime.atomics import copy, load_acquire, pause, store_release
 from gfm_runtime.compiled import FREE
 
 SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gfm_hil import scratch
+from gfm_hil.core import temporary as scratch
 from gfm_hil.links.shm.ring import RING
 
 FOLDER = Path("/dev/shm")  # of shm_open(3) on Linux

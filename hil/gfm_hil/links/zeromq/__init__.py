@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gfm_hil.links.base import Link, LinkKind, Side
-from gfm_hil.links.zeromq.options import ZmqOptions
-from gfm_hil.links.zeromq.reach import refuse_open
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import Link, LinkKind
+from gfm_hil.links.zeromq.options import ZmqOptions, refuse_open
 
 
 def _open(side: Side, endpoint: str, options: ZmqOptions) -> Link:

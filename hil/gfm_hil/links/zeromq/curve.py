@@ -15,8 +15,8 @@ import zmq.auth
 from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import SIDES, Side
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
 
 _KEY_BYTES = 32
 _DOMAIN = "gfmhil"

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 import zmq
 
-from gfm_hil.errors import UserError
-from gfm_hil.links.base import LONGEST, Side
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.links.zeromq.options import ZmqOptions

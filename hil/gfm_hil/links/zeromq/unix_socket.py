@@ -9,8 +9,8 @@ import stat
 import struct
 from pathlib import Path
 
-from gfm_hil import scratch
-from gfm_hil.errors import UserError
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
 
 SCHEME = "ipc://"
 

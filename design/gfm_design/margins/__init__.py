@@ -1,0 +1,1 @@
+"""What a loop stands: gain, phase, disk, delay and parameter margins."""

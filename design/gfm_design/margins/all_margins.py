@@ -1,0 +1,150 @@
+"""All margins of a case: each loop on its own, all channels at once, delay, elements, the grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gfm_design.margins.classical import GainPhase, gain_phase
+from gfm_design.margins.delays import DelayMargin, delay_at_u, delay_at_y, longest, overall_delay
+from gfm_design.margins.disk import DiskMargin, disk_margin
+from gfm_design.margins.locus import Locus, locus_at_u, locus_at_y
+from gfm_design.margins.tolerance import (
+    GridStrength,
+    Range,
+    element_ranges,
+    grid_strength,
+    mode_of,
+)
+from gfm_design.model.case import Case
+from gfm_design.model.linear import Mode
+from gfm_design.model.sampled import SampledLoop, outermost
+from gfm_plant.parameters import Element
+from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
+
+_AT_REST = 1e-6  # 1/s; what decays more slowly is an integrator, to rounding
+_INSIDE, _OUTSIDE = 0.99, 1.01  # of a margin, in dB, degrees or seconds
+
+
+class UnstableLoop(ArithmeticError):
+    """The loop does not hold as it is, so it has no margins; ``mode`` is what grows fastest."""
+
+    def __init__(self, mode: Mode) -> None:
+        self.mode = mode
+        kind = f"the mode at {mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "a real mode"
+        if mode.sigma > _AT_REST:
+            text = f"unstable: {kind} grows with sigma = {mode.sigma:+.4g} 1/s"
+        else:
+            text = f"not asymptotically stable: {kind} neither grows nor decays"
+        super().__init__(text)
+
+
+@dataclass(frozen=True)
+class ChannelMargins:
+    """Margins of the loop through one of u or y, all others closed.
+
+    ``confirmed``: closed with 0.99 of every margin the loop is stable, with 1.01 it is not.
+    """
+
+    name: str
+    gain_phase: GainPhase
+    delay: DelayMargin
+    confirmed: bool
+
+
+@dataclass(frozen=True)
+class LoopMargins:
+    """What a loop stands at its one operating point.
+
+    Attributes:
+        worst: the mode that is damped least, its sigma the largest.
+        u, y: each channel that the loop uses.
+        disk_u, disk_y: all channels of u, of y at once.
+        delay: more delay of all of u; ``longest`` is how far it was looked for, s.
+    """
+
+    worst: Mode
+    u: tuple[ChannelMargins, ...]
+    y: tuple[ChannelMargins, ...]
+    disk_u: DiskMargin
+    disk_y: DiskMargin
+    delay: DelayMargin
+    longest: float
+
+
+@dataclass(frozen=True)
+class Margins:
+    """``loop`` at the operating point, and how far the circuit and the grid may change."""
+
+    loop: LoopMargins
+    elements: dict[Element, Range | None]
+    grid: GridStrength
+
+
+def margins(case: Case) -> Margins:
+    """All margins; takes some seconds.
+
+    Raises:
+        UnstableLoop: there are none.
+        NoEquilibrium: plant and law have no operating point.
+    """
+    loop = loop_margins(case.loop())
+    return Margins(loop, element_ranges(case), grid_strength(case))
+
+
+def loop_margins(loop: SampledLoop) -> LoopMargins:
+    """The margins of one sampled loop.
+
+    Raises:
+        UnstableLoop: there are none.
+    """
+    worst = outermost(loop.closed())
+    mode = mode_of(worst, loop.T_s)
+    if mode.sigma > -_AT_REST:
+        raise UnstableLoop(mode)
+    at_u, at_y = locus_at_u(loop), locus_at_y(loop)
+    return LoopMargins(
+        mode,
+        _channels(loop, at_u, True),
+        _channels(loop, at_y, False),
+        disk_margin(at_u),
+        disk_margin(at_y),
+        overall_delay(loop),
+        longest(loop.T_s),
+    )
+
+
+def _channels(loop: SampledLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargins, ...]:
+    names = U_NAMES if at_u else Y_NAMES
+    omega, H = locus.sampled()
+    found = []
+    for k, channel in enumerate(locus.channels):
+        classical = gain_phase(locus, omega, H, k)
+        delay = (delay_at_u if at_u else delay_at_y)(loop, channel)
+        confirmed = _confirmed(loop, channel, at_u, classical)
+        found.append(ChannelMargins(names[channel], classical, delay, confirmed))
+    return tuple(found)
+
+
+def _confirmed(loop: SampledLoop, channel: int, at_u: bool, m: GainPhase) -> bool:
+    """Close the loop a little inside and outside of every margin and look at its eigenvalues."""
+
+    def held(factor: complex) -> bool:
+        by = np.ones(NU if at_u else NY, complex)
+        by[channel] = factor
+        changed = loop.factored(u=by) if at_u else loop.factored(y=by)
+        return abs(outermost(changed)) < 1.0
+
+    good = True
+    for gain in (m.gain_low, m.gain_high):
+        if 0.0 < gain < np.inf:
+            good &= held(gain**_INSIDE) and not held(gain**_OUTSIDE)
+    if m.phase_deg < np.inf:
+        # at the crossing's negative frequency the same mode turns the other way: try both
+        turns = [
+            [held(np.exp(sign * share * 1j * np.radians(m.phase_deg))) for sign in (1, -1)]
+            for share in (_INSIDE, _OUTSIDE)
+        ]
+        good &= all(turns[0]) and not all(turns[1])
+    return bool(good)

@@ -1,0 +1,90 @@
+"""H = (S - T)/2 on the unit circle, where every margin of a loop can be read off.
+
+S is the sensitivity of the closed loop at u or at y, T = I - S. For one loop, with all others
+closed, L = (1/2 - H)/(1/2 + H): the gain of L is 1 where Re H = 0, its phase 0 or 180 degrees
+where Im H = 0, and the disk margin (skew 0) is 1/max |H|. The frequencies are refined until the
+locus between two of them is straight to a per cent, from a grid that follows the closed loop's
+poles up to the Nyquist frequency.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.model.sampled import SampledLoop
+
+Matrix = NDArray[np.float64]
+Response = NDArray[np.complex128]
+
+_ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
+_LOWEST = 1e-3  # rad/s; below it a loop is what it is at rest, unless a pole is there
+_STRAIGHT = 0.01
+_ROUNDS = 12
+_GONE = 1e-9  # |z| of an emptied delay line, which shapes nothing
+
+
+@dataclass(frozen=True)
+class Locus:
+    """H of the channels of one cut as a stable discrete state space.
+
+    Shapes: A (n,n), B (n,m), C (m,n); H = C (zI - A)^-1 B + I/2. ``channels`` are their indices
+    in u or y; those that the loop does not use are left out.
+    """
+
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    T_s: float
+    channels: tuple[int, ...]
+
+    def __call__(self, omega: Matrix) -> Response:
+        """H at omega [rad/s], shape (len(omega), m, m)."""
+        z = np.exp(1j * omega * self.T_s)
+        eye = np.eye(len(self.A))
+        states = np.linalg.solve(z[:, None, None] * eye - self.A, self.B.astype(complex))
+        return np.asarray(self.C @ states + 0.5 * np.eye(len(self.channels)), complex)
+
+    def sampled(self) -> tuple[Matrix, Response]:
+        """(omega, H(omega)) from 0 to the Nyquist frequency, as fine as the locus needs."""
+        top = np.pi / self.T_s
+        poles = np.linalg.eigvals(self.A)
+        s = np.log(poles[np.abs(poles) > _GONE].astype(complex)) / self.T_s
+        near = np.abs(s.imag[:, None] + _ACROSS * s.real[:, None]).ravel()
+        base = np.geomspace(_LOWEST, top, 200)
+        omega = np.unique(np.concatenate([[0.0, top], base, near[near < top]]))
+        H = self(omega)
+        for _ in range(_ROUNDS):
+            # halves by ratio, as poles lie; the first interval begins at 0
+            middle = np.sqrt(omega[1:] * omega[:-1])
+            middle[0] = 0.5 * omega[1]
+            found = self(middle)
+            bend = np.abs(found - 0.5 * (H[1:] + H[:-1])).max(axis=(1, 2))
+            bent = bend > _STRAIGHT * np.maximum(np.abs(found).max(axis=(1, 2)), 0.5)
+            if not bent.any():
+                break
+            omega = np.concatenate([omega, middle[bent]])
+            order = np.argsort(omega)
+            omega, H = omega[order], np.concatenate([H, found[bent]])[order]
+        return omega, H
+
+
+def locus_at_u(loop: SampledLoop) -> Locus:
+    """H at u: all loops are cut at the commands, before their delay."""
+    p, c = loop.with_delay(), loop.law
+    B = np.vstack([p.B, np.zeros((len(c.A), p.B.shape[1]))])
+    return _locus(loop, B, np.hstack([c.D @ p.C, c.C]), loop.commands)
+
+
+def locus_at_y(loop: SampledLoop) -> Locus:
+    """H at y: all loops are cut at the measurements."""
+    p, c = loop.with_delay(), loop.law
+    C = np.hstack([p.C, np.zeros((p.C.shape[0], len(c.A)))])
+    return _locus(loop, np.vstack([p.B @ c.D, c.B]), C, loop.measurements)
+
+
+def _locus(loop: SampledLoop, B: Matrix, C: Matrix, channels: tuple[int, ...]) -> Locus:
+    k = list(channels)
+    return Locus(loop.closed(), B[:, k], C[k], loop.T_s, channels)

@@ -1,0 +1,147 @@
+"""How far one element of the circuit, or the grid, may be from what it is until a mode is lost.
+
+Each element alone, the operating point solved anew. A place without an operating point counts as
+lost too: the converter cannot be there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.margins.delays import first_loss
+from gfm_design.model.case import Case
+from gfm_design.model.linear import Mode
+from gfm_design.model.sampled import outermost
+from gfm_plant import NoEquilibrium
+from gfm_plant.parameters import ELEMENTS, Element
+
+FLOOR, CEILING = 0.01, 100.0  # of the factor
+_POINTS = 45  # from 1 to an end: a step of a tenth
+_BEYOND = 1e-4  # relative; where the mode that is lost is looked at
+
+
+@dataclass(frozen=True)
+class End:
+    """One end of a range.
+
+    Attributes:
+        factor: over the present value; the floor or the ceiling if it holds up to there.
+        lost: the mode that is lost beyond; None at the floor or ceiling, or if what is lost is
+            the operating point.
+        bounded: it was lost, before the floor or ceiling.
+    """
+
+    factor: float
+    lost: Mode | None
+    bounded: bool
+
+
+@dataclass(frozen=True)
+class Range:
+    """From ``low`` to ``high`` the loop holds."""
+
+    low: End
+    high: End
+
+
+@dataclass(frozen=True)
+class GridStrength:
+    """The strongest and the weakest grid at constant X/R; SCR = 1/|Z_g| p.u."""
+
+    range: Range
+    now: float
+    x_over_r: float
+
+    @property
+    def strongest(self) -> float:
+        """SCR of the strongest stable grid."""
+        return self.now / self.range.low.factor
+
+    @property
+    def weakest(self) -> float:
+        """SCR of the weakest stable grid."""
+        return self.now / self.range.high.factor
+
+
+def element_ranges(case: Case) -> dict[Element, Range | None]:
+    """The range of every element; None for one whose value is 0 and has no percentage."""
+    return {
+        name: element_range(case, (name,)) if case.factor(name) > 0.0 else None for name in ELEMENTS
+    }
+
+
+def element_range(case: Case, names: Sequence[Element]) -> Range:
+    """The range of one element, or of several together, each over its value in the case."""
+    now = {name: case.factor(name) for name in names}
+    return _range(case, lambda f: {name: v * f for name, v in now.items()})
+
+
+def grid_strength(case: Case) -> GridStrength:
+    """L_g and R_g together."""
+    L_g, R_g = case.factor("L_g"), case.factor("R_g")
+    found = _range(case, lambda f: {"L_g": L_g * f, "R_g": R_g * f})
+    Z = case.line(L_g, R_g)
+    return GridStrength(found, 1 / abs(Z), Z.imag / Z.real if Z.real else np.inf)
+
+
+def _range(case: Case, at: Callable[[float], Mapping[Element, float]]) -> Range:
+    return Range(_end(case, at, FLOOR), _end(case, at, CEILING))
+
+
+def _end(case: Case, at: Callable[[float], Mapping[Element, float]], last: float) -> End:
+    scan = np.geomspace(1.0, last, _POINTS)
+    held = first_loss(lambda f: radius(case, at(f)), [float(f) for f in scan])
+    if held is None:
+        return End(last, None, False)
+    beyond = held * (1 + _BEYOND if last > 1.0 else 1 - _BEYOND)
+    try:
+        z = outermost(case.loop(at(beyond)).closed())
+    except NoEquilibrium:
+        return End(held, None, True)
+    return End(held, mode_of(z, case.law.T_s), True)
+
+
+def radius(case: Case, factors: Mapping[Element, float]) -> float:
+    """Spectral radius at these factors; inf without an operating point."""
+    try:
+        return abs(outermost(case.loop(factors).closed()))
+    except NoEquilibrium:
+        return float(np.inf)
+
+
+def mode_of(z: complex, T_s: float) -> Mode:
+    """The mode of one eigenvalue of the sampled loop."""
+    s = np.log(complex(z)) / T_s
+    return Mode(float(s.real), float(abs(s.imag) / (2 * np.pi)))
+
+
+Matrix = NDArray[np.float64]
+
+POINTS = 40
+
+
+@dataclass(frozen=True)
+class Region:
+    """sigma[i, j] in 1/s at R_g[i] and L_g[j], factors of nominal; NaN: no operating point."""
+
+    L_g: Matrix
+    R_g: Matrix
+    sigma: Matrix
+
+
+def stable_region(
+    case: Case, points: int = POINTS, progress: Callable[[int], None] = lambda done: None
+) -> Region:
+    """Map the region, ``points`` each way, evenly by ratio; ``progress`` is told the rows done."""
+    factors = np.geomspace(FLOOR, CEILING, points)
+    sigma = np.empty((points, points))
+    for i, R_g in enumerate(factors):
+        for j, L_g in enumerate(factors):
+            found = radius(case, {"L_g": float(L_g), "R_g": float(R_g)})
+            sigma[i, j] = np.log(found) / case.law.T_s if np.isfinite(found) else np.nan
+        progress(i + 1)
+    return Region(factors, factors, sigma)

@@ -1,0 +1,1 @@
+"""The model: operating point, linear and sampled loop, many loops at once."""

@@ -1,0 +1,213 @@
+"""A law file's state space for many sets of gains at once.
+
+``gfm_runtime.realisation`` builds one law with all checks, in some milliseconds; a search asks for
+thousands. Here the same elements are multiplied out for a whole population in one pass: every
+coefficient is a column of N numbers. Which factors are shared and which cancel is read off row 0,
+a set of gains at which no two factors agree by chance.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_runtime.elements import INTEGRATOR, K_MAX, T_MAX, T_MIN, Element
+from gfm_runtime.expressions import evaluate_each
+from gfm_runtime.lawfile import ElementSpec, LawFile
+from gfm_runtime.realisation import LawStateSpace
+from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
+
+Matrix = NDArray[np.float64]
+Columns = Mapping[str, Matrix]  # parameters by name, shape (N,) each
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """An element N times: num (N, degree + 1) over the product of den, (N, 2 or 3) each."""
+
+    num: Matrix
+    den: tuple[Matrix, ...] = ()
+
+    def __mul__(self, other: _Rows) -> _Rows:
+        return _Rows(_product(self.num, other.num), self.den + other.den).reduced()
+
+    def reduced(self) -> _Rows:
+        """Without the factors that cancel in row 0."""
+        kept = Counter(Element.of(self.num[0], [_key(f) for f in self.den]).den)
+        num, den = self.num, []
+        for factor in self.den:
+            if kept[_key(factor)] > 0:
+                kept[_key(factor)] -= 1
+                den.append(factor)
+            else:
+                num = _quotient(num, factor)
+        return _Rows(num, tuple(den))
+
+    def over(self, den: tuple[Matrix, ...]) -> Matrix:
+        """Numerator over the larger denominator ``den``."""
+        own, num = Counter(map(_key, self.den)), self.num
+        for factor in den:
+            if own[_key(factor)] > 0:
+                own[_key(factor)] -= 1
+            else:
+                num = _product(num, factor)
+        return num
+
+
+def _key(factor: Matrix) -> tuple[float, ...]:
+    return tuple(factor[0].tolist())
+
+
+def _product(a: Matrix, b: Matrix) -> Matrix:
+    out = np.zeros((len(a), a.shape[1] + b.shape[1] - 1))
+    for k in range(b.shape[1]):
+        out[:, k : k + a.shape[1]] += a * b[:, [k]]
+    return out
+
+
+def _quotient(a: Matrix, factor: Matrix) -> Matrix:
+    """a over a factor that divides it."""
+    rest, order = a.copy(), factor.shape[1] - 1
+    out = np.zeros((len(a), a.shape[1] - order))
+    for k in reversed(range(out.shape[1])):
+        out[:, k] = rest[:, k + order] / factor[:, -1]
+        rest[:, k : k + order + 1] -= out[:, [k]] * factor
+    return out
+
+
+class _Builder:
+    """Elements from their specifications; ``usable`` says which rows keep the elements' bounds."""
+
+    def __init__(self, numbers: Columns, count: int) -> None:
+        self._numbers, self._count = numbers, count
+        self.usable = np.ones(count, dtype=bool)
+
+    def column(self, where: str, value: float | str) -> Matrix:
+        """A number or expression, shape (N,)."""
+        return np.broadcast_to(evaluate_each(where, value, self._numbers), (self._count,))
+
+    def cell(self, where: str, specs: list[ElementSpec]) -> _Rows:
+        """The product of a cell's factors."""
+        product = _Rows(np.ones((self._count, 1)))
+        for spec in specs:
+            product = product * self._element(where, spec)
+            if spec.T_f is not None:
+                lag = self.column(f"{where}.T_f", spec.T_f)
+                self.usable &= (lag >= T_MIN) & (lag <= T_MAX)
+                product = product * _Rows(self._stack(1.0), (self._stack(1.0, lag),))
+        return product
+
+    def _element(self, where: str, spec: ElementSpec) -> _Rows:
+        given = spec.model_dump(exclude={"type", "T_f"}, exclude_none=True)
+        n = {name: self.column(f"{where}.{name}", value) for name, value in given.items()}
+        for name in {"k", "k_i"} & set(n):
+            self.usable &= np.abs(n[name]) <= K_MAX
+        k, T = n.get("k", np.zeros(self._count)), n.get("T", np.ones(self._count))
+        self.usable &= (T >= T_MIN) & (T <= T_MAX)
+        integrator = (self._stack(*INTEGRATOR),)
+        match spec.type:
+            case "P":
+                return _Rows(self._stack(k))
+            case "I" | "PI" if "k_i" in n:
+                return _Rows(self._stack(n["k_i"], k), integrator).reduced()
+            case "I":
+                return _Rows(self._stack(1.0 / T), integrator)
+            case "PI":
+                return _Rows(self._stack(k / T, k), integrator)
+            case "D":
+                return _Rows(self._stack(0.0, T))
+            case "PD":
+                return _Rows(self._stack(k, k * T))
+            case "IF":
+                return _Rows(self._stack(k), (self._stack(1.0, T),))
+            case _:  # "O"
+                self.usable &= n["xi"] > 0.0
+                return _Rows(self._stack(k), (self._stack(1.0, 2.0 * T * n["xi"], T * T),))
+
+    def _stack(self, *coefficients: Matrix | float) -> Matrix:
+        return np.stack([np.broadcast_to(c, (self._count,)) for c in coefficients], axis=1)
+
+
+@np.errstate(all="ignore")  # what comes of it is no usable row
+def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
+    """The law at N sets of parameters: as ``realise``, every matrix with a leading axis of N.
+
+    Rows whose numbers make no law are nan. Row 0 must be a law, and one at which factors that are
+    not the same differ.
+    """
+    count = max(len(c) for c in numbers.values())
+    builder = _Builder(numbers, count)
+    rows = [_row(file, i, builder) for i in range(NU)]
+    of_row = tuple(i for i, row in enumerate(rows) for _ in range(row[0].shape[1]))
+    n = len(of_row)
+    A, C = np.zeros((count, n, n)), np.zeros((count, NU, n))
+    B_r, B_y = np.zeros((count, n, NY)), np.zeros((count, n, NY))
+    D_r, D_y = np.zeros((count, NU, NY)), np.zeros((count, NU, NY))
+    at = 0
+    for i, (a, b_r, b_y, d_r, d_y) in enumerate(rows):
+        k = slice(at, at + a.shape[1])
+        A[:, k, k], B_r[:, k], B_y[:, k], D_r[:, i], D_y[:, i] = a, b_r, b_y, d_r, d_y
+        C[:, i, at : at + min(1, a.shape[1])] = 1.0
+        at += a.shape[1]
+    A[~builder.usable], D_y[~builder.usable] = np.nan, np.nan
+    u_0, D_u0 = np.zeros(NU), np.zeros((NU, NY))
+    for i, name in enumerate(U_NAMES):
+        value = getattr(file.u_0, name)
+        if value in REF_NAMES:
+            D_u0[i, REF_NAMES.index(value)] = 1.0
+        else:
+            u_0[i] = value
+    return LawStateSpace(A, B_r, B_y, C, D_r, D_y, D_u0, u_0, of_row)
+
+
+def _row(file: LawFile, i: int, builder: _Builder) -> tuple[Matrix, ...]:
+    """Observer form of row i: A (N,m,m), B_r, B_y (N,m,5), D_r, D_y (N,5)."""
+    cells = {
+        (matrix, key): builder.cell(f"{matrix}_{key}", specs)
+        for matrix, of in (("phi", file.phi), ("psi", file.psi))
+        for key, specs in of.items()
+        if key[0] == str(i + 1)
+    }
+    most: Counter[tuple[float, ...]] = Counter()
+    for cell in cells.values():
+        most |= Counter(map(_key, cell.den))
+    known = {_key(f): f for cell in cells.values() for f in cell.den}
+    den = tuple(known[key] for key in sorted(most.elements()))
+    d = np.ones((len(builder.usable), 1))
+    for factor in den:
+        d = _product(d, factor)
+    lead, d = d[:, [-1]], d / d[:, [-1]]
+    m = d.shape[1] - 1
+    A = np.zeros((len(d), m, m))
+    if m:
+        A[:, :, 0] = -d[:, m - 1 :: -1]
+        A[:, : m - 1, 1:] = np.eye(m - 1)
+    B_r, B_y = np.zeros((len(d), m, NY)), np.zeros((len(d), m, NY))
+    D_r, D_y = np.zeros((len(d), NY)), np.zeros((len(d), NY))
+    for (matrix, key), cell in cells.items():
+        j = int(key[1]) - 1
+        num = cell.over(den)[:, : m + 1] / lead
+        b = np.pad(num, ((0, 0), (0, m + 1 - num.shape[1])))
+        through = b[:, m]
+        column = (b[:, :m] - through[:, None] * d[:, :m])[:, ::-1]
+        B_y[:, :, j] -= column
+        D_y[:, j] -= through
+        if matrix == "phi":
+            B_r[:, :, j] += column
+            D_r[:, j] += through
+    T = _scale(d)[:, None] ** np.arange(m)
+    return A * T[:, None, :] / T[:, :, None], B_r / T[..., None], B_y / T[..., None], D_r, D_y
+
+
+def _scale(d: Matrix) -> Matrix:
+    """A typical frequency of monic polynomials: geometric mean of their non-zero roots.
+
+    Not rounded to powers of two as ``realise`` does: the matrices are to be smooth in the gains.
+    """
+    zeros = int(np.argmax(d[0] != 0.0))
+    order = d.shape[1] - 1 - zeros
+    return np.abs(d[:, zeros]) ** (1.0 / order) if order else np.ones(len(d))

@@ -1,0 +1,122 @@
+"""The operating point of a converter under a law: where both rest, found from their own equations.
+
+Unknowns are the plant's states, the DC current, E_u and the law's states; omega_u is the grid's.
+The equations are the plant's Eq. (1)-(8) (``gfm_plant.model.f``, not a copy of it), the law's
+x = A x + B (r, y) and u = u_0 + C x + D (r, y) at its sampling time, with what the sensors make
+of y. A DC source that regulates itself holds v_dc = 1 and row 1 of the law is not in force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_plant import NoEquilibrium, plant_equilibrium
+from gfm_plant.model import DELTA, N_X, V_DC, f, g
+from gfm_plant.records import PlantRecord
+from gfm_runtime.error_maps import ERROR_MAPS, map_errors
+from gfm_runtime.tustin import DiscreteLaw
+
+Vector = NDArray[np.float64]
+
+_ROUNDS = 40
+_NUDGE = 1e-7  # central differences; the error map is compiled for real numbers only
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Where plant and law rest together, all in p.u.
+
+    Attributes:
+        x: the plant's state, shape (8,), order as in ``gfm_plant.model``.
+        u: the inputs, shape (3,); i_u is the current that flows, whoever commands it.
+        y: the outputs as the sensors report them, shape (5,).
+        x_law: the law's state, shape (n,).
+    """
+
+    x: Vector
+    u: Vector
+    y: Vector
+    x_law: Vector
+
+
+def operating_point(
+    par: PlantRecord,
+    law: DiscreteLaw,
+    ref: Vector,
+    omega_g: float = 1.0,
+    V_g: float = 1.0,
+) -> OperatingPoint:
+    """Solve for the operating point by Newton's method.
+
+    Args:
+        par: the plant's parameters, from ``gfm_plant.make_plant``.
+        law: the law at its sampling time.
+        ref: references (V_dcref, P_ref, omega_g, Q_ref, V_ref), shape (5,), p.u.
+        omega_g, V_g: the grid, p.u.
+
+    Raises:
+        NoEquilibrium: the law has no rest state there (a frequency that its droop cannot reach
+            within the line's capacity, or no steady state at all).
+    """
+    controlled = par[0]["i_u_gain"] != 0.0
+    # row 1's states are left out of a plant whose DC source ignores it
+    kept = np.array([i for i, row in enumerate(law.rows) if controlled or row != 0], dtype=int)
+    start_x, start_u = plant_equilibrium(par, ref[1], ref[4], V_g, omega_g)
+    z = np.concatenate([start_x, [start_u[0], start_u[2]], np.zeros(len(kept))])
+    d = np.array([omega_g, V_g])
+
+    def residual(z: Vector) -> Vector:
+        x, u, y, x_law = _unpack(z, par, law, omega_g, kept)
+        u_law, x_next = _law(law, x_law, ref, y)
+        dx = f(x, u, d, par)
+        dc = u_law[0] - u[0] if controlled else x[V_DC] - 1.0
+        ac = np.delete(dx, DELTA)  # delta rests by omega_u = omega_g
+        rest = (x_next - x_law)[kept] / law.T_s
+        return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], rest])
+
+    for _ in range(_ROUNDS):
+        now = residual(z)
+        jacobian = np.empty((len(z), len(z)))
+        for j in range(len(z)):
+            nudge = np.zeros(len(z))
+            nudge[j] = _NUDGE
+            jacobian[:, j] = (residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE)
+        step = np.linalg.lstsq(jacobian, now, rcond=1e-12)[0]
+        largest = np.abs(step).max()
+        z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
+        if not np.isfinite(z).all():
+            break
+        if largest < 1e-10:
+            if np.abs(residual(z)).max() > 1e-5:
+                break
+            x, u, y, x_law = _unpack(z, par, law, omega_g, kept)
+            return OperatingPoint(x, u, y, x_law)
+    raise NoEquilibrium(
+        f"{law.law.name} has no steady state at P_ref = {ref[1]:g} p.u., V_ref = {ref[4]:g} p.u., "
+        f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."
+    )
+
+
+def _unpack(
+    z: Vector, par: PlantRecord, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
+) -> tuple[Vector, Vector, Vector, Vector]:
+    x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
+    y = g(x, u)
+    measured = np.array([0, 1, 3, 4])  # omega_u passes the sensors untouched
+    y[measured] = par[0]["gain"] * y[measured] + par[0]["offset"]
+    x_law = np.zeros(law.order)
+    x_law[kept] = z[N_X + 2 :]
+    return x, u, y, x_law
+
+
+def _law(law: DiscreteLaw, x: Vector, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
+    """u (3,) of the law and its next state at held inputs; column 3 sees the plant's omega_u."""
+    r, measured = ref.copy(), y.copy()
+    impedance = np.zeros(2)
+    impedance[: len(law.law.error_parameters)] = law.law.error_parameters
+    map_errors(ERROR_MAPS[law.law.error_map], impedance, r, measured)
+    u = law.u_0 + law.D_u0 @ ref + law.C @ x + law.D_r @ r + law.D_y @ measured
+    return u, law.A @ x + law.B_r @ r + law.B_y @ measured

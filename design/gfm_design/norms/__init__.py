@@ -1,0 +1,1 @@
+"""The H-infinity norm and the weighted channels of the performance problem."""

@@ -1,0 +1,1 @@
+"""The synthesis: free gains, searches, the box that deployable gains must hold."""

@@ -1,0 +1,122 @@
+"""Gains that hold in the box: tune on a few of its points, add those that break, and repeat.
+
+The box has a thousand corners, most of which never bind. A round searches with the corners found
+so far; then all of them are looked at, and the worst that are broken join.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.model.box import Box, Point, Source
+from gfm_design.tuning.gains import FreeGain
+from gfm_design.tuning.robust import Loops, RobustProblem, Wanted, paper_problem
+from gfm_design.tuning.synthesis import tune
+from gfm_runtime.lawfile import LawFile
+
+Vector = NDArray[np.float64]
+
+_JOIN, _JOIN_STEPS = 12, 5  # broken corners that join after a round
+_TOLERANCE = 1e-3
+LATE = (7.0, 9.0, 11.0)  # samples: the delays at which the nominal loop must hold as well
+
+
+@dataclass(frozen=True)
+class Round:
+    """What the search stands at after a round: gains, gamma, and the worst over the whole box.
+
+    ``slow`` [1/s] and ``beyond`` (a part of the step) are by how much sigma and the overshoot
+    break what is wanted, at worst; negative if all hold.
+    """
+
+    values: Vector
+    gamma: float
+    sigma: float
+    overshoot: float
+    slow: float
+    beyond: float
+    points: int
+    seconds: float
+
+
+def steps(box: Box) -> list[Point]:
+    """Where the step of P_ref is looked at: from 0.5 p.u., at the least and largest delay."""
+    return replace(box, P_ref=(0.5,), delay=(min(box.delay), max(box.delay))).corners()
+
+
+def deploy(
+    file: LawFile,
+    gains: Sequence[FreeGain],
+    box: Box,
+    wanted: Wanted,
+    seed: int = 0,
+    rounds: int = 6,
+    evaluations: int = 3000,
+    starts: int = 2,
+    tell: Callable[[Round], None] = lambda found: None,
+) -> Round:
+    """The last round's gains; the same for a seed.
+
+    Args:
+        file, gains: the law, with starts that make the paper's own loop stable.
+        box: what to hold in.
+        wanted: the constraints.
+        seed: of the search.
+        rounds, evaluations, starts: how often, and as for ``tune`` each time.
+        tell: told of every round.
+    """
+    begin = time.perf_counter()
+    corners = box.corners() + [Point(delay=late, dc=dc) for dc in box.dc for late in LATE]
+    stepped = steps(box)
+    extremes = [p for p in corners if _is_extreme(p, box)]
+    points = [*extremes, *corners[len(box.corners()) :]]
+    over = [p for p in stepped if p.R_f == p.R_g and p.R_f >= 1.0 and p.delay == max(box.delay)]
+    over = over or stepped  # a box without such resistances
+    everywhere, every_step = Loops(file, gains, corners), Loops(file, gains, stepped)
+    allowed = np.array([wanted.sigma(p) for p in corners])
+    limits = np.array([wanted.overshoot(p) for p in stepped])
+    for k in range(rounds):
+        # a law for the rig alone is tuned for the paper's problem on the rig
+        source: Source = "controlled" if "controlled" in box.dc else "regulated"
+        paper = paper_problem(file, gains, source)
+        found = tune(
+            RobustProblem(paper, points, over, wanted), gains, seed + k, evaluations, starts
+        )
+        sigma, beyond = everywhere.sigma(found.values), every_step.overshoot(found.values)
+        joining = _worst(corners, sigma - allowed, points, _JOIN)
+        joining_steps = _worst(stepped, beyond - limits, over, _JOIN_STEPS)
+        now = Round(
+            found.values,
+            paper(found.values),
+            float(sigma.max()),
+            float(beyond.max()),
+            float((sigma - allowed).max()),
+            float((beyond - limits).max()),
+            len(points),
+            time.perf_counter() - begin,
+        )
+        tell(now)
+        if not joining and not joining_steps:
+            break
+        points, over = points + joining, over + joining_steps
+        gains = [replace(g, start=float(v)) for g, v in zip(gains, found.values, strict=True)]
+    return now
+
+
+def _worst(all_of: Sequence[Point], broken: Vector, known: list[Point], most: int) -> list[Point]:
+    order = [int(k) for k in np.argsort(-broken) if broken[k] > _TOLERANCE]
+    return [all_of[k] for k in order if all_of[k] not in known][:most]
+
+
+def _is_extreme(point: Point, box: Box) -> bool:
+    """One of the box's outermost corners; P_ref alternates so that half of them do."""
+    ends = {n: (min(getattr(box, n)), max(getattr(box, n))) for n in ("R_f", "R_g", "L_g", "delay")}
+    if any(getattr(point, n) not in ends[n] for n in ends):
+        return False
+    high = sum(getattr(point, n) == ends[n][1] for n in ("R_f", "R_g", "delay"))
+    return point.P_ref == (max(box.P_ref) if high % 2 else min(box.P_ref))

@@ -1,0 +1,231 @@
+"""The free gains of a law, and the law as a function of them.
+
+The paper pulls its gains out of the loop into a static K (Section III-B): the law's matrices are
+then affine in the gains. Whether that holds for a law as its file writes it is tried out once; if
+so, a law for new gains costs a few additions, and if not ``model.batch`` builds it from the
+file, a whole population in one pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.model.batch import realise_each
+from gfm_design.model.linear import LinearLaw, closed_law, error_map_slopes, linearise_law
+from gfm_design.model.operating_point import OperatingPoint
+from gfm_runtime.errors import LawError
+from gfm_runtime.expressions import evaluate, evaluate_each
+from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.realisation import realise
+
+Vector = NDArray[np.float64]
+
+_MATRICES = ("A", "B", "C", "D", "B_r", "D_r")
+_GOLDEN = (5.0**0.5 - 1.0) / 2.0  # its multiples modulo 1 never meet
+_AFFINE = 1e-9  # relative misfit at a point away from the base that still counts as affine
+
+
+@dataclass(frozen=True)
+class FreeGain:
+    """A parameter of a law file that synthesis may choose, within [low, high]."""
+
+    name: str
+    start: float
+    low: float
+    high: float
+
+    @property
+    def by_ratio(self) -> bool:
+        """Searched by its logarithm: a gain that cannot change its sign."""
+        return self.low > 0.0
+
+
+def free_gains(
+    file: LawFile,
+    start: Mapping[str, float] | None = None,
+    only: Sequence[str] | None = None,
+) -> tuple[FreeGain, ...]:
+    """The gains that the file declares free, with other starts or fewer of them if wanted.
+
+    Raises:
+        LawError: an unknown or fixed name, none at all, a start for one that is not wanted or
+            outside its bounds, bounds that are none.
+    """
+    declared = {n: p for n, p in file.parameters.items() if p.free is not None}
+    for name in [*(start or {}), *(only or [])]:
+        if name not in declared:
+            known = sorted(declared)
+            raise LawError(f"gain {name}", f"not free in {file.name}; free are {known}")
+    wanted = [n for n in declared if only is None or n in only]
+    for name in start or {}:
+        if name not in wanted:
+            raise LawError(f"gain {name}", f"has a start but is not among those to move, {wanted}")
+    if not wanted:
+        raise LawError(f"law {file.name}", "declares no free gain (parameters.NAME.free)")
+    gains = []
+    for name in wanted:
+        p = declared[name]
+        assert p.free is not None
+        low, high = p.free
+        if not (np.isfinite(p.free).all() and low < high):
+            raise LawError(
+                f"parameters.{name}.free", f"[{low:g}, {high:g}] must be finite and ascending"
+            )
+        value = (start or {}).get(name, p.value)
+        if not low <= value <= high:
+            raise LawError(f"gain {name}", f"start {value:g} lies outside [{low:g}, {high:g}]")
+        gains.append(FreeGain(name, value, low, high))
+    return tuple(gains)
+
+
+def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
+    """``values`` with every parameter that the file ties to others, e.g. k_35 = k_34 / D_q."""
+    numbers = {n: p.value for n, p in file.parameters.items()} | dict(values)
+    out = dict(values)
+    for name, p in file.parameters.items():
+        if p.tied is not None:
+            out[name] = evaluate(f"parameters.{name}.tied", p.tied, numbers)
+    return out
+
+
+def _generic(gain: FreeGain, k: int) -> float:
+    """The k-th gain a little off its start, by a share of it that no other gain has."""
+    share = 1e-3 * (0.5 + (k + 1) * _GOLDEN % 1.0)
+    step = share * (abs(gain.start) or min(1.0, abs(gain.low), abs(gain.high)))
+    moved = gain.start + step if gain.start + step <= gain.high else gain.start - step
+    return min(max(moved, gain.low), gain.high)
+
+
+def _parts(law: LinearLaw) -> list[Vector]:
+    return [getattr(law, name) for name in _MATRICES]
+
+
+class GainedLaw:
+    """A law around an operating point, as a function of its free gains.
+
+    Args:
+        file: the law file.
+        gains: which of its parameters are free.
+        op, ref, dc_control: as for ``gfm_design.model.linear.linearise_law``.
+    """
+
+    def __init__(
+        self,
+        file: LawFile,
+        gains: Sequence[FreeGain],
+        op: OperatingPoint,
+        ref: Vector,
+        dc_control: bool = True,
+    ) -> None:
+        self.file, self.gains = file, tuple(gains)
+        self._op, self._ref, self._dc_control = op, ref, dc_control
+        self._off_start = np.array([_generic(g, k) for k, g in enumerate(self.gains)])
+        self._affine = self._try_affine()
+
+    @property
+    def is_affine(self) -> bool:
+        """The law's matrices are affine in the gains, as the paper's G and K need."""
+        return self._affine is not None
+
+    def named(self, values: Vector) -> dict[str, float]:
+        """The gains by name, tied parameters included."""
+        free = {g.name: float(v) for g, v in zip(self.gains, values, strict=True)}
+        return tied(self.file, free)
+
+    def __call__(self, values: Vector) -> LinearLaw:
+        """The law at these gains, shape (n,); or the laws at many, shape (N,n), on a leading axis.
+
+        Gains that make no law give matrices of nan.
+        """
+        if self._affine is None:
+            many = self._many(np.atleast_2d(values))
+            return many if np.ndim(values) == 2 else LinearLaw(*(m[0] for m in _parts(many)))
+        base, slopes = self._affine
+        return LinearLaw(
+            *(m + np.tensordot(values, s, 1) for m, s in zip(base, slopes, strict=True))
+        )
+
+    def exact(self, values: Vector) -> LinearLaw:
+        """The law as the runtime builds it, in lowest terms.
+
+        Raises:
+            LawError: the gains make no law.
+        """
+        law = build_law(self.file, self.named(values))
+        return linearise_law(law, realise(law), self._op, self._ref, self._dc_control)
+
+    def _many(self, values: Vector) -> LinearLaw:
+        values = np.vstack([self._off_start, values])  # whose first row tells the structure
+        numbers = {n: np.full(len(values), p.value) for n, p in self.file.parameters.items()}
+        numbers |= {g.name: values[:, k] for k, g in enumerate(self.gains)}
+        for name, p in self.file.parameters.items():
+            if p.tied is not None:
+                numbers[name] = evaluate_each(f"parameters.{name}.tied", p.tied, numbers)
+        law = closed_law(realise_each(self.file, numbers), self._map(numbers), self._dc_control)
+        return LinearLaw(*(m[1:] for m in _parts(law)))
+
+    def _map(self, numbers: Mapping[str, Vector]) -> tuple[Vector, Vector]:
+        """The error map's slopes; stacked, if it depends on free gains."""
+        kind = self.file.error_map
+        given = [v for v in (kind.R, kind.X) if v is not None]
+        shape = next(iter(numbers.values())).shape
+        impedance = [np.broadcast_to(evaluate_each("error_map", v, numbers), shape) for v in given]
+        rows = np.array(impedance).reshape(len(given), *shape).T
+        distinct, where = np.unique(rows, axis=0, return_inverse=True)
+        slopes = [error_map_slopes(kind.type, row, self._op.y, self._ref) for row in distinct]
+        r, y = (np.array(part) for part in zip(*slopes, strict=True))
+        return (r[0], y[0]) if len(distinct) == 1 else (r[where], y[where])
+
+    def _try_affine(self) -> tuple[list[Vector], list[Vector]] | None:
+        at = np.array([g.start for g in self.gains])
+        step = np.array([0.1 * (abs(g.start) or 1.0) for g in self.gains])
+        here = self.exact(at)
+        sides = [self.exact(at + np.eye(len(at))[k] * step[k]) for k in range(len(at))]
+        far = self.exact(at + 0.7 * step)
+        base, slopes = [], []
+        for name in _MATRICES:
+            m = getattr(here, name)
+            if any(getattr(s, name).shape != m.shape for s in [*sides, far]):
+                return None
+            slope = np.array([(getattr(s, name) - m) / h for s, h in zip(sides, step, strict=True)])
+            predicted = m + np.tensordot(0.7 * step, slope, 1)
+            misfit = np.abs(predicted - getattr(far, name)).max(initial=0.0)
+            if misfit > _AFFINE * max(1.0, np.abs(m).max(initial=0.0)):
+                return None
+            base.append(m - np.tensordot(at, slope, 1))
+            slopes.append(slope)
+        return base, slopes
+
+
+_LINEAR = 0.01  # share of the bound up to which the coordinate is about linear
+
+
+class Encoding:
+    """Coordinates of gains, with their bounds.
+
+    Attributes:
+        start, low, high: coordinates of the start and of the bounds.
+    """
+
+    def __init__(self, gains: Sequence[FreeGain]) -> None:
+        self._by_ratio = np.array([g.by_ratio for g in gains])
+        self._bounds = np.array([[g.low for g in gains], [g.high for g in gains]])
+        self._linear = _LINEAR * np.abs(self._bounds).max(axis=0)
+        self.start = self.coordinates(np.array([g.start for g in gains]))
+        self.low, self.high = (self.coordinates(b) for b in self._bounds)
+
+    def values(self, point: Vector) -> Vector:
+        """The gains at coordinates, one row a point or a single one, held within the bounds."""
+        held = np.clip(point, self.low, self.high)
+        ratio = np.exp(np.where(self._by_ratio, held, 0.0))
+        other = self._linear * np.sinh(np.where(self._by_ratio, 0.0, held))
+        return np.clip(np.where(self._by_ratio, ratio, other), *self._bounds)
+
+    def coordinates(self, values: Vector) -> Vector:
+        """The coordinates of gains."""
+        ratio = np.log(np.where(self._by_ratio, values, 1.0))
+        return np.where(self._by_ratio, ratio, np.arcsinh(values / self._linear))

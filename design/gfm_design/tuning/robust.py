@@ -1,0 +1,144 @@
+"""Gains that hold in a whole box of real loops: what they must keep, and the cost of a search.
+
+gamma of the paper's problem is made least under constraints over the box: every mode of every
+sampled loop decays faster than alpha, and p overshoots a step of P_ref by no more than asked. A
+broken constraint costs more than gamma can gain by breaking it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.model.box import T_S, Point, Source
+from gfm_design.model.operating_point import operating_point
+from gfm_design.model.stack import overshoot, stacks, tustin
+from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
+from gfm_design.tuning.paper_problem import REFERENCES, PaperProblem
+from gfm_design.tuning.synthesis import UNSTABLE
+from gfm_plant import Plant, make_plant
+from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.tustin import discretise
+
+Vector = NDArray[np.float64]
+
+_BROKEN = 5.0  # cost of a 1/s too little, and of gamma above its ceiling by 1
+_BEYOND = 100.0  # cost of an overshoot by a whole step too much
+_HOPELESS = 20.0  # 1/s; a loop that grows so fast has no step response worth computing
+_SHORT = 3.0  # L_g up to this factor counts as a strong grid
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What every loop of the box must keep.
+
+    Attributes:
+        gamma: no gain in gamma below this is worth a broken constraint.
+        alpha: every mode decays at least so fast, 1/s.
+        strong, weak: overshoot of p as a part of a step of P_ref, up to and beyond L_g x 3.
+        rig_alpha: as alpha, where the DC source regulates itself; None: alpha and the limits of
+            the overshoot hold there too.
+        rig_weight: with a rig_alpha, the cost of the rig's largest overshoot by a whole step.
+    """
+
+    gamma: float = 1.49
+    alpha: float = 1.1
+    strong: float = 0.025
+    weak: float = 0.15
+    rig_alpha: float | None = 0.2
+    rig_weight: float = 3.0
+
+    def sigma(self, point: Point) -> float:
+        """Largest sigma allowed at a point, 1/s."""
+        return -self.alpha if self.rig_alpha is None or not _is_rig(point) else -self.rig_alpha
+
+    def overshoot(self, point: Point) -> float:
+        """Largest overshoot allowed at a point; inf where it is weighed instead."""
+        if self.rig_alpha is not None and _is_rig(point):
+            return np.inf
+        return self.strong if point.L_g <= _SHORT else self.weak
+
+
+def _is_rig(point: Point) -> bool:
+    return point.dc == "regulated"
+
+
+class Loops:
+    """The sampled loops of some points as functions of a law's free gains."""
+
+    def __init__(self, file: LawFile, gains: Sequence[FreeGain], points: Sequence[Point]) -> None:
+        self.points = list(points)
+        law = discretise(build_law(file, {g.name: g.start for g in gains}), T_S)
+        ref = np.asarray(REFERENCES)
+        op = operating_point(make_plant(Plant(), T_S)[0], law, ref)
+        self._laws = [GainedLaw(file, gains, op, ref, dc) for dc in (False, True)]
+        self._stacks = list(stacks(self.points, law))
+
+    def sigma(self, values: Vector) -> Vector:
+        """Largest real part of any mode at each point, 1/s."""
+        laws = [tustin(law(values)) for law in self._laws]
+        out = np.empty(len(self.points))
+        for stack in self._stacks:
+            z = np.linalg.eigvals(stack.loops(laws[stack.controlled])[0])
+            out[stack.members] = np.log(np.abs(z).max(axis=1)) / T_S
+        return out
+
+    def overshoot(self, values: Vector) -> Vector:
+        """How far p goes beyond a step of P_ref, as a part of the step; inf if it grows."""
+        laws = [tustin(law(values)) for law in self._laws]
+        out = np.empty(len(self.points))
+        for stack in self._stacks:
+            out[stack.members] = overshoot(stack, *stack.loops(laws[stack.controlled]))
+        return out
+
+
+def paper_problem(file: LawFile, gains: Sequence[FreeGain], dc: Source) -> PaperProblem:
+    """The paper's problem with a DC source: with the rig's own, row 1 of the law is not in it."""
+    plant = Plant.model_validate({"dc_source": {"mode": dc}})
+    return PaperProblem(file, tuple(gains), plant)
+
+
+class RobustProblem:
+    """The cost of a law's gains over some points of the box; a problem for ``synthesis.tune``.
+
+    Args:
+        paper: gamma.
+        points: where the modes are looked at.
+        steps: where the step of P_ref is looked at.
+        wanted: the constraints.
+    """
+
+    def __init__(
+        self, paper: PaperProblem, points: Sequence[Point], steps: Sequence[Point], wanted: Wanted
+    ) -> None:
+        self._paper, self._wanted = paper, wanted
+        self._loops = Loops(paper.file, paper.gains, points)
+        self._steps = Loops(paper.file, paper.gains, steps)
+        self._sigma = np.array([wanted.sigma(p) for p in points])
+        self._overshoot = np.array([wanted.overshoot(p) for p in steps])
+
+    def __call__(self, values: Vector) -> float:
+        """gamma, and what the broken constraints cost."""
+        gamma = self._paper(values)
+        if gamma >= UNSTABLE:
+            return gamma
+        slow = np.maximum(self._loops.sigma(values) - self._sigma, 0.0)
+        cost = gamma + _BROKEN * (max(gamma - self._wanted.gamma, 0.0) + slow.max() + slow.mean())
+        beyond = np.ones(len(self._overshoot))
+        if slow.max() < _HOPELESS:
+            beyond = np.minimum(self._steps.overshoot(values), 1.0)
+        rig = np.isinf(self._overshoot)
+        over = np.maximum(beyond - self._overshoot, 0.0)
+        cost += _BEYOND * (over.max() + over.mean())
+        return float(cost + self._wanted.rig_weight * beyond[rig].max(initial=0.0))
+
+    def many(self, values: Vector) -> Vector:
+        """Costs of several, one a row."""
+        return np.array([self(v) for v in values])
+
+    def polish(self, code: Encoding, point: Vector) -> Vector:
+        """The point itself: the constraints have kinks that no gradient follows."""
+        return point

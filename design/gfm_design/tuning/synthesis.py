@@ -1,0 +1,178 @@
+"""Fixed-structure H-infinity synthesis: the free gains that make gamma least.
+
+The problem is neither smooth nor convex: the peak jumps between channels and resonances, and the
+stable set has a hard edge. CMA-ES (N. Hansen, "The CMA evolution strategy", 2016) ranks points and
+asks for no gradient, so both are no trouble to it; it is what did best among the optimisers tried.
+What it comes to is handed to a polish, if there is one, which follows the active peaks.
+
+With a polish that finds its way from afar, many short runs of CMA-ES find lower minima than a few
+long ones in the same time (``tune_paper``); without one, it is the long runs that count (``tune``).
+
+An unstable point costs more than any stable one, by its spectral abscissa: the search first
+stabilises, then improves.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.tuning.gains import Encoding, FreeGain
+
+Vector = NDArray[np.float64]
+
+UNSTABLE = 1e6  # what an unusable point costs at least
+_STEP = 0.5  # CMA-ES's first step, in the coordinates of ``Encoding``
+_POPULATION = 32
+_SAMPLES = 400  # random points, of which the best is the start of a further run
+_HOPELESS = 6  # runs without a usable point after which no more are begun
+_STABILISE = 4000  # costs that a run may ask for, whatever its budget, before one is usable
+
+
+class Problem(Protocol):
+    """What is to be made least."""
+
+    def __call__(self, values: Vector) -> float:
+        """Cost of one set of gains, finite; ``UNSTABLE`` and more if they are of no use."""
+
+    def many(self, values: Vector) -> Vector:
+        """Costs of several, one a row."""
+
+    def polish(self, code: Encoding, point: Vector) -> Vector:
+        """A better point nearby, in the search's coordinates; may be the point itself."""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What a search found.
+
+    Attributes:
+        values: the free gains, in the order given.
+        cost: what the search's own cost says of them.
+        evaluations, seconds: what it took.
+        seed: what makes it repeatable.
+    """
+
+    values: Vector
+    cost: float
+    evaluations: int
+    seconds: float
+    seed: int
+
+
+class NotStabilised(ArithmeticError):
+    """No usable gains were found. ``values`` are the best ones tried."""
+
+    def __init__(self, values: Vector, evaluations: int, cost: float) -> None:
+        self.values = values
+        super().__init__(
+            f"no stabilising gains within the bounds after {evaluations} tries; "
+            f"the best still grow by {cost % UNSTABLE:.3g} 1/s"
+        )
+
+
+def unstable_cost(abscissa: Vector) -> Vector:
+    """Cost of points whose largest growth is ``abscissa`` [1/s] >= 0."""
+    # growth in the digits below UNSTABLE, so that it can be read off a cost
+    return UNSTABLE + np.clip(abscissa, 0.0, 0.99 * UNSTABLE)
+
+
+def tune(
+    problem: Problem,
+    gains: Sequence[FreeGain],
+    seed: int = 0,
+    evaluations: int = 12000,
+    starts: int = 2,
+    progress: Callable[[int, float], None] = lambda done, best: None,
+) -> Tuned:
+    """Search the free gains within their bounds for the least cost; the same for a seed.
+
+    Args:
+        problem: the cost.
+        gains: with starts and bounds.
+        seed: of the search.
+        evaluations: how many costs each start may ask for once one of them is usable.
+        starts: searches; the first from the gains' own start, the others from the best of some
+            random points within the bounds.
+        progress: told the evaluations done and the best cost so far.
+
+    Raises:
+        NotStabilised: not one point with a cost below ``UNSTABLE``.
+        ModuleNotFoundError: the package cma is missing (extra ``design``).
+    """
+    begin, done = time.perf_counter(), 0
+    code = Encoding(gains)
+    random = np.random.default_rng(seed)
+    best, best_cost = code.start, problem(code.values(code.start))
+    for run in range(starts):
+        point = code.start
+        if run > 0:
+            points = random.uniform(code.low, code.high, (_SAMPLES, len(gains)))
+            point = points[np.argmin(problem.many(code.values(points)))]
+
+        def tell(asked: int, cost: float, told: int = done, so_far: float = best_cost) -> None:
+            progress(told + asked, min(so_far, cost))
+
+        run_seed = int(random.integers(1, 2**31))
+        found, asked = _search(problem, code, point, run_seed, evaluations, tell)
+        done += asked
+        if problem(code.values(found)) < UNSTABLE:
+            found = problem.polish(code, found)
+        cost = problem(code.values(found))
+        if cost < best_cost:
+            best, best_cost = found, cost
+        if run + 1 == _HOPELESS and best_cost >= UNSTABLE:
+            break
+    if best_cost >= UNSTABLE:
+        raise NotStabilised(code.values(best), done, best_cost)
+    last = problem.polish(code, best)
+    if problem(code.values(last)) < best_cost:
+        best, best_cost = last, problem(code.values(last))
+    values = code.values(best)
+    return Tuned(values, best_cost, done, time.perf_counter() - begin, seed)
+
+
+def _search(
+    problem: Problem,
+    code: Encoding,
+    start: Vector,
+    seed: int,
+    evaluations: int,
+    tell: Callable[[int, float], None],
+) -> tuple[Vector, int]:
+    """The best point of one run of CMA-ES, and how many costs it asked for."""
+    try:
+        import cma
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("synthesis needs cma: pip install 'gfmhil[design]'") from None
+    # cma has no one-dimensional form: a coordinate that does nothing makes up the second
+    idle = 1 if len(start) == 1 else 0
+    search = cma.CMAEvolutionStrategy(
+        np.r_[start, np.zeros(idle)],
+        _STEP,
+        {
+            "seed": seed,
+            "verbose": -9,
+            "popsize": _POPULATION,
+            "maxfevals": max(evaluations, _STABILISE),
+            "tolfun": 1e-5,
+            "bounds": [[*code.low, *[-1.0] * idle], [*code.high, *[1.0] * idle]],
+        },
+    )
+    best, best_cost, usable = start, np.inf, 0
+    while not search.stop() and usable < evaluations:
+        asked = search.ask()
+        points = np.array(asked)[:, : len(start)]
+        costs = problem.many(code.values(points))
+        k = int(np.argmin(costs))
+        if costs[k] < best_cost:
+            best, best_cost = points[k], float(costs[k])
+        usable += len(costs) if best_cost < UNSTABLE else 0
+        search.tell(asked, list(costs))
+        tell(int(search.result.evaluations), best_cost)
+    return best, int(search.result.evaluations)

@@ -1,0 +1,1 @@
+"""What every room uses: errors, the two roles, temporary folders, being stopped, BLAS settings."""

@@ -1,0 +1,8 @@
+"""The two roles of a run: the controller and the plant."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Side = Literal["controller", "plant"]
+SIDES: tuple[Side, ...] = ("controller", "plant")

@@ -1,0 +1,47 @@
+"""Which desks there are in a run folder; a killed side leaves its announcement behind."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
+
+SCHEME = "ipc://"
+LARGEST = 65536  # bytes of a command, and of its answer
+
+
+def announcement(folder: Path, side: Side) -> Path:
+    """Where a side's desk says how it is reached."""
+    return folder / f"desk_{side}.json"
+
+
+def announced(folder: Path, side: Side) -> dict[str, Any] | None:
+    """What a side's desk announces, or None if there is none that lives.
+
+    Raises:
+        UserError: it cannot be told whether there is one; that says nothing about the run.
+    """
+    file = announcement(folder, side)
+    try:
+        found = dict(json.loads(file.read_text(encoding="utf-8")))
+        place = Path(str(found["endpoint"]).removeprefix(SCHEME)).parent
+        return found if scratch.held(place) else None
+    except FileNotFoundError:
+        return None
+    except OSError as problem:
+        raise UserError(f"{file}: {problem.strerror}") from None
+    except (ValueError, TypeError, KeyError) as problem:
+        raise UserError(f"{file}: not an announcement of a run: {problem!r}") from None
+
+
+def present(folder: Path) -> list[Side]:
+    """The sides that have a desk that lives.
+
+    Raises:
+        UserError: it cannot be told whether a side has one.
+    """
+    return [side for side in SIDES if announced(folder, side) is not None]

@@ -1,0 +1,183 @@
+"""Where an operator's commands reach a side that is running: a socket of its own, off the loop.
+
+A command is an event of a scenario without its time. It is checked here, in a thread that the
+loop never waits for; a good one is put into the timeline and the loop's bell is rung, so that it
+is carried out between two ticks. The answer names that tick. ``by`` in the command says who gives
+it (see ``Identity``), and the log of the run records that. The socket is a ZeroMQ REP on a Unix
+path in a folder that only this user can read; ``desk_<side>.json`` in the run folder names it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+from pydantic import TypeAdapter, ValidationError
+
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.identity import Identity
+from gfm_hil.core.rate import Rate
+from gfm_hil.core.roles import Side
+from gfm_hil.engine.announcement import LARGEST, SCHEME, announcement
+from gfm_hil.engine.retune import retuned
+from gfm_hil.engine.setup import Bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.scenario.events import (
+    CONTROLLER_EVENTS,
+    Event,
+    Gains,
+    LawChange,
+    Reset,
+    apply_grid_event,
+)
+
+_LOOK_MS = 100
+_TAKEN_OVER_S = 5.0  # in lockstep a tick may take as long as the other side likes
+_ROOM = 16  # commands that wait, of one operator
+_PER_S, _BURST = 100.0, 200  # commands to one side, of all operators together
+
+_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+_UNKNOWN = {"through": "socket"}  # a program that does not say who it is
+_LOG = logging.getLogger(__name__)
+
+
+class Desk:
+    """One side's desk; use as a context manager around the run.
+
+    Args:
+        side, bench, timeline: of the run.
+        folder: the run folder, to announce the socket in.
+        ring: tells the loop that the timeline has something new.
+        stop: ends the run as Ctrl-C would.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        bench: Bench,
+        timeline: Timeline,
+        folder: Path,
+        ring: Callable[[], None],
+        stop: Callable[[], None],
+    ) -> None:
+        self._side, self._bench, self._timeline = side, bench, timeline
+        self._announcement = announcement(folder, side)
+        self._ring, self._stop = ring, stop
+        self._rate = Rate("all operators together", _PER_S, _BURST)
+        self._over = threading.Event()
+
+    def __enter__(self) -> Desk:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.REP)
+        self._socket.set(zmq.MAXMSGSIZE, LARGEST)
+        self._socket.set(zmq.RCVHWM, _ROOM)
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._context.destroy, linger=0)
+            place = stack.enter_context(scratch.temporary("gfmhil-desk-"))
+            endpoint = f"{SCHEME}{place}/{self._side}"
+            try:
+                self._socket.bind(endpoint)
+            except zmq.ZMQError as problem:
+                raise UserError(
+                    f"TMPDIR = {place.parent}: no socket can be made there: {problem}"
+                ) from None
+            self._resources = stack.pop_all()
+        self._thread = threading.Thread(target=self._serve, name=f"{self._side}-desk", daemon=True)
+        self._thread.start()
+        self._endpoint = endpoint
+        self._announce()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._announcement.unlink(missing_ok=True)
+        self._over.set()
+        self._thread.join()
+        self._resources.close()
+
+    def _announce(self) -> None:
+        """Write down where we are to be found, and which laws the recording's indices mean."""
+        c = self._bench.controller
+        content = {"endpoint": self._endpoint, "T_s": c.T_s, "names": list(c.sets)}
+        content["laws"] = [
+            {"label": label, "name": name, "gains": gains}
+            for label, name, gains in zip(c.labels, c.names, c.changed, strict=True)
+        ]
+        new = self._announcement.with_suffix(".new")
+        new.write_text(json.dumps(content), encoding="utf-8")
+        new.replace(self._announcement)
+
+    def _serve(self) -> None:
+        while not self._over.is_set():
+            if self._socket.poll(_LOOK_MS):
+                with contextlib.suppress(zmq.ZMQError):  # a client that is gone again
+                    self._socket.send_json(self._answer(self._socket.recv()))
+
+    def _answer(self, message: bytes) -> dict[str, Any]:
+        try:
+            content = json.loads(message)
+            if not isinstance(content, dict):
+                raise ValueError("a command must be an object")
+            by = Identity.model_validate(content.pop("by", _UNKNOWN))
+            if content == {"type": "stop"}:  # always passes
+                self._timeline.stopped_by = by.plain()
+                self._stop()
+                return {"ok": True}
+            self._rate.take()
+            for key in ("t", "tick"):
+                if key in content:
+                    raise ValueError(f"{key} = {content[key]}: a command is carried out at once")
+            return self._carry_out(self._checked({**content, "tick": 0}), by)
+        except ValidationError as problem:
+            return {"ok": False, "error": "; ".join(lines(problem))}
+        except (UserError, ValueError, RecursionError) as problem:
+            return {"ok": False, "error": str(problem)}
+        except Exception as problem:  # a mistake of ours; the next command must find a desk
+            _LOG.exception("the %s's desk: %r", self._side, message[:200])
+            return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
+
+    def _checked(self, content: Any) -> Any:
+        """The event, with everything tried out that might fail in the loop.
+
+        Raises:
+            ValueError: it is none, not for this side, or cannot be carried out.
+        """
+        event = _EVENT.validate_python(content)
+        ours = "controller" if isinstance(event, CONTROLLER_EVENTS) else "plant"
+        if ours != self._side:
+            raise ValueError(f"type = {event.type!r}: for the {ours}, not the {self._side}")
+        if isinstance(event, LawChange) and event.law not in self._bench.controller.sets:
+            ready = sorted(self._bench.controller.sets)
+            raise ValueError(f"law = {event.law!r}: not made ready for this run; ready are {ready}")
+        c = self._bench.controller
+        if isinstance(event, Gains):
+            gains = {**c.gains, **event.values}
+            retuned(c.asked, tuple(sorted(gains.items())), c.T_s)
+        if isinstance(event, Reset) and self._bench.scenario.after_trip == "end":
+            raise ValueError("reset: this run ends at a trip; after_trip = 'wait' in its scenario")
+        if ours == "plant":
+            par, st = self._bench.par.copy(), self._bench.st.copy()
+            apply_grid_event(event, par, st)
+        return event
+
+    def _carry_out(self, event: Any, by: Identity) -> dict[str, Any]:
+        ticket = self._timeline.insert(event, by.plain())
+        self._ring()
+        until = time.monotonic() + _TAKEN_OVER_S
+        while not ticket.done.wait(_LOOK_MS * 1e-3):
+            over = self._over.is_set()
+            if (over or time.monotonic() >= until) and ticket.claim():
+                late = f"not taken over within {_TAKEN_OVER_S:g} s"
+                return {"ok": False, "error": "the run is over" if over else late}
+        if ticket.error:
+            return {"ok": False, "error": ticket.error}
+        if isinstance(event, Gains):
+            self._announce()
+        return {"ok": True, "tick": ticket.tick, "label": event.label()}

@@ -1,0 +1,190 @@
+"""Driving the compiled loops: call them, and say in Python what they came back for.
+
+Both functions do what ``run_plant`` and ``run_controller`` do for a link without a port, with the
+same rules, words and recording. They are meant for a thread of their own.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.roles import Side
+from gfm_hil.engine.controller_ticks import controller_ticks
+from gfm_hil.engine.loop_records import (
+    BELL,
+    DONE,
+    EVENT,
+    GONE,
+    LATE,
+    LOOK,
+    PEER_SAFE,
+    PEER_STOPPED,
+    RESTORE,
+    SILENT,
+    STOPPED_HERE,
+    TOLD,
+    make_loop,
+)
+from gfm_hil.engine.plant_ticks import plant_ticks
+from gfm_hil.engine.setup import Bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.engine.waiting import part_from
+from gfm_hil.links import Link, Port, port_function
+from gfm_hil.links.frame import FrameReader, FrameWriter
+from gfm_hil.realtime.clock import now_ns, sleep_until
+from gfm_hil.recording.log import CONTROLLER_LEFT, PLANT_LEFT
+from gfm_hil.recording.recorder import Part
+from gfm_hil.scenario.expectation import CONTROLLER_GONE
+from gfm_plant import NO_FRESH_U
+from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
+
+_FAR = 2**62  # as of a timeline without events
+_NAP_NS = 100_000
+
+
+class _Loop:
+    """One side's compiled loop with everything that its calls have in common."""
+
+    def __init__(
+        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, told: NDArray[np.int64]
+    ) -> None:
+        assert link.port is not None
+        scenario, port, self.part = bench.scenario, link.port, part
+        plant = side == "plant"
+        self.bench, self.link = bench, link
+        self.writer = FrameWriter("y" if plant else "u")
+        self.reader = FrameReader.of(side, scenario)
+        self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
+        self.loop["looks"] = port.looks
+        w, r, c = self.writer, self.reader, bench.controller
+        records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
+        self._arguments: tuple[Any, ...] = (
+            port.send, port.receive, port.patient or _rest, port.handle, port.spins,
+            (w.sequence, w.frame, w.message), (r.frame, r.message), r.record, self.loop, told,
+            *records, bench.y, bench.u, part.signals, part.times, part.progress,
+        )  # fmt: skip
+        self._call = plant_ticks if plant else controller_ticks
+
+    def go(self, until: int) -> int:
+        """Run until that tick or until there is something to say.
+
+        Raises:
+            PeerLost: the link is gone.
+        """
+        why = int(self._call(*self._arguments, until))
+        if why == GONE:
+            self.link.receive()  # which knows more
+            raise PeerLost("the link is gone")
+        return why
+
+    @property
+    def tick(self) -> int:
+        """Plant: the next tick; controller: the last one received."""
+        return int(self.loop["tick"][0])
+
+    def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
+        """Tell the other side how this one ends."""
+        tick = max(self.tick, 0)
+        part_from(self.link, self.writer, self.reader, tick, state, reason, values)
+
+
+def drive_plant(
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, told: NDArray[np.int64]
+) -> FrameReader:
+    """Run the plant's side of a scenario after the handshake; returns its frame counters."""
+    loop, ticks = _Loop("plant", bench, link, part, t0_ns, told), bench.scenario.ticks
+    loop.loop["u_last"] = loop.loop["u_before"] = bench.u
+    waits = bench.scenario.after_trip == "wait"
+    while timeline.running:
+        timeline.carry_out(loop.tick)
+        why = loop.go(min(timeline.next_tick(), ticks))
+        tick = loop.tick
+        if why == RESTORE:
+            bench.restore_plant(tick)
+            loop.loop["u_last"] = loop.loop["u_before"] = bench.u
+        timeline.look(max(tick - 1, 0))
+        if tick >= ticks and why in (DONE, LOOK, RESTORE):
+            timeline.finish(tick)
+        elif why == STOPPED_HERE:
+            timeline.end("interrupted", "stopped by the operator", tick)
+        elif why == PEER_SAFE:
+            timeline.end("safe", REASONS[loop.reader.reason], tick)
+        elif why == PEER_STOPPED:
+            timeline.end("interrupted", CONTROLLER_LEFT, tick)
+        elif why == SILENT:
+            timeline.end("safe", CONTROLLER_GONE, tick)
+        elif why == LATE:
+            timeline.end("safe", NO_FRESH_U, tick)
+    assert timeline.outcome is not None
+    status = timeline.outcome.status
+    state = SAFE if status == "tripped" and not waits else STOPPED
+    loop.last_words(state, int(status != "completed" and loop.tick < ticks), bench.y)
+    return loop.reader
+
+
+def drive_controller(
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, told: NDArray[np.int64]
+) -> FrameReader:
+    """Run the controller's side of a scenario after the handshake; returns its frame counters."""
+    loop, ctl = _Loop("controller", bench, link, part, t0_ns, told), bench.controller.ctl
+    why = EVENT
+    loop.loop["heard"] = max(time.monotonic_ns(), t0_ns)
+    while timeline.running:
+        event = timeline.next_tick()
+        if loop.loop["pending"][0]:  # frames were lost on the way to the event
+            timeline.carry_out(loop.tick)
+            event = timeline.next_tick()
+        elif event <= loop.tick + 1 or why == BELL:
+            timeline.carry_out(loop.tick + 1)
+            event = timeline.next_tick()
+        why = loop.go(event)
+        tick = loop.tick
+        if why in (LOOK, EVENT) and not loop.loop["pending"][0]:
+            timeline.look(max(tick, 0))
+        if why == STOPPED_HERE:
+            timeline.end("interrupted", "stopped by the operator", tick)
+            loop.last_words(STOPPED, 0, bench.u)
+        elif why == PEER_SAFE:
+            timeline.end("tripped", REASONS[PLANT_TRIP], tick)
+            loop.last_words(SAFE, PLANT_TRIP, bench.u)
+        elif why == PEER_STOPPED:
+            if loop.reader.reason:
+                timeline.end("interrupted", PLANT_LEFT, tick)
+            else:
+                timeline.finish(tick)
+            loop.last_words(STOPPED, 0, bench.u)
+        elif why == SILENT:
+            timeline.end("safe", REASONS[LOST_PEER], tick)
+            loop.last_words(SAFE, LOST_PEER, bench.u)
+        elif not timeline.running:  # the look has found and written down a safe state
+            loop.last_words(SAFE, int(ctl["reason"][0]), bench.u)
+    return loop.reader
+
+
+def compile_loops(side: Side, bench: Bench, part: Part) -> None:
+    """Compile (or load from cache) a side's loop without running a tick."""
+    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(TOLD, np.int64))
+    loop.go(_FAR if side == "controller" else 0)
+
+
+@port_function
+def _rest(handle, message):
+    """What a loop without deadlines does where the link cannot sleep until a message comes."""
+    sleep_until(now_ns() + _NAP_NS)
+    return 0
+
+
+@port_function
+def _nothing(handle, message):
+    return 0
+
+
+class _Nowhere:
+    """A link to nobody: the loops are the same for all links."""
+
+    port = Port(np.zeros(1, np.int64), _nothing, _nothing, 0)

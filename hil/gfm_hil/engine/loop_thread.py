@@ -1,0 +1,68 @@
+"""A compiled loop in a thread of its own, watched by the main thread, which hears Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.roles import Side
+from gfm_hil.engine.drive import drive_controller, drive_plant
+from gfm_hil.engine.loop_records import STOP
+from gfm_hil.engine.setup import Bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.links import Link
+from gfm_hil.links.frame import FrameReader
+from gfm_hil.realtime.priority import stand_back
+from gfm_hil.recording.recorder import Part
+
+_LOOK_S = 0.05
+
+
+def run_compiled(
+    side: Side,
+    bench: Bench,
+    link: Link,
+    part: Part,
+    timeline: Timeline,
+    t0_ns: int,
+    stopped: Callable[[], bool],
+    told: NDArray[np.int64],
+) -> FrameReader:
+    """Run one side after the handshake, over a link with a port; returns its frame counters.
+
+    The thread inherits processor and priority from the caller, who then steps back to ordinary
+    priority and only looks, a few times a second, whether to stop and what to write down.
+    ``told`` is what other threads tell the loop, see ``gfm_hil.engine.loop_records``.
+    """
+    found: list[FrameReader] = []
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            drive = drive_plant if side == "plant" else drive_controller
+            found.append(drive(bench, link, part, timeline, t0_ns, told))
+        except BaseException as problem:  # to be raised where somebody sees it
+            failed.append(problem)
+
+    timeline.put_off = True
+    thread = threading.Thread(target=work, name=f"{side}-loop", daemon=True)
+    thread.start()
+    stand_back()
+    try:
+        while thread.is_alive():
+            thread.join(_LOOK_S)
+            timeline.flush()
+            told[STOP] = stopped() or bool(timeline.failed)
+    finally:  # a second Ctrl-C: the thread must not outlive what it writes to
+        told[STOP] = 1
+        while thread.is_alive():
+            with contextlib.suppress(KeyboardInterrupt):
+                thread.join()
+        timeline.put_off = False
+    if failed:
+        raise failed[0]
+    return found[0]

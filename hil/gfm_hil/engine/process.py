@@ -1,0 +1,173 @@
+"""One side as a process of its own: ready the bench, meet the other side, run, keep everything."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import PeerLost, UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.core.roles import Side
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.engine.command_server import Desk
+from gfm_hil.engine.controller_side import run_controller
+from gfm_hil.engine.drive import compile_loops
+from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.loop_records import RING, TOLD
+from gfm_hil.engine.loop_thread import run_compiled
+from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.sd_notify import Watched, notify
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.links import Link, open_link
+from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
+from gfm_hil.links.impaired import ImpairedLink
+from gfm_hil.realtime.prevent_idle import kept_awake
+from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
+from gfm_hil.recording.log import Outcome
+from gfm_hil.recording.recorder import (
+    Part,
+    keep_in_memory,
+    record_command,
+    record_controller,
+    record_sample,
+)
+from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_plant import plant_go_on, plant_sample, plant_take
+from gfm_runtime.assembly import warm_up
+from gfm_runtime.signals import names
+
+
+def run_side(
+    side: Side, scenario: Scenario, folder: Path, notice: Callable[[str], None] = print
+) -> Outcome:
+    """Run one side of a scenario at ``scenario.link.endpoint``, recording into ``folder``.
+
+    Returns:
+        How it ended; the parts of the recording, ``events_<side>.jsonl`` and ``link_<side>.json``
+        (frame counters) are in ``folder``.
+
+    Raises:
+        UserError: the endpoint is not to be had, or the scenario has no operating point.
+    """
+    if scenario.link.endpoint is None:
+        raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
+    with Interrupt() as interrupt:
+        return _run(side, scenario, scenario.link.endpoint, folder, notice, interrupt)
+
+
+def _run(
+    side: Side,
+    scenario: Scenario,
+    endpoint: str,
+    folder: Path,
+    notice: Callable[[str], None],
+    interrupt: Interrupt,
+) -> Outcome:
+    bench = make_bench(scenario)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "scenario.toml").exists():  # a side alone; observers want to know what it runs
+        write_text(folder / "scenario.toml", scenario_toml(scenario))
+    if scenario.mode == "realtime":
+        keep_in_memory(folder, scenario.ticks, notice)
+    part = Part.create(folder, side, scenario.ticks)
+    compile_side(side, bench, part)
+    timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
+    told = np.zeros(TOLD, np.int64)
+
+    def ring() -> None:
+        told[RING] += 1
+
+    # the desk comes first: its threads must not inherit the rights that the loop asks for
+    with Desk(side, bench, timeline, folder, ring, interrupt.ask):
+        try:
+            seen = _meet_and_run(side, bench, endpoint, part, timeline, told, interrupt, notice)
+            with contextlib.suppress(OSError):  # on a full disk these counts are lost, no more
+                write_text(folder / f"link_{side}.json", json.dumps({"side": side, **seen}))
+        except PeerLost as problem:
+            timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
+        finally:
+            timeline.close()
+    assert timeline.outcome is not None
+    return timeline.outcome
+
+
+def _meet_and_run(
+    side: Side,
+    bench: Bench,
+    endpoint: str,
+    part: Part,
+    timeline: Timeline,
+    told: NDArray[np.int64],
+    interrupt: Interrupt,
+    notice: Callable[[str], None],
+) -> dict[str, Any]:
+    """Open the link, meet the other side, run; returns what the link saw.
+
+    Raises:
+        PeerLost: there was nobody to run with.
+        UserError: the endpoint is not to be had.
+    """
+    scenario = bench.scenario
+    rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
+    good: Link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
+    link = good
+
+    def stopped() -> bool:
+        return interrupt.came
+
+    resources = ExitStack()
+    try:
+        if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
+            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: not after START
+        if rights is not None:
+            if link.port is None:  # a loop in Python never sleeps
+                rights["policy"] = ordinary_priority()
+            else:
+                awake = kept_awake(rights["processor"], scenario.keep_awake)
+                rights["kept_awake"] = resources.enter_context(awake)
+            timeline.write(0, "scheduling", side=side, **rights)
+        no_collector_pauses()
+        notify(f"STATUS=waiting for the other side at {endpoint}")
+        start = shake_hands(side, good, scenario, stopped, notice)
+        with Watched(scenario, part.progress):
+            if link.port is not None:
+                reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped, told)
+            else:
+                run = run_controller if side == "controller" else run_plant
+                reader = run(bench, link, part, timeline, start.t0_ns, stopped)
+    finally:
+        resources.close()
+        link.close()
+    injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
+    counted = getattr(good, "counters", {})  # of a link that sees more than whole messages
+    faults = {**reader.faults, **counted, "refused_greetings": start.refused}
+    return {"faults": faults, "e2e": reader.e2e, "one_clock": start.one_clock, **injected}
+
+
+def compile_side(side: Side, bench: Bench, part: Part) -> None:
+    """Compile (or load from cache) every function that a tick calls, on copies."""
+    par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
+    plant_sample(par, st, y)
+    plant_go_on(par, st)
+    plant_take(par, st, u)
+    warm_up(bench.controller)
+    for group in DATA_IDS:
+        values = np.zeros(len(names(group)))
+        reader = FrameReader(group)
+        reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
+        reader.judge(False, False)
+    compile_loops(side, bench, part)
+    if side == "plant":
+        record_sample(part.signals[0].copy(), y, par, st)
+        record_command(part.signals[0].copy(), u)
+    else:
+        record_controller(part.signals[0].copy(), bench.controller.ctl, bench.controller.est)

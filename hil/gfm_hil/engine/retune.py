@@ -1,0 +1,53 @@
+"""A law with other gains while it runs: made ready off the loop, taken over in one tick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+from numpy.typing import NDArray
+
+from gfm_design.tuning.gains import tied
+from gfm_runtime import law_file, load_law
+from gfm_runtime.assembly import Controller
+from gfm_runtime.errors import LawError
+from gfm_runtime.kernel import pack_law
+from gfm_runtime.tustin import DiscreteLaw, discretise
+
+Gains = tuple[tuple[str, float], ...]
+
+
+@lru_cache(maxsize=64)
+def retuned(name: str, gains: Gains, T_s: float) -> tuple[DiscreteLaw, NDArray[Any]]:
+    """A law with some gains changed, discretised, and packed for the kernel.
+
+    What is tied to a changed gain follows it, unless it is given itself. The last ones are kept,
+    so that who checks a change off the loop has it ready for the loop.
+
+    Raises:
+        ValueError: a scheduled law, a name that its file does not have, or no such law.
+    """
+    try:
+        file = law_file(name)
+        if file.schedule is not None:
+            raise LawError(f"law {name}", "is scheduled: its gains change by themselves")
+        (law,) = load_law(name, **tied(file, dict(gains))).laws
+        discrete = discretise(law, T_s)
+        return discrete, pack_law(discrete)
+    except LawError as problem:
+        raise ValueError(str(problem)) from None
+
+
+def change_gains(controller: Controller, values: Mapping[str, float]) -> int:
+    """Ask for other gains of the law last asked for, on top of those changed before.
+
+    Returns:
+        The index of the law from now on.
+
+    Raises:
+        ValueError: as ``retuned``.
+    """
+    gains = {**controller.gains, **values}
+    ready = retuned(controller.asked, tuple(sorted(gains.items())), controller.T_s)
+    return controller.retune(*ready, gains)

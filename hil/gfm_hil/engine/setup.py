@@ -1,0 +1,124 @@
+"""A scenario made ready: the plant's and the controller's records at the operating point.
+
+Both sides build the same bench from the same scenario, each on its own machine if need be, so
+that nothing but frames has to cross the link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.model.operating_point import OperatingPoint, operating_point
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.retune import retuned
+from gfm_hil.scenario.events import Gains, LawChange, Reset
+from gfm_hil.scenario.model import Scenario
+from gfm_plant import NoEquilibrium, make_plant, plant_init
+from gfm_runtime import load_law
+from gfm_runtime.assembly import Controller
+from gfm_runtime.signals import NY
+from gfm_runtime.states import READY, SAFE, STATES
+
+
+@dataclass
+class Bench:
+    """Everything that one run changes.
+
+    Attributes:
+        par, st: the plant's records.
+        controller: the controller, its first law at rest and RUNNING.
+        y: measurements of the current tick, shape (5,), p.u.
+        u: inputs of the current tick, shape (3,), p.u.
+    """
+
+    scenario: Scenario
+    par: NDArray[Any]
+    st: NDArray[Any]
+    controller: Controller
+    start: OperatingPoint
+    y: NDArray[np.float64]
+    u: NDArray[np.float64]
+
+    def keep(self) -> None:
+        """Remember this instant as the start, to which a reset goes back."""
+        c = self.controller
+        self._plant = self.par.copy(), self.st.copy()
+        self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
+        self._asked = c.asked
+
+    def restore_plant(self, tick: int) -> None:
+        """Put the plant back to its start at a tick, trip forgotten and grid included."""
+        self.par[:], self.st[:] = self._plant
+        self.st["tick"], self.u[:] = tick, self.start.u
+
+    def reset_controller(self) -> None:
+        """Take the controller out of SAFE to its start: first law and references, READY.
+
+        Raises:
+            ValueError: it is not in SAFE.
+        """
+        c = self.controller
+        state, changes = int(c.ctl["state"][0]), int(c.ctl["changes"][0])
+        if state != SAFE:
+            raise ValueError(f"reset: the controller is {STATES[state]}, not SAFE")
+        c.ctl[:], c.laws[:], c.states[:], c.est[:] = self._controller
+        c.asked, c.gains = self._asked, {}
+        c.ctl["state"], c.ctl["changes"], self.u[:] = READY, changes, self.start.u
+
+
+def make_bench(scenario: Scenario) -> Bench:
+    """Build both sides of a scenario at its operating point.
+
+    Raises:
+        UserError: the law has no steady state on this grid.
+    """
+    plant = scenario.plant
+    if scenario.seed:
+        plant = plant.model_copy(
+            update={"sensors": plant.sensors.model_copy(update={"seed": scenario.seed})}
+        )
+    par, st = make_plant(plant, scenario.T_s)
+    references = scenario.references.vector()
+    # under the name that events use: a law file has a name of its own, or another law's
+    sets = [replace(load_law(name), name=name) for name in scenario.laws()]
+    controller = Controller(sets, scenario.T_s, references, hold=scenario.late_policy.hold)
+    try:
+        start = operating_point(
+            par,
+            controller.active_law,
+            np.asarray(references),
+            scenario.plant.grid.omega_g,
+            scenario.plant.grid.V_g,
+        )
+    except NoEquilibrium as problem:
+        raise UserError(f"references, plant.grid: {problem}") from None
+    plant_init(par, st, start.x, start.u)
+    controller.start(start.x_law, start.u)
+    bench = Bench(scenario, par, st, controller, start, np.zeros(NY), start.u.copy())
+    bench.keep()
+    _ready_gains(scenario)
+    return bench
+
+
+def _ready_gains(scenario: Scenario) -> None:
+    """Have every change of gains that the scenario names ready before it runs.
+
+    Raises:
+        UserError: one that cannot be.
+    """
+    name, gains = scenario.law, dict[str, float]()
+    for event in scenario.sorted_events():
+        if isinstance(event, LawChange):
+            name, gains = event.law, {}
+        elif isinstance(event, Reset):
+            name, gains = scenario.law, {}
+        elif isinstance(event, Gains):
+            gains.update(event.values)
+            try:
+                retuned(name, tuple(sorted(gains.items())), scenario.T_s)
+            except ValueError as problem:
+                raise UserError(f"events, {event.label()}: {problem}") from None

@@ -1,0 +1,231 @@
+"""What happens when: carries out a scenario's events tick by tick and writes down what came of it.
+
+The log is one JSON object a line, written at once, so that it is there however a run ends. A log
+that cannot be written, as on a full disk, ends the run; its last lines go where room was kept.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_hil.engine.retune import change_gains
+from gfm_hil.engine.setup import Bench
+from gfm_hil.recording.log import Outcome, Status
+from gfm_hil.scenario.events import (
+    CONTROLLER_EVENTS,
+    Gains,
+    LawChange,
+    Reference,
+    Reset,
+    apply_grid_event,
+)
+from gfm_plant import trip_reason
+from gfm_plant.names import CONTROLLER
+from gfm_runtime.signals import U_NAMES, Y_NAMES
+from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
+
+#: the other side knows why
+_ROOM = 1 << 16  # bytes kept beside the log for its last lines
+
+
+@dataclass
+class Ticket:
+    """What became of an event that an operator put in: its tick once ``done``, or an error."""
+
+    operator: dict[str, Any]
+    done: threading.Event = field(default_factory=threading.Event)
+    tick: int = -1
+    error: str = ""
+    _owner: threading.Lock = field(default_factory=threading.Lock)
+
+    def claim(self) -> bool:
+        """True for the first who asks: the loop to carry it out, or who put it in to withdraw."""
+        return self._owner.acquire(blocking=False)
+
+
+class Timeline:
+    """The events of one side, or of both in process, and the log of the run.
+
+    Args:
+        bench: the records that events act on.
+        log: file to append to.
+        sides: which events are ours.
+
+    Raises:
+        UserError: the disk is full.
+    """
+
+    def __init__(self, bench: Bench, log: Path, sides: tuple[Side, ...]) -> None:
+        self._bench, self._sides = bench, sides
+        self._path, self._room = log, log.with_suffix(".room")
+        try:
+            self._log = log.open("ab", buffering=0)
+            if log.is_file():  # not /dev/null
+                with self._room.open("wb") as room:
+                    os.posix_fallocate(room.fileno(), 0, _ROOM)
+        except OSError as problem:
+            raise UserError(f"{log}: {problem.strerror}") from None
+        self._unwritten = b""
+        self.failed = ""  # why the log cannot be written, if so
+        scenario = bench.scenario
+        self._todo = [
+            (e.at(scenario.T_s), e)
+            for e in scenario.sorted_events()
+            if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in sides
+        ]
+        self._inbox: deque[tuple[Any, Ticket]] = deque()
+        self._changes = 0
+        self._lines: deque[dict[str, Any]] = deque()
+        self.put_off = False  # a disk may keep the writer waiting for longer than a tick
+        self.outcome: Outcome | None = None
+        self._fault: tuple[Status, str] | None = None  # what a run that waits is waiting for
+        self.stopped_by: dict[str, Any] | None = None  # the operator, if one has said stop
+
+    @property
+    def running(self) -> bool:
+        """Nothing has ended the run yet."""
+        return self.outcome is None
+
+    def next_tick(self) -> int:
+        """Tick of the next event; far away if there is none."""
+        return self._todo[0][0] if self._todo else 2**62
+
+    def insert(self, event: Any, operator: dict[str, Any]) -> Ticket:
+        """Have an event of ours carried out at the next tick; may be called from any thread.
+
+        Args:
+            event: a checked one.
+            operator: who gives the command, for the log.
+        """
+        ticket = Ticket(operator)
+        self._inbox.append((event, ticket))
+        return ticket
+
+    def carry_out(self, tick: int) -> None:
+        """Carry out every event due at this tick, and what was put in."""
+        while self._todo and self._todo[0][0] <= tick:
+            event = self._todo.pop(0)[1]
+            try:
+                self._carry_out(event, tick)
+            except ValueError as problem:
+                self.write(tick, event.type, label=event.label(), refused=str(problem))
+        while self._inbox:
+            event, ticket = self._inbox.popleft()
+            if not ticket.claim():
+                continue
+            try:
+                self._carry_out(event, tick, by="operator", operator=ticket.operator)
+                ticket.tick = tick
+            except ValueError as problem:  # of a plant that has changed since it was checked
+                ticket.error = str(problem)
+            ticket.done.set()
+
+    def _carry_out(self, event: Any, tick: int, **more: Any) -> None:
+        match event:
+            case Reference():
+                for name, value in event.values().items():
+                    self._bench.controller.set(name, value, event.ramp_s)
+            case LawChange():
+                self._bench.controller.select(event.law)
+            case Gains():
+                change_gains(self._bench.controller, event.values)
+            case Reset():
+                self._bench.reset_controller()
+            case _:
+                apply_grid_event(event, self._bench.par, self._bench.st)
+        self.write(tick, event.type, label=event.label(), **more)
+
+    def look(self, tick: int) -> None:
+        """Write down what the tick just done brought: a change of law, a safe state, a trip."""
+        ctl, st = self._bench.controller.ctl, self._bench.st
+        if "controller" in self._sides and int(ctl["changes"][0]) != self._changes:
+            self._changes = int(ctl["changes"][0])
+            self.write(
+                tick,
+                "law-active",
+                law=self._bench.controller.active,
+                bump_pu=float(ctl["bump"][0]),
+            )
+        found = self._found(ctl, st)
+        if found is not None and self._fault is None:
+            if self._bench.scenario.after_trip == "end":
+                self.end(*found, tick)
+                return
+            self.write(tick, found[0], reason=found[1], side="+".join(self._sides))
+        elif found is None and self._fault is not None:
+            self.write(tick, "recovered", side="+".join(self._sides))
+        self._fault = found
+
+    def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
+        """What keeps our side from running, if anything does: the cause rather than hearsay."""
+        trip = int(st["trip"][0]) if "plant" in self._sides else 0
+        if trip not in (0, CONTROLLER):
+            return "tripped", trip_reason(st, self._bench.par)
+        if "controller" in self._sides and int(ctl["state"][0]) == SAFE:
+            heard = int(ctl["reason"][0]) == PLANT_TRIP
+            return "tripped" if heard else "safe", safe_reason(ctl)
+        return ("safe", trip_reason(st, self._bench.par)) if trip else None
+
+    def finish(self, tick: int) -> None:
+        """The scenario is over: the run is complete, unless it waits for a reset in vain."""
+        self.end(*(self._fault or ("completed", "")), tick)
+
+    def end(self, status: Status, reason: str, tick: int) -> None:
+        """The run is over; the first reason stays."""
+        if self.outcome is None:
+            if self.failed and status == "interrupted":
+                status, reason = "safe", self.failed
+            self.outcome = Outcome(status, reason, tick)
+            side, now = "+".join(self._sides), time.monotonic_ns()  # the clock of timing.npz
+            more: dict[str, Any] = {}
+            if status == "interrupted" and self.stopped_by is not None:
+                more = {"operator": self.stopped_by}
+            self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now, **more)
+
+    def write(self, tick: int, kind: str, **more: Any) -> None:
+        """One line of the log; on disk at once, or at the next ``flush`` if that is put off."""
+        t = round(tick * self._bench.scenario.T_s, 9)
+        self._lines.append({"tick": tick, "t": t, "event": kind, **more})
+        if not self.put_off:
+            self.flush()
+
+    def flush(self) -> None:
+        """Put on disk what is not there yet; may be called from another thread."""
+        tick = 0
+        while self._lines:
+            line = self._lines.popleft()
+            tick = line["tick"]
+            self._unwritten += (json.dumps(line) + "\n").encode()
+        try:
+            while self._unwritten:
+                self._unwritten = self._unwritten[self._log.write(self._unwritten) :]
+        except OSError as problem:
+            if self.failed:  # there is no room left at all: ``close`` tries again
+                return
+            self.failed = f"{self._path.name} cannot be written: {problem.strerror}"
+            self._room.unlink(missing_ok=True)
+            if not self.put_off:  # else who flushes stops the loop, which then ends the run
+                self.end("interrupted", "", tick)
+            self.flush()
+
+    def close(self) -> None:
+        """Close the log."""
+        self.flush()
+        self._log.close()
+        self._room.unlink(missing_ok=True)
+
+
+def safe_reason(ctl: Any) -> str:
+    """Why the controller is in SAFE, in words."""
+    reason, channel = int(ctl["reason"][0]), int(ctl["channel"][0])
+    names = {BAD_Y: Y_NAMES, BAD_U: U_NAMES}.get(reason)
+    return REASONS[reason] + (f": {names[channel]}" if names else "")

@@ -1,0 +1,82 @@
+"""Waiting for the other side: spin with a yield while an answer is near, then sleep."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import PeerLost
+from gfm_hil.links import Link
+from gfm_hil.links.frame import LAST_TIMES, FrameError, FrameReader, FrameWriter
+from gfm_runtime.signals import names
+from gfm_runtime.states import SAFE, STOPPED
+
+_SPIN_NS = 50_000  # longer takes processor time from the very threads that bring the answer
+
+_LAST_NS = 500_000_000
+
+
+def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
+    """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
+
+    A pure spin would starve libzmq's own thread on two cores; every look is followed by a yield.
+    """
+    spin_until = time.monotonic_ns() + _SPIN_NS
+    while True:
+        message = link.receive()
+        if message is not None:
+            return message
+        now = time.monotonic_ns()
+        if now >= deadline_ns or stopped():
+            return None
+        if now < spin_until:
+            os.sched_yield()
+        else:
+            link.wait(min(0.02, (deadline_ns - now) * 1e-9))
+
+
+def send_last(
+    link: Link, writer: FrameWriter, tick: int, state: int, reason: int, values: NDArray[np.float64]
+) -> None:
+    """Send the frame that ends a run, which the other side waits for, and some more like it.
+
+    One alone might be lost. Where there is no room, because the other side is behind, it gets a
+    while to make some.
+    """
+    give_up = time.monotonic_ns() + _LAST_NS
+    for _ in range(LAST_TIMES):
+        message = writer.pack(tick, state, reason, values)
+        while not link.send(message) and time.monotonic_ns() < give_up:
+            time.sleep(0.001)
+
+
+def part_from(
+    link: Link,
+    writer: FrameWriter,
+    reader: FrameReader,
+    tick: int,
+    state: int,
+    reason: int,
+    values: NDArray[np.float64],
+) -> None:
+    """Send the frames that end a run and wait a moment for the other side's.
+
+    Whoever closes at once may take with it what is still on its way: libzmq drops what a socket
+    has sent and a peer that is 64 frames behind has not read yet.
+    """
+    send_last(link, writer, tick, state, reason, values)
+    give_up = time.monotonic_ns() + _LAST_NS
+    unused = np.empty(len(names(reader.group)))
+    with contextlib.suppress(PeerLost):
+        while reader.state not in (SAFE, STOPPED) and time.monotonic_ns() < give_up:
+            message = link.receive()
+            if message is None:
+                link.wait(0.01)
+                continue
+            with contextlib.suppress(FrameError):
+                reader.unpack(message, unused)

@@ -1,1 +1,0 @@
-"""The two sides' ticks as compiled loops: no Python and no interpreter's lock while they run."""

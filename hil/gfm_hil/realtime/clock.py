@@ -1,0 +1,131 @@
+"""Time for compiled loops: read CLOCK_MONOTONIC, sleep to a deadline, give way.
+
+As intrinsics around libc, so that they allocate nothing and survive numba's cache.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from gfm_hil.realtime.atomics import pause as _pause
+from gfm_runtime.compiled import compiled
+
+_MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
+_NS = 1_000_000_000
+_SIGKILL = 9
+
+# numba's own annotation has the typing context among the caller's arguments
+_intrinsic: Any = intrinsic
+
+pause: Any = _pause
+
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
+_TIMESPEC = ir.LiteralStructType([_I64, _I64])
+
+_SPINS_A_YIELD = 16  # looks in vain, once a peer that delivers by itself is late
+
+#: woken this long before a deadline, the rest is spun: a sleep ends up to this late
+AHEAD_NS = 40_000
+
+
+def _libc(builder: Any, name: str, arguments: list[ir.Type]) -> Any:
+    kind = ir.FunctionType(_I32, arguments)
+    known = builder.module.globals.get(name)
+    return known if known is not None else ir.Function(builder.module, kind, name)
+
+
+def _timespec(builder: Any) -> Any:
+    with builder.goto_entry_block():  # once a call of the function, not once an iteration
+        return builder.alloca(_TIMESPEC)
+
+
+def _field(builder: Any, timespec: Any, k: int) -> Any:
+    return builder.gep(timespec, [_I32(0), _I32(k)], inbounds=True)
+
+
+@_intrinsic
+def now_ns(typingctx):
+    """CLOCK_MONOTONIC in ns, int64."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        timespec = _timespec(builder)
+        read = _libc(builder, "clock_gettime", [_I32, _TIMESPEC.as_pointer()])
+        builder.call(read, [_I32(_MONOTONIC), timespec])
+        seconds, ns = (builder.load(_field(builder, timespec, k)) for k in (0, 1))
+        return builder.add(builder.mul(seconds, _I64(_NS)), ns)
+
+    return types.int64(), make
+
+
+@_intrinsic
+def sleep_until(typingctx, deadline_ns):
+    """Sleep to a time of CLOCK_MONOTONIC, int64 ns; returns at once if it has passed."""
+    if not isinstance(deadline_ns, types.Integer):
+        return None
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        timespec = _timespec(builder)
+        parts = builder.sdiv(arguments[0], _I64(_NS)), builder.srem(arguments[0], _I64(_NS))
+        for k, part in enumerate(parts):
+            builder.store(part, _field(builder, timespec, k))
+        pointer = _TIMESPEC.as_pointer()
+        sleep = _libc(builder, "clock_nanosleep", [_I32, _I32, pointer, pointer])
+        return builder.call(sleep, [_I32(_MONOTONIC), _I32(_ABSTIME), timespec, pointer(None)])
+
+    return types.int32(types.int64), make
+
+
+@_intrinsic
+def give_way(typingctx):
+    """Let another thread have the processor: sched_yield."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.call(_libc(builder, "sched_yield", []), [])
+
+    return types.int32(), make
+
+
+@_intrinsic
+def end_this_process(typingctx):
+    """Die as if killed: SIGKILL to oneself."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.call(_libc(builder, "raise", [_I32]), [_I32(_SIGKILL)])
+
+    return types.int32(), make
+
+
+@compiled
+def wait_until(deadline_ns, spins):
+    """Sleep until shortly before a deadline, then spin; returns the longest gap in the spin, ns.
+
+    A thread that only spins would be throttled by the kernel under SCHED_FIFO, one that only
+    sleeps wakes late. A gap is time that something else took: other work, or the host itself.
+    """
+    gap = 0
+    before = now_ns()
+    if deadline_ns - before > AHEAD_NS:
+        sleep_until(deadline_ns - AHEAD_NS)
+        before = now_ns()
+    while before < deadline_ns:
+        now = now_ns()
+        gap = max(gap, now - before)
+        before = now
+        if spins == 0:
+            give_way()
+    return gap
+
+
+@compiled
+def between_looks(looks, spins):
+    """What a waiting loop does after its ``looks``-th look in vain: at first it spins, where the
+    peer itself delivers (``spins`` looks), then it yields, there only now and then: a yield takes
+    as long as the message."""
+    if looks <= spins or (spins > 0 and looks % _SPINS_A_YIELD != 0):
+        pause()
+    else:
+        give_way()

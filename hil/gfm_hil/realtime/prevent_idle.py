@@ -1,0 +1,88 @@
+"""A processor that does not rest while a loop in real time sleeps on it between its ticks.
+
+What rests has to wake up. A virtual machine gives a resting processor back to its host, which
+returns it when it likes, so that a loop misses more ticks on an idle machine than on a busy one.
+A thread of idle priority, which runs only when nothing else would, keeps the processor busy.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+
+from gfm_hil.realtime.atomics import intrinsic, load_acquire, pause
+from gfm_hil.realtime.environment import virtual_machine
+from gfm_runtime.compiled import FREE
+
+_STOP, _BEGUN = range(2)
+_OTHER, _IDLE = 0, 5  # SCHED_OTHER, SCHED_IDLE of sched.h on Linux
+_BETWEEN_LOOKS = 1000  # pauses, some 20 µs
+_PATIENCE_S = 1.0
+
+
+@intrinsic
+def _become(typingctx, policy):
+    """Give the calling thread a policy of ordinary priorities: 0, or -1 if it is refused."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        i32 = ir.IntType(32)
+        kind = ir.FunctionType(i32, [i32, i32, i32.as_pointer()])
+        known = builder.module.globals.get("sched_setscheduler")
+        function = known or ir.Function(builder.module, kind, "sched_setscheduler")
+        with builder.goto_entry_block():
+            priority = builder.alloca(i32)
+        builder.store(i32(0), priority)
+        return builder.call(function, [i32(0), builder.trunc(arguments[0], i32), priority])
+
+    return types.int32(types.int64), make
+
+
+@njit("void(int64[::1])", **FREE)
+def _never_rest(flags):
+    """Spin at idle priority until told to stop. Here and not in Python: a thread of idle priority
+    that waits for its turn must not hold the interpreter's lock."""
+    if _become(_IDLE) == 0:
+        flags[_BEGUN] = 1
+        while load_acquire(flags.ctypes.data) == 0:  # _STOP
+            for _ in range(_BETWEEN_LOOKS):
+                pause()
+        _become(_OTHER)
+
+
+@contextmanager
+def kept_awake(processor: int | None, wanted: str) -> Iterator[bool]:
+    """Keep a processor awake meanwhile; whether it is.
+
+    Args:
+        processor: its number, of those that this thread may use; None: there is none to keep.
+        wanted: ``keep_awake`` of the scenario: "auto" (on a virtual machine), "always" or "never".
+    """
+    flags = np.zeros(2, np.int64)
+    if processor is None or not (
+        wanted == "always" or (wanted == "auto" and virtual_machine() != "no")
+    ):
+        yield False
+        return
+
+    def work() -> None:
+        os.sched_setaffinity(0, {processor})  # of this thread
+        _never_rest(flags)
+
+    thread = threading.Thread(target=work, name="awake", daemon=True)
+    thread.start()
+    until = time.monotonic() + _PATIENCE_S
+    while not flags[_BEGUN] and thread.is_alive() and time.monotonic() < until:
+        time.sleep(0.001)
+    try:
+        yield bool(flags[_BEGUN])
+    finally:
+        flags[_STOP] = 1
+        thread.join(_PATIENCE_S)

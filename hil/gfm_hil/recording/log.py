@@ -1,0 +1,57 @@
+"""The log of a run: one JSON object a line, and how the run ended by what its two roles wrote."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from gfm_plant.names import CONTROLLER_SAFE
+from gfm_runtime.states import PLANT_TRIP, REASONS
+
+Status = Literal["completed", "tripped", "safe", "interrupted"]
+
+PLANT_LEFT = "the plant ended before the scenario did"
+
+CONTROLLER_LEFT = "the controller was stopped"
+
+_HEARSAY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
+
+SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended: status, reason in words, and the tick."""
+
+    status: Status
+    reason: str
+    tick: int
+
+
+def read_log(*paths: Path) -> list[dict[str, Any]]:
+    """The lines of one or more logs, in order of their ticks.
+
+    A line that is damaged, as the last one of a side that was killed may be, is left out.
+    """
+    lines: list[dict[str, Any]] = []
+    for path in paths:
+        if path.is_file():
+            for text in path.read_text("utf-8", errors="replace").splitlines():
+                with contextlib.suppress(ValueError, RecursionError):
+                    line = json.loads(text)
+                    if isinstance(line, dict) and isinstance(line.get("tick"), int):
+                        lines.append(line)
+    return sorted(lines, key=lambda line: line["tick"])
+
+
+def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
+    """The outcome that counts among those the sides wrote and the one seen from outside: the most
+    severe, and of two such the one seen from outside, or of the side that it happened to."""
+    ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
+    found = [outside, *ends] if outside else ends
+    if not found:
+        return Outcome("safe", "both sides ended without a word", 0)
+    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _HEARSAY))

@@ -1,0 +1,1 @@
+"""What a run showed: summary, metrics, figures, report and export files."""

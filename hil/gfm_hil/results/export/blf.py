@@ -1,0 +1,199 @@
+"""CAN frames of a run as BLF, what Vector's tools log, rebuilt from the recording.
+
+The CAN link's own codec makes the frames again from what each side recorded: measurements from y,
+commands from the u that the plant took, states from the controller's. A run over CAN exchanged
+these frames bit by bit, a run over another link would have. Rebuilt are the frames that were used:
+not the handshake, not what was said again or arrived damaged, not a command that came too late,
+not the words that end a run. All that is on a bus is for a logger on that bus, e.g.
+``python -m can.logger``.
+"""
+
+from __future__ import annotations
+
+import heapq
+import tomllib
+from bisect import bisect_right
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.links.can.dbc import write_dbc
+from gfm_hil.links.can.layout import Plan, load_plan
+from gfm_hil.links.can.options import CanOptions
+from gfm_hil.links.can.vectors import PARTS, CanFrame, encode, sender_dtype, set_sender
+from gfm_hil.links.can.wire import frame_dtype
+from gfm_hil.links.frame import FrameWriter
+from gfm_hil.results.export.table import RunTable
+from gfm_runtime.signals import Group, names
+from gfm_runtime.states import INIT, PLANT_TRIP, REASONS, SAFE
+
+_PIECE = 1 << 16  # ticks
+
+#: a CAN frame and when it was sent, s from tick 0
+Timed = tuple[float, CanFrame]
+
+
+def write_blf(table: RunTable, file: Path) -> None:
+    """Write a run; times are of each sender's clock since tick 0, in lockstep those of the run."""
+    options = can_options(table)
+    with can.BLFWriter(file) as writer:
+        for t, (number, payload) in can_frames(table, options):
+            writer.on_message_received(
+                can.Message(
+                    timestamp=t, arbitration_id=number, data=payload, is_extended_id=False,
+                    is_fd=options.fd, bitrate_switch=options.fd,
+                )
+            )  # fmt: skip
+
+
+def dbc_text(table: RunTable) -> str:
+    """The DBC by which the frames are to be read."""
+    options = can_options(table)
+    if options.dbc is None:
+        return write_dbc(options.fd)
+    return Path(options.dbc).read_text(encoding="utf-8")
+
+
+def can_options(table: RunTable) -> CanOptions:
+    """The run's own if it went over CAN, else the link's defaults."""
+    link = tomllib.loads(table.text("scenario.toml")).get("link", {})
+    return CanOptions(**link.get("options", {})) if link.get("type") == "can" else CanOptions()
+
+
+def can_frames(table: RunTable, options: CanOptions) -> Iterator[Timed]:
+    """The frames of both sides in the order of their times.
+
+    Raises:
+        UserError: a side did not record, or the DBC is not to be had.
+    """
+    if not {"y_p", "state"} <= set(table.values):
+        raise UserError(f"{table.folder}: holds the recording of one side; frames need both")
+    try:
+        plan = load_plan(options)
+    except ValueError as problem:
+        raise UserError(f"link.options.{problem}") from None
+    sides = _measurements(table, options, plan), _commands(table, options, plan)
+    return heapq.merge(*sides, key=lambda timed: timed[0])
+
+
+class _Sender:
+    """One side's frames, as its node on the bus makes them.
+
+    Args:
+        plan: of the DBC.
+        group: ``"y"`` or ``"u"``.
+        heartbeat: vectors after which the state is said again.
+    """
+
+    def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
+        self._writer = FrameWriter(group)
+        self._record, self._frames = np.zeros(1, sender_dtype), np.zeros(PARTS + 1, frame_dtype)
+        set_sender(self._record, plan, group, heartbeat)
+
+    def pack(self, tick: int, state: int, reason: int, values: NDArray[np.float64]) -> None:
+        """Make the bench's frame of a tick."""
+        self._writer.pack(tick, state, reason, values)
+
+    def frames(self) -> list[CanFrame]:
+        """The CAN frames of the frame packed last, which count as sent."""
+        count = encode(self._record, self._writer.message, self._frames)
+        return [(int(f["id"]), f["data"][: f["length"]].tobytes()) for f in self._frames[:count]]
+
+
+def _measurements(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
+    """The plant's: one vector a tick, or every n-th."""
+    sender, clock = _Sender(plan, "y", options.heartbeat), _Clock(table, "plant")
+    for first, last in _pieces(table):
+        rows, times = _vector(table, "y", first, last), clock.times(first, last)
+        tripped = table.values["true_trip"][first:last] != 0
+        for k, row in enumerate(rows, first):
+            state, reason = (SAFE, PLANT_TRIP) if tripped[k - first] else (INIT, 0)
+            sender.pack(k, state, reason, row)
+            if k % options.every == 0 and not np.isnan(row[0]):
+                yield from ((times[k - first], frame) for frame in sender.frames())
+
+
+def _commands(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
+    """The controller's: an answer to every vector that it got.
+
+    With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
+    """
+    sender, n = _Sender(plan, "u", options.heartbeat), options.every
+    clock, reasons = _Clock(table, "controller"), _SafeReasons(table)
+    for first, last in _pieces(table):
+        times, state = clock.times(first, last), table.values["state"][first:last]
+        beyond = last + n  # u[k] may be taken as late as that
+        rows, taken = _vector(table, "u", first, beyond), _taken(table, first, beyond)
+        for j in np.flatnonzero(~np.isnan(state)).tolist():
+            k = first + j
+            at = j + n if n > 1 and k else j
+            known = at < len(rows) and bool(taken[at])
+            now = int(state[j])
+            values = rows[at] if known else np.zeros(rows.shape[1])
+            sender.pack(k, now, reasons.at(k) if now == SAFE else 0, values)
+            if k % n == 0:
+                frames = sender.frames()
+                if known:
+                    yield from ((times[j], frame) for frame in frames)
+
+
+def _pieces(table: RunTable) -> Iterator[tuple[int, int]]:
+    """The ticks of a run, first and last of a piece that is held in memory."""
+    return ((a, min(a + _PIECE, table.ticks)) for a in range(0, table.ticks, _PIECE))
+
+
+def _vector(table: RunTable, group: Group, first: int, last: int) -> NDArray[np.float64]:
+    """Rows of a vector, shape (ticks, n), p.u."""
+    return np.column_stack([table.values[f"{group}_{n}"][first:last] for n in names(group)])
+
+
+def _taken(table: RunTable, first: int, last: int) -> NDArray[np.bool_]:
+    """Ticks at which the plant took a command in time; in process it always does."""
+    received = table.values.get("plant_received", table.values["tick"])
+    return received[first:last] >= 0
+
+
+class _Clock:
+    """When a side sent its frame of each tick, s from tick 0."""
+
+    def __init__(self, table: RunTable, side: str) -> None:
+        self._t = table.values["t"] if table.summary["mode"] == "lockstep" else None
+        if self._t is None:
+            self._sent, due = table.values[f"{side}_sent"], table.values[f"{side}_scheduled"]
+            for first, last in _pieces(table):
+                known = np.flatnonzero(due[first:last] >= 0)
+                if len(known):
+                    k = first + int(known[0])
+                    self._begin = int(due[k : k + 1][0]) - round(k * table.summary["T_s"] * 1e9)
+                    break
+
+    def times(self, first: int, last: int) -> NDArray[np.float64]:
+        """The times of ticks [first, last), shape (ticks,)."""
+        if self._t is not None:
+            return self._t[first:last]
+        return (self._sent[first:last] - self._begin) * 1e-9
+
+
+class _SafeReasons:
+    """Codes of the reasons for which the controller was in SAFE; the log has them in words."""
+
+    def __init__(self, table: RunTable) -> None:
+        said = [
+            line
+            for line in table.events
+            if "controller" in line.get("side", "") and "reason" in line
+        ]
+        self._ticks = [line["tick"] for line in said]
+        self._codes = [0, *(self._code(line["reason"]) for line in said)]
+
+    @staticmethod
+    def _code(reason: str) -> int:
+        return next((k for k, text in enumerate(REASONS) if text and reason.startswith(text)), 0)
+
+    def at(self, tick: int) -> int:
+        """The code of the reason given last at a tick; 0 for none."""
+        return self._codes[bisect_right(self._ticks, tick)]

@@ -1,0 +1,87 @@
+"""The formats there are, what each needs to be installed, and writing one whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import replacing, write_text
+from gfm_hil.results.export.table import load_run
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format.
+
+    Attributes:
+        text: what it is.
+        writer: function that writes a table to a file, as module:name in this package.
+        needs: package that this takes.
+        beside: ending of a second file that the first is read by, and the function of its text.
+    """
+
+    text: str
+    writer: str
+    needs: str = ""
+    beside: tuple[str, str] | None = None
+
+
+FORMATS = {
+    "mf4": Format("MDF 4.11, with events and attachments", "mf4:write_mf4", "asammdf"),
+    "csv": Format("text, every number exactly", "csv_file:write_csv"),
+    "mat": Format("MATLAB 5", "mat:write_mat", "scipy"),
+    "parquet": Format("Apache Parquet", "parquet:write_parquet", "pyarrow"),
+    "blf": Format(
+        "CAN frames and their DBC, for Vector's tools", "blf:write_blf", "cantools",
+        (".dbc", "blf:dbc_text"),
+    ),
+}  # fmt: skip
+
+
+def check_format(name: str) -> None:
+    """See that a format is there and can be written here.
+
+    Raises:
+        UserError: it is none, or its package is not installed.
+    """
+    if name not in FORMATS:
+        raise UserError(f"--format {name}: must be one of {', '.join(FORMATS)}")
+    needs = FORMATS[name].needs
+    if needs and find_spec(needs) is None:
+        raise UserError(f"--format {name} needs {needs}: pip install 'gfmhil[export]'")
+
+
+def export_run(folder: Path, name: str, file: Path) -> list[Path]:
+    """Write a finished run to ``file`` in the format ``name``.
+
+    Returns:
+        What was written: the file and, of CAN frames, their DBC.
+
+    Raises:
+        UserError: no run, no such format, or the file cannot be written.
+    """
+    check_format(name)
+    table, form = load_run(folder), FORMATS[name]
+    written = [file]
+    try:
+        with replacing(file) as part:
+            part.touch()  # the packages say it each in its own way
+            _function(form.writer)(table, part)
+            if form.beside is not None:
+                suffix, text = form.beside
+                written.append(file.with_suffix(suffix))
+                write_text(written[-1], _function(text)(table))
+    except OSError as problem:
+        raise UserError(f"{file}: {problem.strerror or problem}") from None
+    return written
+
+
+def _function(where: str) -> Callable[..., Any]:
+    module, _, name = where.partition(":")
+    function: Callable[..., Any] = getattr(import_module(f"gfm_hil.results.export.{module}"), name)
+    return function

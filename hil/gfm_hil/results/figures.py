@@ -1,0 +1,225 @@
+"""Figures of a run and of several side by side, like the paper's: one quantity a panel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from gfm_hil.core.files import replacing
+from gfm_hil.results.metrics import Rows
+from gfm_hil.results.summary import Spread, nominal_frequency
+from gfm_hil.scenario.model import Scenario
+
+Signals = Mapping[str, Rows]
+
+# Okabe and Ito's colours: told apart by everyone, and in print
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_POINTS = 4000  # drawn a curve; each pixel column keeps its least and its largest value
+_PIECE = 1 << 18  # ticks read at a time
+_LABELS = 40  # events with a label
+_BINS = 60  # of the histogram of misses
+_GREY = "#888888"
+
+
+def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Least and largest value of each stretch, so that no oscillation is drawn away.
+
+    ``t`` and ``x`` are arrays or columns of a file, of which a piece is read at a time.
+    """
+    ticks = len(t)
+    stretch = ticks // (_POINTS // 2)
+    if stretch < 3:
+        return t[:], x[:] * factor
+    whole = ticks // stretch * stretch
+    step = max(1, _PIECE // stretch) * stretch
+    moments, pairs = [], []
+    for first in range(0, whole, step):
+        last = min(first + step, whole)
+        values = (x[first:last] * factor).reshape(-1, stretch)
+        low, high = np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)  # past any NaN
+        times = t[first:last].reshape(-1, stretch)
+        pairs.append(np.column_stack([low, high]).ravel())
+        moments.append(np.column_stack([times[:, 0], times[:, stretch // 2]]).ravel())
+    return (
+        np.concatenate([*moments, t[whole:ticks]]),
+        np.concatenate([*pairs, x[whole:ticks] * factor]),
+    )
+
+
+def draw_panel(
+    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
+) -> None:
+    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
+    for t, x, colour, label in curves:
+        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, label=label)
+    axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
+    axes.grid(True, color="#e4e4e4", lw=0.6)
+    axes.tick_params(labelsize=8.5, color=_GREY)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(_GREY)
+    axes.ticklabel_format(useOffset=False)
+    low, high = axes.get_ylim()
+    least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise
+    if high - low < least:
+        axes.set_ylim((low + high - least) / 2, (low + high + least) / 2)
+
+
+def _mark(axes: Sequence[Axes], events: Sequence[dict[str, Any]]) -> None:
+    """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one."""
+    if not events:
+        return
+    for a in axes:  # one artist a panel: thousands of lines take minutes to draw
+        lines = LineCollection(
+            [[(e["t"], 0), (e["t"], 1)] for e in events], colors=_GREY, linewidths=0.8,
+            linestyles=[(0, (4, 3))], zorder=0, transform=a.get_xaxis_transform(),
+        )  # fmt: skip
+        lines.set_in_layout(False)
+        a.add_collection(lines, autolim=False)
+        a.update_datalim([(e["t"], 0) for e in events], updatey=False)
+        a.autoscale_view(scaley=False)
+    for k, event in enumerate(events[:: -(-len(events) // _LABELS)]):
+        axes[0].annotate(
+            event["label"], (event["t"], 1.0), (3, 20 + 10 * (k % 3)),
+            xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
+            color="#444444",
+        )  # fmt: skip
+
+
+def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    for a in axes[-1]:
+        a.set_xlabel("t [s]", fontsize=9)
+    return figure, list(axes.ravel())
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110)
+
+
+def draw_run(
+    folder: Path,
+    scenario: Scenario,
+    signals: Signals,
+    timing: Signals,
+    summary: dict[str, Any],
+    laws: Sequence[str],
+) -> list[Path]:
+    """Draw one run into its folder: signals.png and, in real time, timing.png."""
+    pictures = []
+    if "true_p" in signals:
+        pictures.append(_draw_signals(folder, scenario, signals, summary, laws))
+    if summary["mode"] == "realtime" and summary["round_trip_us"]:
+        pictures.append(draw_timing(folder, scenario, timing, summary))
+    return pictures
+
+
+def _draw_signals(
+    folder: Path,
+    scenario: Scenario,
+    signals: Signals,
+    summary: dict[str, Any],
+    laws: Sequence[str],
+) -> Path:
+    figure, axes = _figure(3, 2, (10.5, 7.4))
+    t, f_n = signals["t"], nominal_frequency(scenario)
+    blue, red, green, *_ = COLOURS
+
+    def panel(axes: Axes, title: str, *names: tuple[str, str, str], factor: float = 1.0) -> None:
+        drawn = [(t, signals[n], c, label) for n, c, label in names if n in signals]
+        draw_panel(axes, title, drawn, factor)
+        if len(drawn) > 1:
+            axes.legend(fontsize=8, frameon=False, loc="best")
+
+    panel(axes[0], "active power p [p.u.]", ("true_p", blue, "p"), ("ref_P_ref", _GREY, "P_ref"))
+    panel(axes[1], "reactive power q [p.u.]", ("true_q", blue, "q"), ("ref_Q_ref", _GREY, "Q_ref"))
+    panel(
+        axes[2], "frequency [Hz]", ("true_omega_u", blue, "converter"),
+        ("true_omega_g", _GREY, "grid"), factor=f_n,
+    )  # fmt: skip
+    panel(axes[3], "voltage V [p.u.]", ("true_V", blue, "V"), ("u_E_u", red, "E_u"))
+    panel(axes[4], "DC voltage v_dc [p.u.]", ("true_v_dc", blue, "v_dc"))
+    panel(axes[5], "currents [p.u.]", ("true_i", blue, "|i_dq|"), ("u_i_u", green, "i_u"))
+    _mark([axes[0], *axes[1:]], summary["events"])
+    figure.suptitle(
+        f"{scenario.title} — {' → '.join(summary['laws'])}", fontsize=11, x=0.01,
+        ha="left",
+    )  # fmt: skip
+    path = folder / "signals.png"
+    _save(figure, path)
+    return path
+
+
+def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict[str, Any]) -> Path:
+    """Draw into timing.png how long round trips took and when a fresh u was missing."""
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    for begin, end, colour, label in (
+        ("plant_sent", "plant_received", COLOURS[0], "y[k] sent → u[k] received"),
+        ("plant_scheduled", "plant_woke", COLOURS[1], "tick begun after its deadline"),
+    ):
+        spread = Spread.between(timing, begin, end)
+        before = np.cumsum(spread.count) - spread.count
+        beyond = 1 - before / max(1, int(spread.count.sum()))
+        left.loglog(np.maximum(spread.ns / 1e3, 0.1), beyond, color=colour, lw=1.2, label=label)
+    left.axvline(scenario.T_s * 1e6, color=_GREY, lw=0.8, ls=(0, (4, 3)))
+    left.set_title("share of ticks beyond a latency [µs]", loc="left", fontsize=9.5)
+    left.legend(fontsize=8, frameon=False)
+    edges, counts = np.linspace(0, summary["duration_s"], _BINS + 1), np.zeros(_BINS)
+    ticks = len(timing["plant_received"])
+    for first in range(0, ticks, _PIECE):
+        missing = np.flatnonzero(timing["plant_received"][first : first + _PIECE] < 0)
+        counts += np.histogram((first + missing) * scenario.T_s, edges)[0]
+    right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
+    right.set_title(
+        f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}",
+        loc="left",
+        fontsize=9.5,
+    )
+    right.set_xlabel("t [s]", fontsize=9)
+    for a in (left, right):
+        a.grid(True, color="#e4e4e4", lw=0.6)
+        a.tick_params(labelsize=8.5)
+    path = folder / "timing.png"
+    _save(figure, path)
+    return path
+
+
+def draw_comparison(
+    path: Path, scenario: Scenario, runs: Mapping[str, Signals], events: Sequence[dict[str, Any]]
+) -> None:
+    """p, frequency, q and v_dc of several laws in one figure, like the paper's."""
+    figure, axes = _figure(4, 1, (8.6, 8.2))
+    f_n = nominal_frequency(scenario)
+    for a, (title, name, factor) in zip(
+        axes,
+        (
+            ("active power p [p.u.]", "true_p", 1.0),
+            ("frequency [Hz]", "true_omega_u", f_n),
+            ("reactive power q [p.u.]", "true_q", 1.0),
+            ("DC voltage v_dc [p.u.]", "true_v_dc", 1.0),
+        ),
+        strict=True,
+    ):
+        curves = [
+            (s["t"], s[name], COLOURS[k % len(COLOURS)], law)
+            for k, (law, s) in enumerate(runs.items())
+        ]
+        draw_panel(a, title, curves, factor)
+    axes[0].legend(fontsize=8.5, frameon=False, ncols=min(4, len(runs)), loc="lower right")
+    _mark(axes, events)
+    figure.suptitle(scenario.title, fontsize=11, x=0.01, ha="left")
+    _save(figure, path)

@@ -1,0 +1,116 @@
+"""report.html: the summary and the figures of a run in one file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.core.files import write_text
+from gfm_hil.scenario.model import Scenario
+
+_STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}
+h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
+table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
+border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums} td.n,th.n{text-align:right}
+img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
+.status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
+.completed{background:#00734f} .tripped,.safe{background:#b34500}
+.unmet{color:#b34500}
+pre{background:#f6f6f6;padding:1rem;overflow-x:auto;font-size:13px}
+"""
+
+EVENT_COLUMNS = (
+    ("label", "event"),
+    ("t", "t [s]"),
+    ("p_peak", "p peak [p.u.]"),
+    ("p_final", "p final [p.u.]"),
+    ("settling_s", "settling 2 % [s]"),
+    ("overshoot_pct", "overshoot [%]"),
+    ("f_nadir_hz", "f nadir [Hz]"),
+    ("f_peak_hz", "f peak [Hz]"),
+    ("rocof_hz_s", "RoCoF [Hz/s]"),
+    ("v_min", "V min [p.u.]"),
+    ("v_max", "V max [p.u.]"),
+    ("damping_ratio", "damping ratio"),
+    ("oscillation_hz", "at [Hz]"),
+    ("bump_pu", "bump [p.u.]"),
+)
+
+
+def cell(value: Any) -> str:
+    """A value as people read it; – for none."""
+    match value:
+        case None:
+            return "–"
+        case float():
+            return f"{value:.4g}" if abs(value) < 10 else f"{value:.5g}"
+        case list():
+            return ", ".join(cell(v) for v in value) or "–"
+    return str(value)
+
+
+def write_report(
+    folder: Path, scenario: Scenario, summary: dict[str, Any], pictures: Sequence[Path]
+) -> Path:
+    """Write report.html into the run folder; returns its path."""
+    status = html.escape(summary["status"])
+    columns = [c for c in EVENT_COLUMNS if any(e.get(c[0]) is not None for e in summary["events"])]
+    head = "".join(
+        f"<th class={'n' if k else 'l'}>{html.escape(v)}</th>" for k, (_, v) in enumerate(columns)
+    )
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f"<td class={'n' if k else 'l'}>{html.escape(cell(e.get(name)))}</td>"
+            for k, (name, _) in enumerate(columns)
+        )
+        + "</tr>"
+        for e in summary["events"]
+    )
+    facts = [
+        ("laws", " → ".join(summary["laws"])),
+        ("link, mode", f"{summary['link']}, {summary['mode']}"),
+        (
+            "simulated",
+            f"{summary['duration_s']:g} s, {summary['ticks']} ticks of {summary['T_s'] * 1e6:g} µs",
+        ),
+        ("wall clock", f"{summary['wall_s']:.2f} s"),
+        ("misses", cell(summary["misses"])),
+        ("bump at a law change [p.u.]", cell(summary["bump_pu"])),
+    ]
+    if summary["round_trip_us"]:
+        times = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
+        facts.append(("round trip [µs]", times))
+    if any(summary["faults"].values()):
+        facts.append(("frames refused or lost", str(summary["faults"])))
+    rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
+    images = "".join(f'<img alt="{p.stem}" src="{_inline(p)}">' for p in pictures)
+    unmet = "".join(
+        f'<p class="unmet">not as expected: {html.escape(part)}</p>' for part in summary["unmet"]
+    )
+    resolved = html.escape((folder / "scenario.toml").read_text("utf-8"))
+    path = folder / "report.html"
+    write_text(
+        path,
+        f"""<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(scenario.title)}</title><style>{_STYLE}</style>
+<h1>{html.escape(scenario.title)}</h1>
+<p><span class="status {status}">{status}</span> {html.escape(summary["reason"])}</p>
+{unmet}
+<p>{html.escape(scenario.description)}</p>
+<table>{rows}</table>
+{images}
+<h2>Events</h2><div class="scroll"><table><tr>{head}</tr>{body}</table></div>
+<h2>Scenario as resolved</h2><pre>{resolved}</pre></html>
+""",
+    )
+    return path
+
+
+def _inline(picture: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"

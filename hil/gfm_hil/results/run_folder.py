@@ -1,0 +1,246 @@
+"""The folder of a run: whether it may be used, and what is in it in the end.
+
+``summary.json`` is written last. While it is not there, the folder still holds all that the other
+files are made of, and ``recover`` can make them again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import Unfinished, UserError
+from gfm_hil.core.files import sync_folder, unfinished, write_text
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.recording.log import Outcome, read_log, worst
+from gfm_hil.recording.npz import Arrays, Column
+from gfm_hil.recording.recorder import (
+    CONTROLLER_COLUMNS,
+    CONTROLLER_TIMES,
+    PLANT_COLUMNS,
+    PLANT_TIMES,
+    merge,
+    read_recording,
+    remove_parts,
+)
+from gfm_hil.results.summary import summarise
+from gfm_hil.scenario.model import Scenario, load_scenario
+
+_LOCK = ".lock"  # removed when the folder is complete
+_ENDED = "ended.json"  # how the run ended, while its folder is not complete
+_COLUMNS = ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *PLANT_TIMES, *CONTROLLER_TIMES)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        folder: of the run.
+        summary: content of summary.json.
+        columns: of signals.npz, each shape (ticks,), read block by block when sliced.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+    columns: dict[str, Column]
+
+    @property
+    def signals(self) -> Arrays:
+        """The columns of signals.npz as arrays; each access reads one from the file."""
+        return Arrays(self.columns)
+
+
+def check_free(folder: Path, ticks: int) -> None:
+    """See that a run may be recorded in ``folder``, which need not exist.
+
+    Raises:
+        UserError: it holds something, cannot be made or written, or the disk is too full; a
+            memory-mapped file on a full disk would end the process without a word.
+    """
+    there = folder
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise UserError(f"{folder}: {there} is not a folder that can be written to; choose --out")
+    if there == folder and any(folder.iterdir()):
+        raise UserError(f"{folder}: is not empty; choose another --out")
+    # the parts stay until the run's files are there, which compression may not make smaller
+    needed = 2 * 8 * len(_COLUMNS) * ticks
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise UserError(
+            f"{folder}: {ticks} ticks need {needed / 1e9:.3g} GB, free are {free / 1e9:.3g} GB; "
+            "shorten duration or choose another --out"
+        )
+
+
+def finish(
+    scenario: Scenario,
+    folder: Path,
+    laws: list[str],
+    wall_s: float,
+    figures: bool = True,
+    outside: Outcome | None = None,
+) -> Run:
+    """Turn the parts that the sides left in ``folder`` into the files of a run.
+
+    Args:
+        scenario, folder: of the run.
+        laws: labels of the controller's laws, which the recording refers to by index.
+        wall_s: how long it took.
+        figures: draw them and write report.html.
+        outside: how it ended as seen from outside the sides, which may not have lived to say.
+
+    Raises:
+        Unfinished: a file cannot be written; ``recover`` completes the folder.
+    """
+    ended = {"wall_s": wall_s, "figures": figures, "outside": outside and asdict(outside)}
+    with _kept(folder):
+        write_text(folder / _ENDED, json.dumps(ended))
+        return _complete(scenario, folder, laws, wall_s, figures, outside)
+
+
+def recover(folder: Path) -> Run:
+    """Complete the folder of a run that was cut off; leave one that is complete as it is.
+
+    Raises:
+        UserError: it is no run folder, the run is still going on, or its recording is gone.
+        Unfinished: a file cannot be written.
+    """
+    if not (folder / "scenario.toml").is_file():
+        raise UserError(f"{folder}: is not a run folder (scenario.toml is missing)")
+    with _alone(folder), _kept(folder):
+        if (folder / "summary.json").is_file():
+            _clear(folder)
+            summary = json.loads((folder / "summary.json").read_text("utf-8"))
+            return Run(folder, summary, read_recording(folder)[0])
+        parts = folder / "parts"
+        if not parts.is_dir() and not (folder / "signals.npz").is_file():
+            lay = f" (it lay in {parts.readlink()})" if parts.is_symlink() else ""
+            raise UserError(f"{folder}: nothing is left of what was recorded{lay}")
+        scenario = load_scenario(str(folder / "scenario.toml"))
+        laws = make_bench(scenario).controller.labels
+        try:
+            ended = json.loads((folder / _ENDED).read_text("utf-8"))
+        except FileNotFoundError:  # it was cut off while it ran
+            ended = {"wall_s": _lasted(folder), "figures": True, "outside": None}
+        outside = Outcome(**ended["outside"]) if ended["outside"] else None
+        return _complete(scenario, folder, laws, ended["wall_s"], ended["figures"], outside)
+
+
+@contextlib.contextmanager
+def in_use(folder: Path) -> Iterator[None]:
+    """While this process runs the run of ``folder``, ``recover`` refuses it.
+
+    Raises:
+        UserError: another process is just recovering it.
+    """
+    with contextlib.ExitStack() as stack:
+        handle = _open_lock(folder)
+        stack.callback(os.close, handle)
+        try:
+            scratch.lock(handle, fcntl.LOCK_SH)
+        except TimeoutError as problem:
+            raise UserError(f"{folder}: {problem}") from None
+        yield
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep others from a folder, and from its parts where those lie elsewhere."""
+    with contextlib.ExitStack() as stack:
+        handle = _open_lock(folder)
+        stack.callback(os.close, handle)
+        try:
+            scratch.lock(handle, fcntl.LOCK_EX, patience_s=0.0)
+        except TimeoutError:
+            raise UserError(f"{folder}: the run is still going on") from None
+        if (folder / "parts").is_symlink() and (folder / "parts").is_dir():
+            stack.callback(scratch.let_go, scratch.hold((folder / "parts").resolve()))
+        yield
+
+
+def _open_lock(folder: Path) -> int:
+    """The file that is locked while a run folder is in use; only our user can open it, so that no
+    other user can keep it locked."""
+    try:
+        return os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError as problem:
+        raise UserError(f"{folder}: {problem.strerror}") from None
+
+
+@contextlib.contextmanager
+def _kept(folder: Path) -> Iterator[None]:
+    """Say what to do where a file cannot be written."""
+    try:
+        yield
+    except OSError as problem:
+        raise Unfinished(
+            f"{folder}: {problem.strerror or problem}; all that was recorded is kept: make room, "
+            f"then gfmhil recover {folder}"
+        ) from None
+
+
+def _lasted(folder: Path) -> float:
+    """How long a run lasted whose end nobody saw: from its start to what was written last, s."""
+    times = [path.stat().st_mtime for path in [*folder.iterdir(), *folder.glob("parts/*")]]
+    return max(0.0, max(times) - (folder / "scenario.toml").stat().st_mtime)
+
+
+def _complete(
+    scenario: Scenario,
+    folder: Path,
+    laws: list[str],
+    wall_s: float,
+    figures: bool,
+    outside: Outcome | None,
+) -> Run:
+    """Make the files of a run, then remove what they were made of; may be repeated at any point."""
+    if (folder / "parts").is_dir():
+        merge(folder, scenario.T_s, laws)
+    signals, timing, _ = read_recording(folder)
+    logs = sorted(folder.glob("events_*.jsonl"))
+    log = read_log(*(logs or [folder / "events.jsonl"]))
+    write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
+    faults, injected, one_clock = {}, {}, True
+    for path in sorted(folder.glob("link_*.json")):
+        content = json.loads(path.read_text())
+        faults[content["side"]] = {k: v for k, v in content["faults"].items() if v}
+        one_clock &= content["one_clock"]
+        if "injected" in content:
+            injected[content["side"]] = content["injected"]
+    outcome = worst(log, outside)
+    summary = summarise(scenario, signals, timing, log, outcome, faults, wall_s, one_clock)
+    if injected:
+        summary["injected"] = injected
+    if figures and len(signals["tick"]):
+        # a second of imports, which the sides' processes do without
+        from gfm_hil.results.figures import draw_run
+        from gfm_hil.results.report import write_report
+
+        pictures = draw_run(folder, scenario, signals, timing, summary, laws)
+        write_report(folder, scenario, summary, pictures)
+    sync_folder(folder)
+    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    sync_folder(folder)
+    _clear(folder)
+    return Run(folder, summary, signals)
+
+
+def _clear(folder: Path) -> None:
+    """Remove what the files of a complete run were made of, and what a killed process left."""
+    remove_parts(folder)
+    for pattern in (_LOCK, "events_*", "link_*.json", "desk_*.json", _ENDED):
+        for path in folder.glob(pattern):
+            path.unlink()
+    for path in unfinished(folder):
+        path.unlink()

@@ -1,0 +1,92 @@
+"""A whole run: one process or two, and a run folder in the end, however it ended."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.core.roles import SIDES
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.engine.inproc import compile_loop, run_inproc
+from gfm_hil.engine.processes import Processes, Progress
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.recording.recorder import Part, remove_parts
+from gfm_hil.results.run_folder import Run, check_free, finish, in_use
+from gfm_hil.scenario.model import INPROC, Scenario
+from gfm_hil.scenario.toml_out import scenario_toml
+
+__all__ = ["Progress", "Run", "run_scenario"]
+
+Notice = Callable[[str], None]
+
+
+def run_scenario(
+    scenario: Scenario,
+    folder: Path,
+    progress: Progress = lambda ticks, misses: None,
+    notice: Notice = lambda text: None,
+    figures: bool = True,
+    controller_command: Sequence[str] = (),
+) -> Run:
+    """Run a scenario and leave a run folder.
+
+    Args:
+        scenario: checked, from ``load_scenario``.
+        folder: where to write; new or empty.
+        progress: told how far the run is.
+        notice: told what a person should know while waiting.
+        figures: draw the figures and write report.html.
+        controller_command: program and arguments of another controller instead of ours, for a
+            link that is none of ``inproc``; see ``Processes``.
+
+    Raises:
+        UserError: the folder is in use, no operating point, an endpoint that is occupied. The
+            folder is then left as it was.
+    """
+    check_free(folder, scenario.ticks)
+    bench = make_bench(scenario)
+    folder.mkdir(parents=True, exist_ok=True)
+    with in_use(folder):
+        outside = None
+        try:
+            with Interrupt() as interrupt:
+                try:
+                    write_text(folder / "scenario.toml", scenario_toml(scenario))
+                except OSError as problem:
+                    raise UserError(f"{folder}: {problem.strerror}") from None
+                if scenario.link.type == INPROC:
+                    began = _run_here(bench, folder, progress, notice, interrupt)
+                else:
+                    command = tuple(controller_command)
+                    both = Processes(scenario, folder, progress, notice, interrupt, command)
+                    began, outside = both.run()
+        except UserError:
+            remove_parts(folder)
+            shutil.rmtree(folder)
+            raise
+        wall_s = time.monotonic() - began
+        return finish(scenario, folder, bench.controller.labels, wall_s, figures, outside)
+
+
+def _run_here(
+    bench: Bench, folder: Path, progress: Progress, notice: Notice, interrupt: Interrupt
+) -> float:
+    """Run both sides in this process; returns when the first tick was run."""
+    parts = {side: Part.create(folder, side, bench.scenario.ticks) for side in SIDES}
+    timeline = Timeline(bench, folder / "events_both.jsonl", SIDES)
+    notice("compiling the loop (once a machine) …")
+    compile_loop(bench, parts["plant"], parts["controller"])
+    began = time.monotonic()
+
+    def go_on(ticks: int) -> bool:
+        progress(ticks, 0)
+        return not interrupt.came
+
+    run_inproc(bench, parts["plant"], parts["controller"], timeline, go_on)
+    timeline.close()
+    return began

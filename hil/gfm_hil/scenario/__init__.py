@@ -1,0 +1,5 @@
+"""A scenario: its model and events, loading and checking, and writing it as TOML."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,353 @@
+"""What a scenario consists of, as pydantic models: all that can be said without trying it out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.links import link_kind, link_names
+from gfm_hil.links.impaired.settings import Impairment
+from gfm_hil.scenario.events import (
+    Breaker,
+    Event,
+    GridImpedance,
+    LawChange,
+    Reset,
+    apply_grid_event,
+    check_reference,
+)
+from gfm_hil.scenario.expectation import check_expectation
+from gfm_plant import Plant, load_converter, make_plant
+from gfm_runtime import LawError, discretise, law_file, load_law
+from gfm_runtime.errors import printable
+from gfm_runtime.signals import REF_NAMES, table_hash
+from gfm_runtime.toml_file import read_toml
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+INPROC = "inproc"  # no link: both sides in one compiled loop
+
+
+class Link(_Model):
+    """How the two sides exchange frames."""
+
+    type: str = Field("zmq", description="name of a link; inproc: one compiled loop, lockstep only")
+    endpoint: str | None = Field(
+        None,
+        description="where the sides meet, in the form of the link; a fresh one if none",
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="the link's own options")
+    peer_timeout_s: float = Field(
+        0.5, gt=0, le=60, description="silence after which the other side counts as gone"
+    )
+    repeat_s: float = Field(
+        0.002, gt=0, le=60, description="lockstep: silence after which the plant sends y[k] again"
+    )
+    impairment: Impairment | None = Field(None, description="faults on purpose")
+    start_timeout_s: float = Field(
+        60.0, gt=0, le=604800, description="how long to wait for it at the start"
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> Link:
+        if self.type == INPROC:  # endpoint and options wait for the day there is a link again
+            return self
+        if self.type not in link_names():
+            raise ValueError(
+                f"type = {self.type!r}: must be one of {sorted([INPROC, *link_names()])}"
+            )
+        kind = link_kind(self.type)
+        if self.endpoint is not None:
+            kind.check_endpoint(self.endpoint)
+        try:
+            options = kind.options.model_validate(self.options)
+        except ValidationError as problem:
+            raise ValueError("; ".join(f"options.{line}" for line in lines(problem))) from None
+        kind.check_both(self.endpoint, options)
+        return self
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class References(_Model):
+    """Y_ref at the start, p.u."""
+
+    V_dcref: float = 1.0
+    P_ref: float = 0.5
+    omega_g: float = 1.0
+    Q_ref: float = 0.0
+    V_ref: float = 1.0
+
+    @model_validator(mode="after")
+    def _in_range(self) -> References:
+        for name in REF_NAMES:
+            check_reference(name, getattr(self, name))
+        return self
+
+    def vector(self) -> list[float]:
+        """In the order of the signal table."""
+        return [getattr(self, name) for name in REF_NAMES]
+
+
+class LatePolicy(_Model):
+    """Real time: what to do about frames that are not there at their deadline."""
+
+    hold: int = Field(
+        200, ge=0, le=10**9, description="ticks in a row to hold the last value, then SAFE"
+    )
+    extrapolate: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="the first of them, over which the plant goes on along u's trend",
+    )
+
+    @model_validator(mode="after")
+    def _within_hold(self) -> LatePolicy:
+        if self.extrapolate > self.hold:
+            raise ValueError(
+                f"extrapolate = {self.extrapolate}: must be at most hold = {self.hold}"
+            )
+        return self
+
+
+class Scenario(_Model):
+    """One experiment."""
+
+    title: str
+    description: str = ""
+    duration: float = Field(gt=0, le=86400, description="s")
+    T_s: float = Field(1e-4, ge=1e-6, le=0.1, description="sampling time, s")
+    mode: Literal["lockstep", "realtime"] = "lockstep"
+    law: str = Field("mimo-gfm", description="catalogue name or path of a law file")
+    seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
+    expect: Literal["completed", "tripped", "safe"] = Field(
+        "completed", description="status with which the run counts as passed (exit code 0)"
+    )
+    expect_reason: str | None = Field(
+        None,
+        description="name of the trip or safe reason, which must be the cause of the end; any if "
+        "none",
+    )
+    expect_after: float | None = Field(
+        None, gt=0, description="s; the trip or safe state must not come before; any time if none"
+    )
+    after_trip: Literal["end", "wait"] = Field(
+        "end",
+        description="wait: a trip or a safe state does not end the run; the plant stays blocked "
+        "until an event, or an operator, resets both sides to the scenario's start",
+    )
+    keep_awake: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="real time: a thread of idle priority keeps each side's processor from "
+        "resting; auto: on a virtual machine, whose host returns late what has rested",
+    )
+    ready_laws: list[str] = Field(
+        default_factory=list,
+        description="laws made ready besides those that events name, for an operator to change to",
+    )
+    compare: list[str] = Field(default_factory=list, description="laws that `compare` puts beside")
+    references: References = References()
+    link: Link = Link()
+    late_policy: LatePolicy = LatePolicy()
+    plant: Plant = Plant()
+    events: list[Event] = Field(default_factory=list, max_length=10_000)
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks of the run."""
+        return round(self.duration / self.T_s)
+
+    def laws(self) -> list[str]:
+        """Names of every law that the run uses, the first one first, each once."""
+        changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
+        return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
+
+    def sorted_events(self) -> list[Event]:
+        """Events in order of their tick; those of one tick in the order of the file."""
+        return sorted(self.events, key=lambda e: e.at(self.T_s))
+
+    def digest(self) -> str:
+        """Hash over what both sides must agree on: scenario, signal table, and what is in the
+        law and converter files, wherever each machine keeps them."""
+        about = {"link", "title", "description", "compare"}
+        about |= {"expect", "expect_reason", "expect_after"}
+        content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
+        content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
+        names = self.laws()
+        events = [
+            {**e.model_dump(), **({"law": names.index(e.law)} if isinstance(e, LawChange) else {})}
+            for e in self.sorted_events()
+        ]
+        return _hash([content, events, self.laws_digest(), table_hash()])
+
+    def laws_digest(self) -> str:
+        """Hash over the content of every law that the run uses."""
+        return _hash([law_file(name).model_dump() for name in self.laws()])
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Scenario:
+        problems = check_expectation(self)
+        if self.ticks < 1:
+            problems.append(f"duration = {self.duration:g} s: not one tick of T_s = {self.T_s:g} s")
+        for k, event in enumerate(self.events):
+            if event.at(self.T_s) >= self.ticks:
+                problems.append(
+                    f"events.{k}: at {event.at(self.T_s) * self.T_s:g} s, but the run ends at "
+                    f"{self.duration:g} s"
+                )
+            if isinstance(event, Reset) and self.after_trip == "end":
+                problems.append(f"events.{k}: nothing to reset with after_trip = 'end'; use 'wait'")
+            if isinstance(event, Breaker) and self.plant.grid.load_R is None:
+                problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
+        if self.link.type == INPROC:
+            if self.mode == "realtime":
+                problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
+        else:
+            kind = link_kind(self.link.type)
+            try:
+                kind.check(kind.options.model_validate(self.link.options), self.T_s)
+            except ValueError as problem:
+                problems.append(f"link.options: {problem}")
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+
+__all__ = [
+    "LatePolicy",
+    "Link",
+    "References",
+    "Scenario",
+    "check_scenario",
+    "find_scenario",
+    "load_scenario",
+    "shipped_scenarios",
+]
+
+SCENARIO_FOLDERS = (
+    Path(__file__).resolve().parents[1] / "scenarios",  # a wheel carries them here
+    Path(__file__).resolve().parents[3] / "scenarios",  # a checkout has them here
+)
+
+
+def find_scenario(name: str) -> Path:
+    """The file of a scenario: a path, or the name of a shipped one (with or without .toml).
+
+    Raises:
+        UserError: neither exists.
+    """
+    return find_file("scenario", name, "*.toml")
+
+
+def find_file(kind: str, name: str, pattern: str) -> Path:
+    """The file of that path, or the shipped one of that name; ``kind`` is for the message.
+
+    Raises:
+        UserError: neither exists.
+    """
+    given, shipped = Path(name), _shipped(pattern)
+    try:
+        is_file, exists = given.is_file(), given.exists()
+    except OSError as problem:  # such as a name of 300 characters
+        raise UserError(printable(f"{kind} {name}: {problem.strerror}")) from None
+    if is_file:
+        return given
+    if given.name.removesuffix(".toml") in shipped:
+        return shipped[given.name.removesuffix(".toml")]
+    what = "is not a regular file" if exists else "no such file"
+    raise UserError(printable(f"{kind} {name}: {what}; shipped are {sorted(shipped)}"))
+
+
+def _shipped(pattern: str) -> dict[str, Path]:
+    return {p.stem: p for folder in SCENARIO_FOLDERS for p in folder.glob(pattern)}
+
+
+def shipped_scenarios() -> list[str]:
+    """Names of the scenarios that come with gfmhil."""
+    return sorted(_shipped("*.toml"))
+
+
+def load_scenario(name: str, **changed: Any) -> Scenario:
+    """Read, override and check a scenario, its laws and its plant.
+
+    Args:
+        name: path or shipped name.
+        changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
+            None leaves the file's value. Another link than the file's forgets its endpoint
+            and options.
+
+    Raises:
+        UserError: one line a mistake, each with its path, the value and what is allowed.
+    """
+    path = find_scenario(name)
+    try:
+        content = read_toml(path)
+    except ValueError as problem:
+        raise UserError(f"{path}: {problem}") from None
+    link, chosen = content.get("link"), changed.get("link__type")
+    if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
+        link.pop("endpoint", None)  # they are of the file's own link
+        link.pop("options", None)
+    for key, value in changed.items():
+        if value is not None:
+            table: Any = content
+            *parents, last = key.split("__")
+            for parent in parents:
+                table = table.setdefault(parent, {}) if isinstance(table, dict) else None
+            if isinstance(table, dict):  # else the check says what the file has instead
+                table[last] = value
+    return check_scenario(content, str(path))
+
+
+def check_scenario(content: dict[str, Any], where: str) -> Scenario:
+    """The scenario of a dict, with its laws and its plant tried out.
+
+    Raises:
+        UserError: as ``load_scenario``.
+    """
+    where = printable(where)
+    try:
+        scenario = Scenario.model_validate(content)
+    except ValidationError as problem:
+        raise UserError("\n".join(f"{where}: {line}" for line in lines(problem))) from None
+    try:
+        for law in [*scenario.laws(), *scenario.compare]:
+            for stage in load_law(law).laws:
+                discretise(stage, scenario.T_s)
+        _try_plant(scenario)
+    except (LawError, UserError) as problem:
+        raise UserError(f"{where}: {problem}") from None
+    return scenario
+
+
+def _try_plant(scenario: Scenario) -> None:
+    """Make the plant and every line that its events give it, which may be too fast to resolve."""
+    converter = f"plant.converter = {scenario.plant.converter!r}"
+    if scenario.plant.converter.endswith(".toml"):
+        try:
+            read_toml(scenario.plant.converter)
+        except ValueError as problem:
+            raise UserError(f"{converter}: {problem}") from None
+    try:
+        par, st = make_plant(scenario.plant, scenario.T_s)
+    except ValidationError as problem:
+        raise UserError("; ".join(f"{converter}: {line}" for line in lines(problem))) from None
+    except ValueError as problem:
+        raise UserError(str(problem)) from None
+    for k, event in enumerate(scenario.events):
+        if isinstance(event, GridImpedance):
+            try:
+                apply_grid_event(event, par, st)
+            except ValueError as problem:
+                raise UserError(f"events.{k}: {problem}") from None

@@ -1,0 +1,86 @@
+"""The nonlinear bench at one point of the box: a step of P_ref with the rig's imperfections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gfm_design.model.box import T_S, Point
+from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import safe_reason
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.scenario.model import check_scenario
+from gfm_plant import trip_reason
+from gfm_runtime.states import SAFE
+
+#: what the rig adds to a point: its boards, and the noise of its sensors in p.u.
+RIG: dict[str, Any] = {
+    "adc": "DS2004",
+    "dac": "DS2101",
+    "noise_std": {"v_dc": 3e-5, "p": 5e-4, "q": 5e-4, "V": 1e-4},
+}
+STEP = (0.5, 1.0)  # of P_ref, p.u.
+_BEFORE, _AFTER = 5000, 25000  # ticks
+_P = PLANT_COLUMNS.index("true_p")
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """What came of a run.
+
+    Attributes:
+        point: the plant.
+        ended: why the run ended early, or "".
+        overshoot: of p beyond where it settles, as a part of the step; NaN after an early end.
+        ripple: how far p still swings beyond that at the end, where only the rounding of the
+            boards and the noise move it; a part of the step. The overshoot contains it.
+    """
+
+    point: Point
+    ended: str
+    overshoot: float
+    ripple: float
+
+
+def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
+    """Step P_ref from 0.5 to 1 p.u. on a point's plant, whatever its own P_ref is.
+
+    Args:
+        point: the plant.
+        law: catalogue name or law file.
+        seed: of the sensors' noise.
+    """
+    plant = point.plant().model_dump(mode="json", exclude_none=True)
+    plant |= {"adc": RIG["adc"], "dac": RIG["dac"]}
+    plant["sensors"] |= {"noise_std": RIG["noise_std"]}
+    content = {
+        "title": str(point),
+        "duration": (_BEFORE + _AFTER) * T_S,
+        "law": law,
+        "seed": seed,
+        "references": {"P_ref": STEP[0]},
+        "plant": plant,
+    }
+    bench = make_bench(check_scenario(content, str(point)))
+    c, ticks = bench.controller, _BEFORE + _AFTER
+    signals = np.full((ticks, len(PLANT_COLUMNS)), np.nan)
+    references = np.empty((ticks, len(CONTROLLER_COLUMNS)))
+    for start, stop in ((0, _BEFORE), (_BEFORE, ticks)):
+        if start:
+            c.set("P_ref", STEP[1])
+        done = run_ticks(
+            bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
+            signals, references, start, stop, False,
+        )  # fmt: skip
+        if bench.st["trip"][0] or c.ctl["state"][0] == SAFE:
+            tripped = bool(bench.st["trip"][0])
+            why = trip_reason(bench.st, bench.par) if tripped else safe_reason(c.ctl)
+            return Stepped(point, f"{why} at {done * T_S:.3f} s", np.nan, np.nan)
+    p = signals[_BEFORE:, _P]
+    rest, step = p[-_AFTER // 10 :], STEP[1] - STEP[0]
+    settled = rest.mean()
+    overshoot, ripple = (float((v - settled) / step) for v in (p.max(), rest.max()))
+    return Stepped(point, "", overshoot, ripple)

@@ -1,0 +1,142 @@
+"""Reading a campaign file, and checking all of it before anything starts."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.model import check_scenario, find_file, load_scenario
+from gfm_hil.studies.campaign.draw import Distribution
+from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
+from gfm_plant import make_plant
+from gfm_runtime.errors import printable
+from gfm_runtime.toml_file import parse_toml, read_text
+
+# what a campaign decides itself; [set] may fix the last two
+_OWN = ("law", "seed", "mode", "link", "compare", "duration", "T_s")
+_SETTABLE = ("duration", "T_s")
+_TRIED = 2000  # runs, about a millisecond each; a later one that cannot be ends the campaign
+
+
+def find_campaign(name: str) -> Path:
+    """The file of a campaign: a path, or the name of a shipped one.
+
+    Raises:
+        UserError: neither exists.
+    """
+    return find_file("campaign", name, "campaigns/*.toml")
+
+
+def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of: None) -> Campaign:
+    """Read and check a campaign, its runs included.
+
+    Args:
+        name: path or shipped name.
+        tell: told the checks done and how many there are, as they go on; there may be thousands.
+
+    Raises:
+        UserError: one line a mistake, each with its path, the value and what is allowed.
+    """
+    path = find_campaign(name)
+    try:
+        text = read_text(path)
+        file = CampaignFile.model_validate(parse_toml(text))
+    except ValidationError as problem:
+        raise UserError(
+            "\n".join(f"{path}: {printable(_line(e))}" for e in problem.errors())
+        ) from None
+    except ValueError as problem:
+        raise UserError(f"{path}: {problem}") from None
+    base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
+    content = base.model_dump(mode="json")
+    content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
+    _check_paths(path, file, content)
+    for target, value in file.set.items():
+        put(content, target, value)
+    laws = {law: _beside(path, law) for law in file.laws}
+    for label, law in laws.items():
+        check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
+    campaign = Campaign(path.stem, text, file, content, laws)
+    checks = [*_end_checks(path, campaign), *_run_checks(path, campaign)]
+    for k, check in enumerate(checks):
+        tell(k, len(checks))
+        check()
+    return campaign
+
+
+def _beside(path: Path, name: str) -> str:
+    """A file that lies beside the campaign's, or the name as it is."""
+    beside = path.parent / name
+    with suppress(OSError):  # a name too long, which its loader refuses
+        return str(beside.resolve()) if beside.is_file() else name
+    return name
+
+
+def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> None:
+    """See that every path exists, is the campaign's to change and is given once."""
+    where = [(f"set.{p}", p) for p in file.set]
+    where += [(f"draw.{k}", p) for k, d in enumerate(file.draw) for p in d.paths()]
+    problems, seen = [], set()
+    for entry, target in where:
+        own = target.split(".")[0]
+        if own in _OWN and not (entry.startswith("set.") and own in _SETTABLE):
+            problems.append(f"{entry}: {target!r} is the campaign's own and cannot be set here")
+        elif target in seen:
+            problems.append(f"{entry}: {target!r} is given twice")
+        else:
+            seen.add(target)
+            try:
+                put(copy.deepcopy(content), target, 0)
+            except KeyError as problem:
+                problems.append(f"{entry}: {problem.args[0]}")
+    if len(set(file.laws)) < len(file.laws):
+        problems.append(f"laws = {file.laws}: each once")
+    if problems:
+        raise UserError("\n".join(f"{path}: {printable(p)}" for p in problems))
+
+
+def _end_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
+    """Try every distribution's extremes, one at a time, on the scenario as it is."""
+
+    def check(k: int, d: Distribution, value: Any) -> None:
+        content = copy.deepcopy(campaign.base)
+        for target in d.paths():
+            put(content, target, value)
+        check_scenario(content, f"{path}: draw.{k}, {d.path} = {value!r}")
+
+    for k, d in enumerate(campaign.file.draw):
+        yield from (partial(check, k, d, value) for value in d.ends())
+
+
+def _run_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
+    """Make the runs' plants: what fails only in combination shows before anything starts."""
+    law = campaign.file.laws[0]
+
+    def check(run: int) -> None:
+        try:
+            scenario, _ = campaign.scenario(run, law)
+            make_plant(scenario.plant, scenario.T_s)
+        except ValueError:
+            check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
+            raise
+
+    yield from (partial(check, run) for run in range(min(campaign.file.runs, _TRIED)))
+
+
+def _line(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"])
+    text = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{where}: {text}"
+    if error["type"] == "missing":
+        return f"{where}: missing"
+    if error["type"] == "extra_forbidden":
+        return f"{where}: unknown key"
+    return f"{where} = {error['input']!r:.60}: {text}"

@@ -1,0 +1,165 @@
+"""What a worker does: a chunk of runs in process, each turned into a small record."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES
+from gfm_hil.engine.inproc import compile_loop, run_inproc
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.engine.timeline import Timeline
+from gfm_hil.recording.log import Outcome
+from gfm_hil.recording.recorder import (
+    CONTROLLER_COLUMNS,
+    CONTROLLER_TIMES,
+    PLANT_COLUMNS,
+    PLANT_TIMES,
+    Part,
+)
+from gfm_hil.results.summary import summarise
+from gfm_hil.scenario.model import Scenario
+from gfm_hil.studies.campaign.spec import Campaign
+
+Job = tuple[int, str]  # run number, law
+Record = dict[str, Any]
+
+_RIPPLE_WINDOW = 0.2  # s, ten periods of 50 Hz
+_EVENT_KEYS = ("t", "tick", "label")  # of a summary's event; the scenario has them
+
+
+class RunFailed(Exception):
+    """A run ended by an error of the program; the message names the run."""
+
+
+class _LogInMemory(Timeline):
+    """A timeline that keeps its log instead of writing it."""
+
+    def __init__(self, bench: Any) -> None:
+        super().__init__(bench, Path(os.devnull), SIDES)
+        self.lines: list[dict[str, Any]] = []
+
+    def write(self, tick: int, kind: str, **more: Any) -> None:
+        t = round(tick * self._bench.scenario.T_s, 9)
+        self.lines.append({"tick": tick, "t": t, "event": kind, **more})
+
+
+def buffers(ticks: int) -> tuple[Part, Part]:
+    """Room to record one run: the plant's and the controller's."""
+
+    def part(columns: Sequence[str], times: Sequence[str]) -> Part:
+        return Part(
+            np.empty((ticks, len(columns))),
+            np.empty((0, len(times)), np.int64),  # lockstep has no times
+            np.zeros(2, np.int64),
+        )
+
+    return part(PLANT_COLUMNS, PLANT_TIMES), part(CONTROLLER_COLUMNS, CONTROLLER_TIMES)
+
+
+def compile_once(campaign: Campaign) -> None:
+    """Fill numba's cache here, so that workers need not all compile the same."""
+    scenario, _ = campaign.scenario(0, campaign.file.laws[0])
+    try:
+        compile_loop(make_bench(scenario), *buffers(1))
+    except UserError:  # no steady state: the workers will compile
+        return
+
+
+def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
+    """The records of some runs.
+
+    Raises:
+        RunFailed: an error that is not the run's own.
+    """
+    parts = None
+    records = []
+    for run, law in jobs:
+        try:
+            scenario, drawn = campaign.scenario(run, law)
+            parts = parts or buffers(scenario.ticks)
+            summary, p = simulate(scenario, *parts)
+        except Exception as problem:
+            words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
+            raise RunFailed(words) from problem
+        records.append(record(run, law, scenario, drawn, summary, p))
+    return records
+
+
+def simulate(
+    scenario: Scenario, plant: Part, controller: Part
+) -> tuple[dict[str, Any], NDArray[np.float64]]:
+    """The summary of a run, as ``run_scenario`` would write it, and p at every tick, p.u."""
+    try:
+        bench = make_bench(scenario)
+    except UserError as problem:
+        return {"status": "no-steady-state", "reason": str(problem), "events": []}, np.empty(0)
+    plant.signals[:] = np.nan
+    timeline = _LogInMemory(bench)
+    with np.errstate(all="ignore"):  # a diverging run is a result
+        run_inproc(bench, plant, controller, timeline, lambda ticks: True)
+    timeline.close()
+    recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
+    done = int(recorded[-1]) + 1 if len(recorded) else 0
+    signals: dict[str, NDArray[Any]] = {"tick": np.arange(done)}
+    for j, name in enumerate(PLANT_COLUMNS):
+        if name.startswith("true_"):
+            signals[name] = np.array(plant.signals[:done, j])
+    outcome = timeline.outcome or Outcome("safe", "ended without a word", done)
+    summary = summarise(scenario, signals, {}, timeline.lines, outcome, {}, 0.0)
+    return summary, signals["true_p"]
+
+
+def record(
+    run: int,
+    law: str,
+    scenario: Scenario,
+    drawn: dict[str, Any],
+    summary: dict[str, Any],
+    p: NDArray[np.float64],
+) -> Record:
+    """What is kept of a run; ``docs/campaigns.md`` lists the keys."""
+    completed = summary["status"] == "completed"
+    events = [{k: v for k, v in e.items() if k not in _EVENT_KEYS} for e in summary["events"]]
+    window = p[-max(1, round(_RIPPLE_WINDOW / scenario.T_s)) :]
+    return _finite(
+        {
+            "run": run,
+            "law": law,
+            "seed": scenario.seed,
+            "drawn": drawn,
+            "status": summary["status"],
+            "reason": summary["reason"],
+            "end_s": None if completed or not len(p) else len(p) * scenario.T_s,
+            "ripple_pu": float(np.ptp(window)) if completed else None,
+            "growth_1_s": max((g for e in events if (g := _growth(e)) is not None), default=None),
+            "events": events,
+        }
+    )
+
+
+def _growth(event: dict[str, Any]) -> float | None:
+    """Growth rate of an event's dominant oscillation, 1/s; negative: it decays."""
+    zeta, hertz = event.get("damping_ratio"), event.get("oscillation_hz")
+    if zeta is None or hertz is None:
+        return None
+    return -zeta * 2 * math.pi * hertz / math.sqrt(1 - zeta**2)
+
+
+def _finite(value: Any) -> Any:
+    """None in place of NaN and infinity, which JSON does not know."""
+    match value:
+        case dict():
+            return {k: _finite(v) for k, v in value.items()}
+        case list():
+            return [_finite(v) for v in value]
+        case float() if not math.isfinite(value):
+            return None
+    return value

@@ -1,0 +1,64 @@
+"""The experiments of the league on the nonlinear bench: the paper's simulation, disturbed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gfm_hil.recording.recorder import PLANT_COLUMNS
+from gfm_hil.scenario.model import check_scenario
+from gfm_hil.studies.campaign.worker import buffers, simulate
+
+START = "mimo-gfm"  # the law that the switchover comes from
+AT = 0.5  # s
+DURATION = 5.0  # s
+TRACE_EVERY = 40  # ticks
+_CURRENT = PLANT_COLUMNS.index("true_i")
+
+#: what happens, and how the plant differs from the ideal one
+EXPERIMENTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "p_ref": ({"type": "reference", "P_ref": 1.0}, {}),
+    "frequency": ({"type": "grid-frequency", "f_hz": 49.9}, {}),
+    "phase": ({"type": "grid-phase-jump", "degrees": 3.0}, {}),
+    "late": ({"type": "reference", "P_ref": 1.0}, {"delay": {"samples": 1}}),
+    "switchover": ({"type": "law"}, {}),
+}
+
+
+def experiment(name: str, law: str) -> dict[str, Any]:
+    """Run one.
+
+    Args:
+        name: of ``EXPERIMENTS``.
+        law: catalogue name or law file.
+
+    Returns:
+        status, reason, the metrics of the event (``results.metrics``), i_peak [p.u.], dp (largest
+        deviation of p from before the event), bump_pu of a switchover, and trace, p over time
+        every ``TRACE_EVERY`` ticks.
+    """
+    event, plant = EXPERIMENTS[name]
+    switched = event["type"] == "law"
+    content = {
+        "title": f"{law}: {name}",
+        "duration": DURATION,
+        "law": START if switched else law,
+        "link": {"type": "inproc"},
+        "references": {"P_ref": 0.5},
+        "plant": plant,
+        "events": [{"t": AT, **event} | ({"law": law} if switched else {})],
+    }
+    scenario = check_scenario(content, f"league, {name}")
+    parts = buffers(scenario.ticks)
+    summary, p = simulate(scenario, *parts)
+    out: dict[str, Any] = {"status": summary["status"], "reason": summary["reason"]}
+    at = round(AT / scenario.T_s)
+    if summary["status"] == "completed":
+        out |= {k: v for k, v in summary["events"][0].items() if k not in ("t", "tick", "type")}
+        out["i_peak"] = float(np.max(parts[0].signals[at : len(p), _CURRENT]))
+        out["dp"] = float(np.max(np.abs(p[at:] - p[at - 1])))
+    else:
+        out["end_s"] = len(p) * scenario.T_s - AT
+    out["trace"] = [round(float(v), 5) for v in p[::TRACE_EVERY]]
+    return out

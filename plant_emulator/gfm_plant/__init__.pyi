@@ -1,0 +1,47 @@
+from .bases import Bases
+from .build import make_plant
+from .emulator import (
+    plant_advance,
+    plant_ahead,
+    plant_go_on,
+    plant_init,
+    plant_take,
+    plant_truth,
+)
+from .grid import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
+from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
+from .options import Plant
+from .parameters import ConverterParameters, load_converter
+from .protection import trip_reason
+from .records import plant_par_dtype, plant_state_dtype
+from .sensors import plant_sample
+from .steady_state import NoEquilibrium, plant_equilibrium
+
+__all__ = [
+    "CONTROLLER_SAFE",
+    "NO_FRESH_U",
+    "TRIP_REASONS",
+    "TRUTH",
+    "Bases",
+    "ConverterParameters",
+    "NoEquilibrium",
+    "Plant",
+    "breaker",
+    "grid_frequency",
+    "grid_impedance",
+    "grid_voltage",
+    "load_converter",
+    "make_plant",
+    "phase_jump",
+    "plant_advance",
+    "plant_ahead",
+    "plant_equilibrium",
+    "plant_go_on",
+    "plant_init",
+    "plant_par_dtype",
+    "plant_sample",
+    "plant_state_dtype",
+    "plant_take",
+    "plant_truth",
+    "trip_reason",
+]

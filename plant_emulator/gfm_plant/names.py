@@ -1,0 +1,36 @@
+"""What the plant says in words: the names of its true values, its trips and their reasons."""
+
+from __future__ import annotations
+
+TRIPS = (
+    # option, quantity, sign (+1: trips above the threshold, -1: below)
+    ("over_current", "|i_dq|", +1),
+    ("over_voltage", "V", +1),
+    ("under_voltage", "V", -1),
+    ("dc_over_voltage", "v_dc", +1),
+    ("dc_under_voltage", "v_dc", -1),
+    ("over_frequency", "omega_u", +1),
+    ("under_frequency", "omega_u", -1),
+)
+"""The protections with a threshold; their place is their index in the records."""
+
+DIVERGED = len(TRIPS) + 1
+BAD_COMMAND = len(TRIPS) + 2
+CONTROLLER = len(TRIPS) + 3
+
+TRIP_REASONS: dict[int, str] = {
+    0: "none",
+    **{k + 1: name.replace("_", "-") for k, (name, *_) in enumerate(TRIPS)},
+    DIVERGED: "diverged",
+    BAD_COMMAND: "command not finite",
+    CONTROLLER: "blocked for the controller",
+}
+"""What the trip code in a plant's state means."""
+
+#: the value of a trip with the code CONTROLLER, and the words for it
+SAFE_STATE, SILENT = 0.0, 1.0
+CONTROLLER_SAFE = "the controller is in its safe state"
+NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
+
+TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip")
+"""What `plant_truth` writes, in this order; i = |i_dq|, delta in rad, trip a reason code."""

@@ -1,0 +1,17 @@
+"""The states of the controller and the reasons for its safe state, as codes and in words."""
+
+from __future__ import annotations
+
+INIT, READY, RUNNING, SAFE, STOPPED = range(5)
+STATES = ("INIT", "READY", "RUNNING", "SAFE", "STOPPED")
+
+OK, BAD_Y, BAD_U, STALE, LOST_PEER, PLANT_TRIP, OPERATOR = range(7)
+REASONS = (
+    "",
+    "a measurement is not finite or out of range",
+    "an output is not finite",
+    "no fresh measurement for longer than late_policy allows",
+    "the plant's process is gone",
+    "the plant's protection tripped",
+    "stopped by the operator",
+)

@@ -1,0 +1,175 @@
+"""Tustin's discretisation of a whole law, and the checks that let it into the kernel.
+
+    x[k+1] = A x[k] + B_r r[k] + B_y y[k]
+    u[k]   = u_0 + C x[k] + D_r r[k] + D_y y[k]
+
+Column 3 of B_y and D_y multiplies the law's own omega_u[k] *of the same tick*: the kernel solves
+the scalar loop omega_u = (...) + D_y[1,2] omega_u in closed form, so no hidden delay enters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_runtime.errors import LawError
+from gfm_runtime.law import Law, cell_name
+from gfm_runtime.realisation import realise
+from gfm_runtime.signals import NU, NY
+
+Matrix = NDArray[np.float64]
+
+OMEGA_ROW, OMEGA_COLUMN = 1, 2
+_ON_CIRCLE = 1e-9  # |z| beyond 1 + this is unstable; an integrator sits at 1 to rounding
+
+
+@dataclass(frozen=True)
+class DiscreteLaw:
+    """A law at one sampling time; shapes and units as in ``LawStateSpace``, T_s in s.
+
+    W (n,3) is the anti-windup gain: x is moved by W (u_clamped - u_raw) before it steps.
+    The four maps E_r, E_y (n,5), F, G (n,3) set the state at a bumpless change:
+    x = E_r r + E_y y + F (u - u_0) + G (change of u per tick).
+    """
+
+    law: Law
+    T_s: float
+    A: Matrix
+    B_r: Matrix
+    B_y: Matrix
+    C: Matrix
+    D_r: Matrix
+    D_y: Matrix
+    D_u0: Matrix
+    u_0: Matrix
+    rows: tuple[int, ...]
+    W: Matrix
+    E_r: Matrix
+    E_y: Matrix
+    F: Matrix
+    G: Matrix
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.rows)
+
+    def closed(self) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix, Matrix]:
+        """(A, B_r, B_y, C, D_r, D_y) with the omega_u loop closed; column 3 of B_y, D_y is 0."""
+        gain = 1.0 / (1.0 - self.D_y[OMEGA_ROW, OMEGA_COLUMN])
+        b, d = self.B_y[:, [OMEGA_COLUMN]] * gain, self.D_y[:, [OMEGA_COLUMN]] * gain
+        B_y, D_y = self.B_y.copy(), self.D_y.copy()
+        B_y[:, OMEGA_COLUMN], D_y[:, OMEGA_COLUMN] = 0.0, 0.0
+        c, d_r, d_y = self.C[[OMEGA_ROW]], self.D_r[[OMEGA_ROW]], D_y[[OMEGA_ROW]]
+        return (
+            self.A + b @ c,
+            self.B_r + b @ d_r,
+            B_y + b @ d_y,
+            self.C + d @ c,
+            self.D_r + d @ d_r,
+            D_y + d @ d_y,
+        )
+
+
+def discretise(law: Law, T_s: float, prewarp: float | None = None) -> DiscreteLaw:
+    """Discretise a law by Tustin at T_s [s]; ``prewarp`` [rad/s] is matched exactly if given.
+
+    Raises:
+        LawError: T_s or prewarp out of range, an omega_u loop without solution or unstable, and
+            as ``realise``.
+    """
+    if not (math.isfinite(T_s) and T_s > 0.0):
+        raise LawError("T_s", f"{T_s} s must be > 0")
+    half = T_s / 2
+    if prewarp is not None:
+        if not 0.0 < prewarp < math.pi / T_s:
+            raise LawError("prewarp", f"{prewarp} rad/s must lie in (0, {math.pi / T_s:g})")
+        half = math.tan(prewarp * T_s / 2) / prewarp
+    ss = realise(law)
+    eye = np.eye(ss.order)
+    backward = np.linalg.inv(eye - half * ss.A)
+    A = backward @ (eye + half * ss.A)
+    B_r, B_y = backward @ ss.B_r * (2 * half), backward @ ss.B_y * (2 * half)
+    C = ss.C @ backward
+    D_r, D_y = ss.D_r + half * ss.C @ backward @ ss.B_r, ss.D_y + half * ss.C @ backward @ ss.B_y
+    W, E_r, E_y, F, G = (np.zeros((ss.order, k)) for k in (NU, NY, NY, NU, NU))
+    for i in range(NU):
+        k = np.flatnonzero(np.asarray(ss.rows) == i)
+        if len(k):
+            block = np.ix_(k, k)
+            W[k, i] = _slowest(A[block], C[i, k]) * min(1.0, T_s / law.limits.T_t)
+            if i == OMEGA_ROW:  # the omega_u loop passes on 1/(1 - D_y) of what x moves
+                W[k, i] *= 1.0 - D_y[i, OMEGA_COLUMN]
+            E_r[k], E_y[k], F[k, i], G[k, i] = _take_over(
+                A[block], B_r[k], B_y[k], C[i, k], D_r[i], D_y[i]
+            )
+    discrete = DiscreteLaw(
+        law, T_s, A, B_r, B_y, C, D_r, D_y, ss.D_u0, ss.u_0, ss.rows, W, E_r, E_y, F, G
+    )
+    _check(discrete)
+    return discrete
+
+
+def _slowest(A: Matrix, c: Matrix) -> Matrix:
+    """Direction of the slowest mode that does not swing, scaled to move the output by one, or 0.
+
+    Correcting only this mode (an integrator, if the row has one) lets the row leave its limit at
+    once and leaves the faster modes alone.
+    """
+    values, vectors = np.linalg.eig(A)
+    # rounding splits a double real root into a pair with a small imaginary part
+    real = np.flatnonzero(np.abs(values.imag) <= 1e-3 * np.abs(1.0 - values))
+    if not len(real):
+        return np.zeros(len(A))
+    v = vectors[:, real[np.argmax(values.real[real])]].real
+    return v / (c @ v)
+
+
+def _take_over(
+    A: Matrix, B_r: Matrix, B_y: Matrix, c: Matrix, d_r: Matrix, d_y: Matrix
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """E_r, E_y, F, G of one row: nearest to its rest state, the output and its change right.
+
+    The rest state is (I-A)^# B (r, y), with an integrator at 0; the least-norm correction then
+    makes u[k] and, with two or more states, u[k+1] - u[k] what the law before it would have given.
+    """
+    n = len(A)
+    move = A - np.eye(n)
+    projector = np.zeros((n, n))
+    if np.min(np.abs(np.linalg.eigvals(A) - 1.0)) < 1e-9:  # an integrator; a row has one at most
+        left, _, right = np.linalg.svd(move)
+        projector = np.outer(right[-1], left[:, -1]) / (left[:, -1] @ right[-1])
+    drazin = np.linalg.inv(projector - move) - projector
+    rest_r, rest_y = drazin @ B_r, drazin @ B_y
+    slope = c @ move
+    unit = float(np.linalg.norm(slope)) or 1.0  # makes both equations of one size
+    equations = np.vstack([c, slope / unit]) if n > 1 else c[None, :]
+    correct = np.zeros((n, 2))
+    correct[:, : len(equations)] = np.linalg.pinv(equations)
+    f, g = correct[:, 0], correct[:, 1] / unit
+    # residuals of the two equations at the rest state, as maps of r and y
+    E_r = rest_r - np.outer(f, c @ rest_r + d_r) - np.outer(g, slope @ rest_r + c @ B_r)
+    E_y = rest_y - np.outer(f, c @ rest_y + d_y) - np.outer(g, slope @ rest_y + c @ B_y)
+    return E_r, E_y, f, g
+
+
+def _check(discrete: DiscreteLaw) -> None:
+    law = discrete.law
+    loop = discrete.D_y[OMEGA_ROW, OMEGA_COLUMN]
+    column_3 = " and ".join(
+        cell_name(m, (OMEGA_ROW, OMEGA_COLUMN))
+        for m in ("phi", "psi")
+        if not law.element(m, (OMEGA_ROW, OMEGA_COLUMN)).is_zero
+    )
+    if loop >= 1.0 - 1e-9:
+        raise LawError(column_3, f"the omega_u loop gain {loop:g} must be < 1 at T_s")
+    poles = np.linalg.eigvals(discrete.closed()[0])
+    radius = np.max(np.abs(poles), initial=0.0)
+    if radius > 1 + _ON_CIRCLE:
+        raise LawError(
+            column_3 or law.dynamic(),
+            f"unstable at T_s = {discrete.T_s:g} s, spectral radius {radius:g}",
+        )
