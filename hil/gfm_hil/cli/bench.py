@@ -25,7 +25,7 @@ Tell = Callable[[str, float], None]
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("bench", help="measure links, clock, kernel and loop here")
+    command = commands.add_parser("bench")
     kinds = command.add_subparsers(dest="kind", required=True, metavar="WHAT")
 
     def kind(name: str, text: str, *options: Callable[[argparse.ArgumentParser], None]) -> None:

@@ -32,7 +32,7 @@ _PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("campaign", help="run a scenario many times with drawn values")
+    command = commands.add_parser("campaign")
     command.add_argument("file", help="campaign file, or the name of a shipped one")
     command.add_argument("--out", help="folder; runs/<campaign>-<time> by default")
     command.add_argument("--resume", action="store_true", help="run what --out has not got yet")

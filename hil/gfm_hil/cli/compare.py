@@ -29,7 +29,7 @@ from gfm_hil.scenario.model import find_scenario
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("compare", help="run a scenario under several laws")
+    command = commands.add_parser("compare")
     add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
     command.add_argument("--out", help="folder; runs/<scenario>-compare-<time> by default")

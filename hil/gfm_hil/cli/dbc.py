@@ -21,7 +21,7 @@ _RATES = {
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("dbc", help="the CAN link's DBC file, or its bus budget")
+    command = commands.add_parser("dbc")
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
     command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")

@@ -21,7 +21,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "deploy",
-        help="write the service units, container files, CAN units and tuning script to a folder",
         description="Write what is in deploy/: units of systemd, container files, units of CAN "
         "interfaces and the script that tunes a machine for real time.",
     )

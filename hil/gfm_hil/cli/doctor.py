@@ -18,7 +18,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "doctor",
-        help="what timing on this machine depends on, and what to do about it",
         description="Judge this machine for real time; it only looks, for about a second.",
     )
     command.add_argument("--json", action="store_true", help="all facts and findings as JSON")

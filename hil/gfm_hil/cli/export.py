@@ -14,7 +14,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "export",
-        help="a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",
         description="; ".join(f"{name}: {form.text}" for name, form in FORMATS.items()),
     )
     command.add_argument("folder", type=Path, help="the run folder")

@@ -13,7 +13,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "keys",
-        help="make a key pair per side, for ZeroMQ between two machines",
         description="Make a key pair per side, for ZeroMQ between two machines (CURVE).",
     )
     command.add_argument("--out", default="keys", help="folder (%(default)s)")

@@ -19,7 +19,7 @@ MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
 
 def add(commands: Any) -> None:
     """Add the command and its sub-command to the parser."""
-    command = commands.add_parser("laws", help="list the laws, or show one")
+    command = commands.add_parser("laws")
     command.add_argument("--json", action="store_true", help="as JSON")
     command.add_argument("--tuned", action="store_true", help="those with the league's gains")
     command.set_defaults(call=call_list)

@@ -7,6 +7,7 @@ otherwise, or its folder could not be completed; 130: interrupted.
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import re
 import sys
@@ -14,46 +15,43 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from gfm_hil.core.errors import Unfinished, UserError
-from gfm_plant import NoEquilibrium
-from gfm_runtime import LawError
-from gfm_runtime.errors import printable
-
-#: the module of each command; only the one that is called is imported, so that a side of a run
-#: starts without the design tools
-MODULES = {
-    "run": "run",
-    "tell": "tell",
-    "recover": "recover",
-    "scope": "scope",
-    "modbus": "modbus",
-    "export": "export",
-    "stream": "stream",
-    "compare": "compare",
-    "campaign": "campaign",
-    "bench": "bench",
-    "laws": "laws",
-    "design": "design",
-    "dbc": "dbc",
-    "doctor": "doctor",
-    "scenarios": "scenarios",
-    "keys": "keys",
-    "deploy": "deploy",
-    "controller": "sides",
-    "plant": "sides",
+#: each command's module and what it does. Only the module of the command that is called is
+#: imported, so that the help and the light commands load neither numba nor the design tools.
+COMMANDS = {
+    "run": ("run", "run a scenario and leave a run folder"),
+    "tell": ("tell", "have a run that is going on do something, or show where it is"),
+    "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
+    "scope": ("scope", "look at a run in the browser while it goes on, or afterwards"),
+    "modbus": ("modbus", "serve a run that is going on as a SunSpec device on Modbus/TCP"),
+    "export": ("export", "a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF"),
+    "stream": ("stream", "send on what a run records: PlotJuggler, own tools, Prometheus"),
+    "compare": ("compare", "run a scenario under several laws"),
+    "campaign": ("campaign", "run a scenario many times with drawn values"),
+    "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
+    "laws": ("laws", "list the laws, or show one"),
+    "design": ("design", "gamma, margins, and gains by H-infinity synthesis"),
+    "dbc": ("dbc", "the CAN link's DBC file, or its bus budget"),
+    "doctor": ("doctor", "what timing on this machine depends on, and what to do about it"),
+    "scenarios": ("scenarios", "list the scenarios that ship"),
+    "keys": ("keys", "make a key pair per side, for ZeroMQ between two machines"),
+    "deploy": ("deploy", "write service units, container files and the tuning script to a folder"),
+    "controller": ("sides", "start the controller alone; it binds the endpoint"),
+    "plant": ("sides", "start the plant emulator alone; it connects to the endpoint"),
 }
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """The parser of one command; of all of them if it is None or unknown."""
+    """The parser of one command with its options; that of no command only lists all of them."""
     top = argparse.ArgumentParser(
         prog="gfmhil", description="Hardware-in-the-loop bench for grid-forming converter control."
     )
     top.add_argument("--version", action="version", version=f"gfmhil {version('gfmhil')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    wanted = [MODULES[command]] if command in MODULES else dict.fromkeys(MODULES.values())
-    for module in wanted:
-        import_module(f"gfm_hil.cli.{module}").add(commands)
+    if command in COMMANDS:
+        import_module(f"gfm_hil.cli.{COMMANDS[command][0]}").add(commands)
+    else:
+        for name, (_, text) in COMMANDS.items():
+            commands.add_parser(name, help=text)
     return top
 
 
@@ -62,28 +60,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     for text in given:
         if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
-            return _refuse(f"{text}: -- cannot be a value; for a file of that name write ./--")
+            why = "-- cannot be a value; for a file of that name write ./--"
+            return _refuse(OSError(errno.EINVAL, why, text))
     options = parser(given[0] if given else None).parse_args(given)
     try:
         return int(options.call(options))
-    except (UserError, LawError, NoEquilibrium) as problem:
-        return _refuse(str(problem))
-    except Unfinished as problem:
-        _refuse(str(problem))
-        return 3
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # a reader such as head that has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to flush
         return 0
-    except OSError as problem:
-        if problem.filename is None:  # not about a file that the user named
-            raise
-        return _refuse(f"{problem.filename}: {problem.strerror}")
+    except Exception as problem:
+        return _refuse(problem)
 
 
-def _refuse(problem: str) -> int:
-    """Print what is wrong, one line a mistake; returns the exit code."""
-    said = "\n".join(printable(line) for line in problem.split("\n"))
+def _refuse(problem: Exception) -> int:
+    """Print what the user can mend, one line a mistake; returns the exit code.
+
+    Raises:
+        Exception: the problem itself, if it is a mistake of ours.
+    """
+    from gfm_hil.core.errors import Unfinished, UserError  # these imports take longer than --help
+    from gfm_plant import NoEquilibrium
+    from gfm_runtime import LawError
+    from gfm_runtime.errors import printable
+
+    if isinstance(problem, OSError) and problem.filename is not None:  # a file that the user named
+        text = f"{problem.filename}: {problem.strerror}"
+    elif isinstance(problem, UserError | LawError | NoEquilibrium | Unfinished):
+        text = str(problem)
+    else:
+        raise problem
+    said = "\n".join(printable(line) for line in text.split("\n"))
     print(f"gfmhil: {said}", file=sys.stderr)
-    return 2
+    return 3 if isinstance(problem, Unfinished) else 2

@@ -18,7 +18,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "modbus",
-        help="serve a run that is going on as a SunSpec device on Modbus/TCP",
         description="Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end.",
     )
     command.add_argument("folder", nargs="?", type=Path, metavar="RUN", help="the run folder")

@@ -15,7 +15,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "recover",
-        help="complete the folder of a run that a kill or a full disk cut off",
         description=(
             "Complete the folder of a run that a kill, a power failure or a full disk cut off: "
             "signals, times, events, summary, figures and report of all that was recorded. "

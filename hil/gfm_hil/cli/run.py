@@ -28,7 +28,7 @@ from gfm_hil.scenario.model import INPROC, find_scenario
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("run", help="run a scenario and leave a run folder")
+    command = commands.add_parser("run")
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--out", help="run folder; runs/<scenario>-<time> by default")

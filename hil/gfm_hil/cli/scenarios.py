@@ -14,7 +14,7 @@ from gfm_hil.scenario.model import load_scenario, shipped_scenarios
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("scenarios", help="list the scenarios that ship")
+    command = commands.add_parser("scenarios")
     command.add_argument("--json", action="store_true", help="as JSON")
     command.set_defaults(call=call)
 

@@ -24,7 +24,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "scope",
-        help="look at a run in the browser while it goes on, or afterwards",
         description="Serves a page with the run's signals. Who opens it with the token that is "
         "printed can also control the run; others can look.",
     )

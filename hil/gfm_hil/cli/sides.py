@@ -9,7 +9,7 @@ from typing import Any
 
 from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.process import run_side
 from gfm_hil.engine.setup import make_bench
@@ -20,11 +20,8 @@ from gfm_hil.scenario.model import INPROC
 
 def add(commands: Any) -> None:
     """Add both commands to the parser."""
-    for side, text in (
-        ("controller", "start the controller alone; it binds the endpoint"),
-        ("plant", "start the plant emulator alone; it connects to the endpoint"),
-    ):
-        command = commands.add_parser(side, help=text)
+    for side in SIDES:
+        command = commands.add_parser(side)
         add_scenario_options(command)
         command.add_argument("--law", help="override law: catalogue name or law file")
         command.add_argument("--out", help="run folder; runs/<side>-<time> by default")

@@ -24,7 +24,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "stream",
-        help="send on what a run records while it goes on: PlotJuggler, own tools, Prometheus",
         description="Samples for PlotJuggler's ZeroMQ subscriber (JSON) and, at the next port, "
         "every tick in blocks for gfm_hil.telemetry.BlockReader. Ends with the run.",
     )

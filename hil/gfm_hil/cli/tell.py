@@ -17,7 +17,6 @@ def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "tell",
-        help="have a run that is going on do something, or show where it is",
         description="Without anything to tell: the newest tick as JSON.",
     )
     command.add_argument("folder", type=Path, help="the run folder")

@@ -9,7 +9,7 @@ from gfm_hil.cli.design import box, deploy, gamma, league, margins, tune
 
 def add(commands: Any) -> None:
     """Add the command and its sub-commands to the parser."""
-    command = commands.add_parser("design", help="gamma, and gains by H-infinity synthesis")
+    command = commands.add_parser("design")
     kinds = command.add_subparsers(dest="design", required=True, metavar="WHAT")
     for module in (gamma, margins, tune, box, deploy, league):
         module.add(kinds)
