@@ -195,6 +195,14 @@ def test_example_controller_passes_its_tests(tmp_path: Path) -> None:
     assert "3 passed" in done.stdout
 
 
+@pytest.mark.apt  # make, a C compiler, libzmq3-dev
+@pytest.mark.timeout(600)
+def test_example_controller_in_c_passes_its_tests(tmp_path: Path) -> None:
+    done = project("own_controller_c", tmp_path)
+    assert done.returncode == 0, done.stdout
+    assert "4 passed" in done.stdout
+
+
 def test_example_controller_is_droop_5_but_for_its_integrator(lab: Lab, tmp_path: Path) -> None:
     """Euler there, Tustin here: a response of the same law, to a part in a hundred."""
     source = (EXAMPLES / "own_law" / "laws" / "my-droop.toml").read_text(encoding="utf-8")
