@@ -1,4 +1,4 @@
-"""Figures and tables of experiments, cli, deploy, testing, streams: runs in process and writes
+"""Figures and tables of start, experiments, cli, deploy, testing, streams: runs in process and writes
 
     docs/_static/figures/*.png    the figures
     docs/tables/*.md              the numbers that the page quotes
@@ -16,6 +16,7 @@ from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
 from _figures.limit_cycle import limit_cycles
 from _figures.services import services
+from _figures.start import start
 from _figures.streams import from_mf4
 from _figures.testing import failed_assertion
 
@@ -51,6 +52,7 @@ def main() -> None:
     failed_assertion()
     from_mf4()
     services()
+    start()
     terminal()
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from _ext import (
+    connect_pages,
     design_pages,
     law_pages,
     modbus_pages,
@@ -36,7 +37,13 @@ MAKERS: dict[str, Callable[..., str]] = {
     "command": outputs.command,
     "modbus-droops": modbus_pages.droops,
     "modbus-registers": modbus_pages.registers,
-    "frame-layout": testing_pages.frame_layout,
+    "frame-examples": connect_pages.frame_examples,
+    "frame-layout": connect_pages.frame_layout,
+    "handshake": connect_pages.handshake,
+    "shm-layout": connect_pages.shm_layout,
+    "shm-slot": connect_pages.shm_slot,
+    "signals": connect_pages.signals,
+    "states": connect_pages.states,
     "scope-head": testing_pages.scope_head,
     "testing-calls": testing_pages.calls,
     "export-formats": stream_pages.export_formats,
