@@ -1,4 +1,4 @@
-"""Figures and tables of start, experiments, cli, deploy, testing, streams: runs in process and writes
+"""Figures and tables of start, experiments, cli, deploy, testing, streams: runs and writes
 
     docs/_static/figures/*.png    the figures
     docs/tables/*.md              the numbers that the page quotes

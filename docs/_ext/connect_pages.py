@@ -63,13 +63,10 @@ def frame_examples() -> str:
     return "\n".join(parts)
 
 
-def states() -> str:
-    """The codes of states and reasons."""
-    rows = ["| code | state | reason |", "|---|---|---|"]
-    for code in range(max(len(STATES), len(REASONS))):
-        state = STATES[code] if code < len(STATES) else "–"
-        rows.append(f"| {code} | {state} | {REASONS[code] if code else 'none'} |")
-    return "\n".join(rows)
+def codes(what: str) -> str:
+    """The codes of ``states`` or ``reasons``."""
+    texts = STATES if what == "states" else ("none", *REASONS[1:])
+    return "\n".join(["| code | |", "|---|---|", *(f"| {k} | {t} |" for k, t in enumerate(texts))])
 
 
 def signals() -> str:

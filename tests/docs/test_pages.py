@@ -52,6 +52,24 @@ def test_example_scenario_completes(example_run: Run) -> None:
     assert example_run.summary["status"] == "completed"
 
 
+def test_modes_of_the_example_law_are_looked_at_as_the_page_says(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "own-law.md").read_text("utf-8"), re.S)
+    monkeypatch.chdir(DOCS.parent)
+    exec(program, {})
+    rates = [float(line.split()[0]) for line in capsys.readouterr().out.splitlines()]
+    assert len(rates) == 4
+    assert max(rates) < 0
+
+
+def test_readme_names_pages_that_there_are() -> None:
+    text = (DOCS.parent / "README.md").read_text("utf-8")
+    named = re.findall(r"\]\(([^)#:]+)", text)
+    assert len(named) > 10
+    assert [name for name in named if not (DOCS.parent / name).is_file()] == []
+
+
 def documented(head: str) -> list[set[str]]:
     """The names in the first columns of the tables below a heading."""
     text = (DOCS / "scenarios.md").read_text(encoding="utf-8").split(f"## {head}\n", 1)[1]
