@@ -7,16 +7,15 @@ from functools import cache
 
 import numpy as np
 
-from gfm_design.model.linear import Mode, loop_modes
-from gfm_design.model.operating_point import operating_point
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.linear import Mode
 from gfm_hil.cli.laws import cell_text
-from gfm_plant import Plant, make_plant
+from gfm_plant import Plant
 from gfm_runtime import discretise, law_file, law_names, load_law
 from gfm_runtime.lawfile import ElementSpec, LawFile, Number
 from gfm_runtime.signals import REF_NAMES, U_NAMES, group
 
 T_S = 1e-4
-REF = np.array([s.default for s in group("ref")])
 BANDWIDTH_HZ = 300.0
 _GREEK = {"eta", "alpha", "gamma", "xi"}
 _SYMBOL = {s.name: s.symbol for s in (*group("u"), *group("ref"))}
@@ -132,9 +131,7 @@ def worst_mode(name: str, rig: bool) -> Mode:
 
     Ideal, or with one sample of delay and 300 Hz sensors.
     """
-    par, _ = make_plant(_plant(name, rig), T_S)
-    law = discretise(load_law(name).laws[0], T_S)
-    modes = loop_modes(par, law, operating_point(par, law, REF), REF)
+    modes = ClosedLoop.of(name, _plant(name, rig)).modes()
     return next(m for m in modes if m.frequency_hz > 1e-3 or m.sigma >= 0.0)
 
 

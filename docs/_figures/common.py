@@ -8,21 +8,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 
-from gfm_design.model.linear import Mode, ideal_modes, loop_modes
-from gfm_design.model.operating_point import operating_point
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.linear import Mode
 from gfm_hil.results.runner import Run, run_scenario
 from gfm_hil.scenario.model import Scenario, check_scenario, find_scenario
-from gfm_plant import Plant, make_plant
-from gfm_runtime import discretise, get_law
+from gfm_plant import Plant
+from gfm_runtime import get_law
 
 DOCS = Path(__file__).resolve().parents[1]
 FIGURES, TABLES = DOCS / "_static" / "figures", DOCS / "tables"
 LAWS = ("mimo-gfm", "vsg-2", "droop-5")
-T_S = 1e-4
-REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
 RIG: dict[str, Any] = {
     "delay": {"samples": 1},
     "sensors": {"bandwidth_hz": 300.0},
@@ -55,12 +52,7 @@ def run(case: Scenario) -> Run:
 
 def modes(law: str, plant: dict[str, Any], ideal: bool = False, **gains: float) -> list[Mode]:
     """Modes of a law's loop, longest lasting first."""
-    par, _ = make_plant(Plant.model_validate(plant), T_S)
-    discrete = discretise(get_law(law, **gains), T_S)
-    op = operating_point(par, discrete, REF)
-    if ideal:
-        return ideal_modes(par, discrete.law, op, REF)
-    return loop_modes(par, discrete, op, REF)
+    return ClosedLoop.of(get_law(law, **gains), Plant.model_validate(plant), ideal=ideal).modes()
 
 
 def within(found: Sequence[Mode], low: float, high: float) -> Mode:

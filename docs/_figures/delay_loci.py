@@ -6,16 +6,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from _figures.common import FIGURES, REF, T_S, dress, number, write_table
+from _figures.common import FIGURES, dress, number, write_table
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_design.model.case import Case
-from gfm_design.model.sampled import SampledLoop
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.results.figures import COLOURS
 from gfm_plant import Plant
-from gfm_runtime import discretise, get_law
 
 LAWS = (("mimo-gfm", "printed gains"), ("mimo-gfm-deployable", "deployable gains"))
 SENSORS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -26,9 +24,8 @@ DELAYS = np.arange(0.0, 500.5, 2.5)  # us
 LC, BELOW = (900.0, 1300.0), (20.0, 900.0)  # Hz
 
 
-def _loop(law: str, sensors: int) -> SampledLoop:
-    plant = Plant.model_validate(SENSORS[sensors][1])
-    return Case(plant, discretise(get_law(law), T_S), REF).loop()
+def _loop(law: str, sensors: int) -> ClosedLoop:
+    return ClosedLoop.of(law, Plant.model_validate(SENSORS[sensors][1]))
 
 
 @cache
@@ -36,8 +33,7 @@ def poles(law: str, sensors: int) -> tuple[NDArray[np.complex128], ...]:
     """log(z)/T_s of the upper half plane [1/s, rad/s], for each of DELAYS."""
     loop, found = _loop(law, sensors), []
     for delay in DELAYS:
-        z = np.linalg.eigvals(loop.closed(loop.with_delay(delay * 1e-6))).astype(complex)
-        s = np.log(z[np.abs(z) > 1e-9]) / T_S
+        s = loop.later(delay * 1e-6).poles()
         found.append(s[s.imag >= 0.0])
     return tuple(found)
 

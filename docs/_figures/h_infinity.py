@@ -94,7 +94,7 @@ def channels(found: Tuned) -> None:
         tops = [bound]
         for name, colour, width, of, tuned in cases:
             values = starts(of) if tuned is None else tuned.values
-            loop, norms = of.loop(values), of.channels(values)
+            loop, norms = of.closed_loop(values).performance(), of.channels(values)
             omega = _omega(loop)
             size = _size(loop, weight, omega)
             a.loglog(omega, size, color=colour, lw=width, label=name)

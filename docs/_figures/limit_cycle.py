@@ -8,9 +8,7 @@ from typing import Any
 from _figures.common import (
     FIGURES,
     GREY,
-    REF,
     RIG,
-    T_S,
     modes,
     run,
     scenario,
@@ -22,11 +20,10 @@ from _figures.steps import window
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_design.model.operating_point import operating_point
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.results.figures import COLOURS
 from gfm_hil.results.runner import Run
-from gfm_plant import Plant, make_plant
-from gfm_runtime import discretise, get_law
+from gfm_plant import Plant
 
 LSB = 2.0 / 2**12  # of E_u on the DS2101, p.u.
 CHOKES: tuple[dict[str, float], ...] = (
@@ -92,8 +89,8 @@ def _relay(plant: dict[str, Any], one: Run) -> list[str]:
         kappa = (low + high) / 2
         found = modes("vsg-2", plant, k_34=1.9048 * kappa, k_35=38.0954 * kappa)
         low, high = (kappa, high) if within(found, 40, 60).sigma < 0 else (low, kappa)
-    par, _ = make_plant(Plant.model_validate(plant), T_S)
-    phi = operating_point(par, discretise(get_law("vsg-2"), T_S), REF).u[2] / LSB % 1.0
+    op = ClosedLoop.of("vsg-2", Plant.model_validate(plant)).made_of.op
+    phi = op.u[2] / LSB % 1.0
     sine, cosine = math.sin(math.pi * phi), abs(math.cos(math.pi * phi))
     least = 2 * sine * (1 + cosine) / math.pi
     if least < kappa:

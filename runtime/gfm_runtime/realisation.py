@@ -9,12 +9,14 @@ that a time constant of microseconds beside one of seconds stays well conditione
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.elements import INTEGRATOR, Factor, Polynomial, over, poly_add, poly_mul, union
+from gfm_runtime.elements import INTEGRATOR, Polynomial, over, poly_add, poly_mul, union
 from gfm_runtime.errors import LawError
 from gfm_runtime.law import Law, cell_name
 from gfm_runtime.signals import NU, NY, REF_NAMES
@@ -56,6 +58,16 @@ class LawStateSpace:
         return CX @ B_r + self.D_r, CX @ B_y + self.D_y
 
 
+class Row(NamedTuple):
+    """A row of a law in observer form: A (m,m), B_r and B_y (m,5), D_r and D_y (5,)."""
+
+    A: Matrix
+    B_r: Matrix
+    B_y: Matrix
+    D_r: Matrix
+    D_y: Matrix
+
+
 def realise(law: Law) -> LawStateSpace:
     """State space of a law.
 
@@ -63,25 +75,35 @@ def realise(law: Law) -> LawStateSpace:
         LawError: two integrators in series through omega_u, a coefficient that is not finite.
     """
     _check_series(law)
-    blocks = [_row(law, i) for i in range(NU)]
-    n = sum(len(a) for a, *_ in blocks)
-    A, C = np.zeros((n, n)), np.zeros((NU, n))
-    B_r, B_y = np.zeros((n, NY)), np.zeros((n, NY))
-    D_r, D_y = np.zeros((NU, NY)), np.zeros((NU, NY))
-    rows: list[int] = []
-    for i, (a, b_r, b_y, d_r, d_y) in enumerate(blocks):
-        k = slice(len(rows), len(rows) + len(a))
-        A[k, k], B_r[k], B_y[k], D_r[i], D_y[i] = a, b_r, b_y, d_r, d_y
-        if len(a):
-            C[i, k.start] = 1.0
-        rows += [i] * len(a)
-    u_0, D_u0 = np.zeros(NU), np.zeros((NU, NY))
-    for i, value in enumerate(law.u_0):
+    return assemble([_row(law, i) for i in range(NU)], law.u_0)
+
+
+def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
+    """The state space of a law, or of several on a leading axis, from its three rows.
+
+    ``rows`` are as ``observer_form`` gives them, ``u_0`` as a ``Law`` has it.
+    """
+    many = rows[0].A.shape[:-2]
+    of_row = [i for i, row in enumerate(rows) for _ in range(row.A.shape[-1])]
+    n = len(of_row)
+    A, C = np.zeros((*many, n, n)), np.zeros((*many, NU, n))
+    B_r, B_y = np.zeros((*many, n, NY)), np.zeros((*many, n, NY))
+    D_r, D_y = np.zeros((*many, NU, NY)), np.zeros((*many, NU, NY))
+    at = 0
+    for i, row in enumerate(rows):
+        m = row.A.shape[-1]
+        k = slice(at, at + m)
+        A[..., k, k], B_r[..., k, :], B_y[..., k, :] = row.A, row.B_r, row.B_y
+        D_r[..., i, :], D_y[..., i, :] = row.D_r, row.D_y
+        C[..., i, at : at + min(1, m)] = 1.0
+        at += m
+    constant, D_u0 = np.zeros(NU), np.zeros((NU, NY))
+    for i, value in enumerate(u_0):
         if isinstance(value, str):
             D_u0[i, REF_NAMES.index(value)] = 1.0
         else:
-            u_0[i] = value
-    return LawStateSpace(A, B_r, B_y, C, D_r, D_y, D_u0, u_0, tuple(rows))
+            constant[i] = value
+    return LawStateSpace(A, B_r, B_y, C, D_r, D_y, D_u0, constant, tuple(of_row))
 
 
 def _check_series(law: Law) -> None:
@@ -101,52 +123,60 @@ def _check_series(law: Law) -> None:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused below
-def _row(law: Law, i: int) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
-    """Observer form of row i: A, B_r, B_y, D_r, D_y; its C is (1, 0, ..., 0)."""
+def _row(law: Law, i: int) -> Row:
+    """Observer form of row i."""
     phi = [law.element("phi", (i, j)) for j in range(NY)]
     psi = [law.element("psi", (i, j)) for j in range(NY)]
     den = union([e.den for e in (*phi, *psi)])
-    d, m = _expand(den)
-    A = np.zeros((m, m))
-    for k in range(m):
-        A[k, 0] = -d[m - 1 - k]
-        if k + 1 < m:
-            A[k, k + 1] = 1.0
-    B_r, B_y = np.zeros((m, NY)), np.zeros((m, NY))
-    D_r, D_y = np.zeros(NY), np.zeros(NY)
-    for j in range(NY):
-        on_error, feedback = over(phi[j], den), over(psi[j], den)
-        on_y = poly_add([-c for c in on_error], [-c for c in feedback])
-        D_r[j], B_r[:, j] = _numerator(on_error, den, d)
-        D_y[j], B_y[:, j] = _numerator(on_y, den, d)
-    if not all(np.isfinite(part).all() for part in (A, B_r, B_y, D_r, D_y)):
-        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
-    T = 2.0 ** np.round(np.log2(_scale(d)) * np.arange(m))  # exact powers of two; T[0] = 1
-    return A * T[None, :] / T[:, None], B_r / T[:, None], B_y / T[:, None], D_r, D_y
-
-
-def _expand(den: tuple[Factor, ...]) -> tuple[Polynomial, int]:
-    """Monic polynomial of the factors (ascending, without the leading 1) and its degree."""
     d: Polynomial = (1.0,)
     for factor in den:
         d = poly_mul(d, [c / factor[-1] for c in factor])
-    return d[:-1], len(d) - 1
-
-
-def _numerator(num: Polynomial, den: tuple[Factor, ...], d: Polynomial) -> tuple[float, Matrix]:
-    """Feed-through and observer-form input column of num(s)/den(s)."""
-    m = len(d)
+    on_r, on_y = np.zeros((NY, len(d))), np.zeros((NY, len(d)))
     lead = math.prod(f[-1] for f in den)
-    b = np.zeros(m + 1)
-    b[: len(num)] = np.asarray(num) / lead
-    through = float(b[m])
-    return through, (b[:m] - through * np.asarray(d))[::-1]
+    for j in range(NY):
+        on_error, feedback = over(phi[j], den), over(psi[j], den)
+        on_measured = poly_add([-c for c in on_error], [-c for c in feedback])
+        on_r[j, : len(on_error)] = np.asarray(on_error) / lead
+        on_y[j, : len(on_measured)] = np.asarray(on_measured) / lead
+    monic = np.asarray(d)
+    T: Matrix = np.exp2(np.round(np.log2(powers(monic))))  # exact powers of two; the first is 1
+    row = observer_form(monic, on_r, on_y, T)
+    if not all(np.isfinite(part).all() for part in row):
+        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
+    return row
 
 
-def _scale(d: Polynomial) -> float:
-    """A typical frequency of the polynomial: geometric mean of its non-zero roots."""
-    nonzero = [(k, c) for k, c in enumerate(d) if c != 0.0]
-    if not nonzero or len(d) < 2:
-        return 1.0
-    k, c = nonzero[0]
-    return float(abs(c) ** (1.0 / (len(d) - k)))
+def observer_form(d: Matrix, on_r: Matrix, on_y: Matrix, T: Matrix) -> Row:
+    """One row of a law as a state space: A, B_r, B_y, D_r, D_y; its C is (1, 0, ..., 0).
+
+    Coefficients are in ascending powers of s and may have leading axes.
+
+    Args:
+        d: common denominator with leading coefficient 1, shape (..., m+1).
+        on_r, on_y: numerators, shape (..., 5, m+1).
+        T: scales of the states, shape (..., m).
+    """
+    m = d.shape[-1] - 1
+    A = np.zeros((*d.shape[:-1], m, m))
+    if m:
+        A[..., 0] = -d[..., m - 1 :: -1]
+        A[..., : m - 1, 1:] = np.eye(m - 1)
+    D_r, D_y = on_r[..., m], on_y[..., m]
+    B_r, B_y = (
+        np.swapaxes(b[..., :m] - b[..., m:] * d[..., None, :m], -1, -2)[..., ::-1, :]
+        for b in (on_r, on_y)
+    )
+    across, down = T[..., None, :], T[..., None]
+    return Row(A * across / down, B_r / down, B_y / down, D_r, D_y)
+
+
+def powers(d: Matrix) -> Matrix:
+    """Powers 0 to m-1 of a typical frequency of monic polynomials (..., m+1), shape (..., m).
+
+    The frequency is the geometric mean of the non-zero roots. All polynomials are taken to have as
+    many roots at 0 as the first.
+    """
+    m = d.shape[-1] - 1
+    zeros = int(np.argmax(d.reshape(-1, m + 1)[0] != 0.0))
+    typical = np.abs(d[..., zeros]) ** (1.0 / max(m - zeros, 1))
+    return np.asarray(typical)[..., None] ** np.arange(m)

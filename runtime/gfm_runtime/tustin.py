@@ -59,19 +59,44 @@ class DiscreteLaw:
 
     def closed(self) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix, Matrix]:
         """(A, B_r, B_y, C, D_r, D_y) with the omega_u loop closed; column 3 of B_y, D_y is 0."""
-        gain = 1.0 / (1.0 - self.D_y[OMEGA_ROW, OMEGA_COLUMN])
-        b, d = self.B_y[:, [OMEGA_COLUMN]] * gain, self.D_y[:, [OMEGA_COLUMN]] * gain
-        B_y, D_y = self.B_y.copy(), self.D_y.copy()
-        B_y[:, OMEGA_COLUMN], D_y[:, OMEGA_COLUMN] = 0.0, 0.0
-        c, d_r, d_y = self.C[[OMEGA_ROW]], self.D_r[[OMEGA_ROW]], D_y[[OMEGA_ROW]]
-        return (
-            self.A + b @ c,
-            self.B_r + b @ d_r,
-            B_y + b @ d_y,
-            self.C + d @ c,
-            self.D_r + d @ d_r,
-            D_y + d @ d_y,
-        )
+        B, D = np.hstack([self.B_y, self.B_r]), np.hstack([self.D_y, self.D_r])
+        A, B, C, D = close_omega_u(self.A, B, self.C, D)
+        return A, B[:, NY:], B[:, :NY], C, D[:, NY:], D[:, :NY]
+
+
+def close_omega_u(
+    A: Matrix, B: Matrix, C: Matrix, D: Matrix
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """A law's state space (x' = A x + B (y, r), u = C x + D (y, r)) with its omega_u loop closed.
+
+    Solves omega_u = (...) + D[1,2] omega_u; columns 2 of the new B and D are 0. Shapes (..., n, n),
+    (..., n, m), (..., 3, n), (..., 3, m) with m >= 5; the matrices may be those of several laws.
+    """
+    row, column = [OMEGA_ROW], [OMEGA_COLUMN]
+    gain = 1.0 / (1.0 - D[..., row, :][..., column])
+    b, d = B[..., column] * gain, D[..., column] * gain
+    B, D = B.copy(), D.copy()
+    B[..., column], D[..., column] = 0.0, 0.0
+    c_omega, d_omega = C[..., row, :], D[..., row, :]
+    return A + b @ c_omega, B + b @ d_omega, C + d @ c_omega, D + d @ d_omega
+
+
+def tustin(
+    A: Matrix, B: Matrix, C: Matrix, D: Matrix, half: float
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Tustin's discretisation of dx/dt = A x + B w, z = C x + D w, any number of w and z.
+
+    The matrices may have leading axes. ``half`` is half the sampling time in s, or what replaces it
+    for prewarping: s = (z - 1)/(z + 1)/half.
+    """
+    eye = np.eye(A.shape[-1])
+    backward = np.linalg.inv(eye - half * A)
+    return (
+        backward @ (eye + half * A),
+        backward @ B * (2 * half),
+        C @ backward,
+        D + half * C @ backward @ B,
+    )
 
 
 def discretise(law: Law, T_s: float, prewarp: float | None = None) -> DiscreteLaw:
@@ -89,12 +114,9 @@ def discretise(law: Law, T_s: float, prewarp: float | None = None) -> DiscreteLa
             raise LawError("prewarp", f"{prewarp} rad/s must lie in (0, {math.pi / T_s:g})")
         half = math.tan(prewarp * T_s / 2) / prewarp
     ss = realise(law)
-    eye = np.eye(ss.order)
-    backward = np.linalg.inv(eye - half * ss.A)
-    A = backward @ (eye + half * ss.A)
-    B_r, B_y = backward @ ss.B_r * (2 * half), backward @ ss.B_y * (2 * half)
-    C = ss.C @ backward
-    D_r, D_y = ss.D_r + half * ss.C @ backward @ ss.B_r, ss.D_y + half * ss.C @ backward @ ss.B_y
+    B, D = np.hstack([ss.B_r, ss.B_y]), np.hstack([ss.D_r, ss.D_y])
+    A, B, C, D = tustin(ss.A, B, ss.C, D, half)
+    B_r, B_y, D_r, D_y = B[:, :NY], B[:, NY:], D[:, :NY], D[:, NY:]
     W, E_r, E_y, F, G = (np.zeros((ss.order, k)) for k in (NU, NY, NY, NU, NU))
     for i in range(NU):
         k = np.flatnonzero(np.asarray(ss.rows) == i)

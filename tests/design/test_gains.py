@@ -55,7 +55,7 @@ def test_a_law_as_a_function_of_its_gains(law: str) -> None:
         for s in 1j * np.logspace(-1, 4, 12):
             exact, many = (
                 C @ np.linalg.solve(s * np.eye(len(A)) - A, B.astype(complex)) + D
-                for A, B, C, D in (problem.loop(row), loop)
+                for A, B, C, D in (problem.closed_loop(row).performance(), loop)
             )
             np.testing.assert_allclose(many, exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
 
@@ -98,13 +98,13 @@ def test_gains_in_the_error_map_cancelling_factors_and_gains_that_make_no_law() 
     values = np.array([[0.02, 0.004, 2.0], [0.05, 0.006, -1.0], [0.05, 0.02, 1.0]])
     A, B, C, D = problem.loops(values)
     for k in (0, 1):
-        a, b, c, d = problem.loop(values[k])
+        a, b, c, d = problem.closed_loop(values[k]).performance()
         assert len(a) == A.shape[1]
         exact = c @ np.linalg.solve(10j * np.eye(len(a)) - a, b.astype(complex)) + d
         many = C[k] @ np.linalg.solve(10j * np.eye(len(a)) - A[k], B[k].astype(complex)) + D[k]
         np.testing.assert_allclose(many, exact, rtol=1e-9, atol=1e-12)
     with pytest.raises(LawError, match="must be > 0"):
-        problem.loop(values[2])  # T_f = -0.01 s
+        problem.closed_loop(values[2])  # T_f = -0.01 s
     assert np.isnan(A[2]).any()
     assert problem(values[2]) > UNSTABLE
 

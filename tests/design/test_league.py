@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.law_comparison import T_S, as_it_is, gamma, late_case, search, stands
+from gfm_design.tuning.law_comparison import as_it_is, gamma, late_loop, search, stands
 from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
-from gfm_design.tuning.law_comparison_modes import Culprit, culprit, late_culprit
+from gfm_design.tuning.law_comparison_modes import Culprit, culprit
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
+
+from .support import reference_loop
 
 SHORT = {"seed": 0, "evaluations": 64, "starts": 1}
 
@@ -32,8 +35,8 @@ def test_participation_is_how_far_the_mode_moves_with_a_state() -> None:
     file = law_file("droop-1")
     problem = PaperProblem(file, free_gains(file))
     values = np.array([g.start for g in problem.gains])
-    found = culprit(problem, values)
-    A = problem.loop(values)[0]
+    found = culprit(problem.closed_loop(values))
+    A = problem.closed_loop(values).A
     target = found.mode.sigma + 2j * np.pi * found.mode.frequency_hz
     moved = []
     for k in range(len(A)):
@@ -92,7 +95,8 @@ def test_the_stacked_late_loop_is_the_exact_one(name: str) -> None:
     file = law_file(name)
     problem = PaperProblem(file, free_gains(file))
     at = np.array([g.start for g in problem.gains])
-    modes = late_case(file, problem.law.named(at)).loop().closed()
+    late = late_loop(file, problem.law.named(at))
+    modes = reference_loop(late.made_of.par, late.plant, late.law)
     sigma = np.log(np.abs(np.linalg.eigvals(modes)).max()) / T_S
     np.testing.assert_allclose(LateProblem(problem).sigma(np.array([at, at])), sigma, atol=1e-6)
 
@@ -117,7 +121,7 @@ def test_the_search_ends_at_gains_that_can_be_run() -> None:
 
 
 def test_a_late_culprit_names_the_states_of_the_sampled_loop() -> None:
-    found = late_culprit(late_case(law_file("mimo-gfm"), {}))
+    found = culprit(late_loop(law_file("mimo-gfm"), {}))
     assert found.mode.frequency_hz == pytest.approx(1180, abs=2)
     assert found.mode.sigma == pytest.approx(22.6, abs=0.1)
     assert {name for name, _ in found.states} & {"i_d", "i_q", "v_d", "v_q"}

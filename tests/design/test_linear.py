@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gfm_design.model.linear import (
-    Mode,
-    hold,
-    ideal_modes,
-    linearise_law,
-    linearise_plant,
-    loop_modes,
-    sampled_loop,
-)
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.linear import Mode, hold, linearise_plant
 from gfm_design.model.operating_point import operating_point
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import Bench, make_bench
@@ -37,12 +30,8 @@ REGULATED = {"dc_source": {"mode": "regulated"}}
 
 
 def modes(law: str, plant: dict[str, Any], T_s: float = 1e-4, ideal: bool = False) -> list[Mode]:
-    par, _ = make_plant(Plant.model_validate(plant), T_s)
-    discrete = discretise(get_law(law), T_s)
-    op = operating_point(par, discrete, REF)
-    if ideal:
-        return ideal_modes(par, discrete.law, op, REF)
-    return loop_modes(par, discrete, op, REF)
+    options = Plant.model_validate(plant)
+    return ClosedLoop.of(law, options, REF, T_s=T_s, ideal=ideal).modes()
 
 
 def near(found: list[Mode], frequency_hz: float) -> Mode:
@@ -92,17 +81,14 @@ def bench_of(law: str, plant: dict[str, Any], duration: float) -> Bench:
 def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, place: Path) -> Any:
     """(simulated, predicted) deviation of the measured p after a jump of delta by ``angle``."""
     bench = bench_of(law, plant, ticks * 1e-4)
-    c, d = bench.controller, bench.controller.active_law
-    linear = linearise_plant(bench.par, bench.start)
-    controlled = bench.par[0]["i_u_gain"] != 0.0
-    reaction = linearise_law(d.law, d, bench.start, REF, controlled)
-    step = sampled_loop(bench.par, linear, reaction)
-    x = np.zeros(len(step))
+    c = bench.controller
+    loop = ClosedLoop.of(c.active_law, bench.scenario.plant, REF)
+    x = np.zeros(len(loop.A))
     x[DELTA] = angle
     predicted = np.empty(ticks)
     for k in range(ticks):
-        predicted[k] = linear.C[1] @ x[: len(linear.A)]
-        x = step @ x
+        predicted[k] = loop.plant.C[1] @ x[: len(loop.plant.A)]
+        x = loop.A @ x
     bench.st["x"][0, DELTA] += angle
     parts = [Part.create(place, side, ticks) for side in ("plant", "controller")]
     done = run_ticks(

@@ -19,45 +19,47 @@ from gfm_design.margins.tolerance import (
     CEILING,
     FLOOR,
     element_ranges,
+    factor,
     grid_strength,
-    radius,
+    sigma,
     stable_region,
 )
-from gfm_design.model.case import Case
-from gfm_design.model.linear import LinearLaw, LinearPlant, sampled_loop
-from gfm_design.model.operating_point import operating_point
-from gfm_design.model.sampled import SampledLoop, outermost
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.linear import LinearLaw, LinearPlant
 from gfm_hil.cli import main
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.recorder import PLANT_COLUMNS, Part
 from gfm_hil.results.loop_delay import read_loop_delay
 from gfm_hil.scenario.model import check_scenario, load_scenario
-from gfm_plant import make_plant
+from gfm_plant import load_converter
 from gfm_plant.model import DELTA
-from gfm_runtime import discretise, load_law
+
+from .support import reference_loop
 
 T = 0.01
 
 
-def chain(num: list[float], den: list[float], gain: float, samples: float = 0.0) -> SampledLoop:
+def chain(num: list[float], den: list[float], gain: float, samples: float = 0.0) -> ClosedLoop:
     """One loop: E_u drives num/den, read as V and fed back by -gain."""
     A, B, C, _ = control.ssdata(control.ss(control.tf(num, den)))
     n = len(A)
-    plant = LinearPlant(A, np.zeros((n, 3)), np.zeros((n, 2)), np.zeros((5, n)))
-    plant.B[:, 2], plant.C[4] = B[:, 0], C[0]
+    reads = np.zeros((5, n))
+    reads[4] = C[0]
+    plant = LinearPlant(A, np.zeros((n, 3)), np.zeros((n, 2)), reads, reads)
+    plant.B[:, 2] = B[:, 0]
     D = np.zeros((3, 5))
     D[2, 4] = -gain
     law = LinearLaw(
         np.zeros((0, 0)), np.zeros((0, 5)), np.zeros((3, 0)), D, np.zeros((0, 5)), np.zeros((3, 5))
     )
-    return SampledLoop(plant, law, T, samples * T)
+    return ClosedLoop(plant, law, T, samples * T)
 
 
-def case_of(law: str, scenario: str, **plant: Any) -> Case:
+def loop_of(law: str, scenario: str, **plant: Any) -> ClosedLoop:
     s = load_scenario(scenario)
     changed = type(s.plant).model_validate({**s.plant.model_dump(exclude_unset=True), **plant})
-    return Case(changed, discretise(load_law(law).laws[0], 1e-4), np.array(s.references.vector()))
+    return ClosedLoop.of(law, changed, s.references.vector())
 
 
 def test_integrator_has_the_margins_that_algebra_gives() -> None:
@@ -76,9 +78,7 @@ def test_integrator_has_the_margins_that_algebra_gives() -> None:
     # H = (z - 1 - k T)/(2 (z - 1 + k T)) is largest at z = -1
     assert m.disk == pytest.approx(2 * (2 - k * T) / (2 + k * T), rel=1e-9)
     # one more whole sample: z (z - 1) + k T has its product of roots at k T
-    one = first_loss(
-        lambda g: abs(outermost(chain([1.0], [1.0, 0.0], g, 1.0).closed())), [1.0, 300.0]
-    )
+    one = first_loss(lambda g: chain([1.0], [1.0, 0.0], g, 1.0).sigma(), [1.0, 300.0])
     assert one == pytest.approx(1 / T, rel=1e-5)
 
 
@@ -87,8 +87,8 @@ def test_integrator_has_the_margins_that_algebra_gives() -> None:
 def test_fractional_delay_of_an_integrator(samples: float, part: float) -> None:
     # u acts with its delay: the integral over a tick is that of two held values, at u and at y
     loop = chain([1.0], [1.0, 0.0], 5.0, samples)
-    for extra in ({"u_extra": part * T}, {"y_extra": part * T}):
-        p = loop.with_delay(**extra)
+    for extra in ({"u": part * T}, {"y": part * T}):
+        p = loop.later(**extra).held
         total = samples + part
         x = np.zeros(len(p.A))
         y = []
@@ -104,7 +104,7 @@ def test_agrees_with_python_control() -> None:
     loop = chain([1200.0], [1.0, 10.0, 416.0, 800.0], 2.0)
     locus = locus_at_u(loop)
     m = gain_phase(locus, *locus.sampled(), 0)
-    p = loop.with_delay()
+    p = loop.held
     L = control.ss(p.A, p.B[:, [2]], 2.0 * p.C[[4]], 0, T)
     gm, pm, _, w_g, w_p, _ = control.stability_margins(L)
     assert m.gain_high == pytest.approx(gm, rel=1e-4)
@@ -120,10 +120,10 @@ def test_agrees_with_python_control() -> None:
 
 def test_scan_stops_at_the_first_loss() -> None:
     def island(value: float) -> float:  # lost in (2, 3) and from 7 on
-        return 1.5 if 2.0 < value < 3.0 or value > 7.0 else 0.5
+        return 0.5 if 2.0 < value < 3.0 or value > 7.0 else -0.5
 
     assert first_loss(island, list(np.arange(0.0, 10.0, 0.5))) == pytest.approx(2.0, rel=1e-5)
-    assert first_loss(lambda value: 0.5, [0.0, 1.0]) is None
+    assert first_loss(lambda value: -0.5, [0.0, 1.0]) is None
 
 
 def test_mu_of_known_matrices() -> None:
@@ -137,7 +137,7 @@ def test_mu_of_known_matrices() -> None:
 @pytest.mark.parametrize("at", [locus_at_u, locus_at_y])
 def test_disk_margin_is_mu(at: Any) -> None:
     slycot = pytest.importorskip("slycot")
-    locus = at(case_of("mimo-gfm", "rig_pref_step").loop())
+    locus = at(loop_of("mimo-gfm", "rig_pref_step"))
     m = len(locus.channels)
     found = disk_margin(locus)
     near = 2 * np.pi * found.frequency_hz * np.linspace(0.999, 1.001, 51)
@@ -159,27 +159,24 @@ CASES = [
 @pytest.mark.parametrize(("law", "scenario", "plant"), CASES)
 def test_loop_is_that_of_the_modes(law: str, scenario: str, plant: dict[str, Any]) -> None:
     # the emulator's own record of its delay, against the delay in seconds
-    case = case_of(law, scenario, **plant)
-    par, _ = make_plant(case.plant, 1e-4)
-    op = operating_point(par, case.law, case.ref)
-    loop = case.loop()
-    ours = np.sort(np.abs(np.linalg.eigvals(loop.closed())))[::-1]
-    theirs = np.sort(np.abs(np.linalg.eigvals(sampled_loop(par, loop.plant, loop.law))))[::-1]
+    loop = loop_of(law, scenario, **plant)
+    ours = np.sort(np.abs(np.linalg.eigvals(loop.A)))[::-1]
+    reference = reference_loop(loop.made_of.par, loop.plant, loop.law)
+    theirs = np.sort(np.abs(np.linalg.eigvals(reference)))[::-1]
     np.testing.assert_allclose(ours, theirs[: len(ours)], atol=1e-9)
-    assert op.u[0] > 0.0
+    assert loop.made_of.op.u[0] > 0.0
 
 
 @pytest.mark.parametrize(("law", "scenario", "plant"), CASES[1:4])
 def test_margins_are_where_eigenvalues_cross(
     law: str, scenario: str, plant: dict[str, Any]
 ) -> None:
-    loop = case_of(law, scenario, **plant).loop()
+    loop = loop_of(law, scenario, **plant)
     m = loop_margins(loop)
     assert all(c.confirmed for c in (*m.u, *m.y))
     if np.isfinite(m.delay.seconds):
         for share, held in ((0.99, True), (1.01, False)):
-            later = loop.with_delay(share * m.delay.seconds)
-            assert (abs(outermost(loop.closed(later))) < 1.0) is held
+            assert (loop.later(share * m.delay.seconds).sigma() < 0.0) == held
     # every channel's disk margin is at least that of all at once
     for channels, disk in ((m.u, m.disk_u), (m.y, m.disk_y)):
         assert min(c.gain_phase.disk for c in channels) >= disk.alpha * (1 - 1e-6)
@@ -188,8 +185,8 @@ def test_margins_are_where_eigenvalues_cross(
         for _ in range(100):
             turn = np.exp(2j * np.pi * rng.random(5))
             f = (1 + 0.999 * disk.alpha / 2 * turn) / (1 - 0.999 * disk.alpha / 2 * turn)
-            A = loop.factored(u=f[:3]) if channels is m.u else loop.factored(y=f)
-            assert abs(outermost(A)) < 1.0
+            changed = loop.scaled(u=f[:3]) if channels is m.u else loop.scaled(y=f)
+            assert changed.sigma() < 0.0
 
 
 def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> float:
@@ -210,7 +207,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
 
 def test_delay_margin_on_the_nonlinear_bench(tmp_path: Path) -> None:
     # the ideal mimo-gfm loses 1181 Hz half a sample out; 5 % of that is 2.6 us
-    margin = overall_delay(case_of("mimo-gfm", "pref_step").loop())
+    margin = overall_delay(loop_of("mimo-gfm", "pref_step"))
     assert 0.0 < margin.seconds < 1e-4
     fraction = margin.seconds / 1e-4
     for k, (share, grows) in enumerate(((0.95, False), (1.05, True))):
@@ -220,35 +217,36 @@ def test_delay_margin_on_the_nonlinear_bench(tmp_path: Path) -> None:
 
 
 def test_element_ranges_are_where_eigenvalues_cross() -> None:
-    case = case_of("mimo-gfm", "rig_pref_step")
+    loop = loop_of("mimo-gfm", "rig_pref_step")
     bounded = 0
-    for name, found in element_ranges(case).items():
+    for name, found in element_ranges(loop).items():
         assert found is not None
         for end, out in ((found.low, 1 / 1.01), (found.high, 1.01)):
-            now = case.factor(name)
+            now = factor(loop, name)
             inside = end.factor / (out if end.bounded else 1.0)
-            assert radius(case, {name: now * inside}) < 1.0
+            assert sigma(loop, {name: now * inside}) < 0.0
             if end.bounded:
                 bounded += 1
-                assert radius(case, {name: now * end.factor * out}) >= 1.0
+                assert sigma(loop, {name: now * end.factor * out}) >= 0.0
             else:
                 assert end.factor in (FLOOR, CEILING)
     assert bounded >= 3
 
 
 def test_grid_strength_and_region() -> None:
-    case = case_of("mimo-gfm", "rig_pref_step")
-    grid = grid_strength(case)
+    loop = loop_of("mimo-gfm", "rig_pref_step")
+    grid = grid_strength(loop)
     # the paper's line is 1.75 % of Z_b; R_g at half of it
-    assert grid.now == pytest.approx(1 / abs(case.line(1.0, 0.5)))
+    nominal = load_converter(loop.made_of.plant.converter).pu()
+    assert grid.now == pytest.approx(1 / abs(0.5 * nominal["R_g"] + 1j * nominal["L_g"]))
     assert grid.weakest == pytest.approx(grid.now / grid.range.high.factor)
     assert grid.range.high.lost is not None
     assert grid.range.high.lost.frequency_hz == pytest.approx(1008.0, abs=2.0)
-    region = stable_region(case, points=4)
+    region = stable_region(loop, points=4)
     for i, R_g in enumerate(region.R_g):
         for j, L_g in enumerate(region.L_g):
-            z = radius(case, {"L_g": float(L_g), "R_g": float(R_g)})
-            assert (z < 1.0) == (region.sigma[i, j] < 0.0)
+            found = sigma(loop, {"L_g": float(L_g), "R_g": float(R_g)})
+            assert (found < 0.0) == (region.sigma[i, j] < 0.0)
 
 
 def write_run(folder: Path, missed: slice) -> None:

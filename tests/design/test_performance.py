@@ -29,7 +29,7 @@ def test_printed_gains(law: str, gamma: float) -> None:
 @pytest.mark.parametrize("law", ["mimo-gfm", "vsg-2"])
 def test_channels_agree_with_control_and_a_dense_grid(law: str) -> None:
     p = problem(law)
-    A, B, C, D = p.loop(NONE)
+    A, B, C, D = p.closed_loop(NONE).performance()
     for channel, weight in zip(p.channels(NONE), PAPER_WEIGHTS, strict=True):
         system = channel_system((A, B, C, D), weight)
         assert channel.norm == pytest.approx(control.linfnorm(control.ss(*system))[0], rel=1e-6)

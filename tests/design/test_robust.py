@@ -7,18 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gfm_design.model.box import T_S, Box, Point
-from gfm_design.model.linear import linearise_law, linearise_plant, sampled_loop
+from gfm_design.margins.delays import overall_delay
+from gfm_design.model.box import Box, Point, Source
+from gfm_design.model.closed_loop import T_S
+from gfm_design.model.linear import linearise_law, linearise_plant
 from gfm_design.model.operating_point import operating_point
 from gfm_design.tuning.deployable import Round, deploy, steps
 from gfm_design.tuning.gains import FreeGain, free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.robust import Loops, RobustProblem, Wanted, paper_problem
 from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_hil.cli.design.box import delay_margin
 from gfm_hil.studies.box import step_run
 from gfm_plant import make_plant
 from gfm_runtime import discretise, get_law, law_file
+
+from .support import reference_loop
 
 LAW = "mimo-gfm-deployable"
 CONTROLLED, RIG = Box(dc=("controlled",)), Box(dc=("regulated",))
@@ -38,6 +41,10 @@ def sigma(points: list[Point], law: str = LAW) -> np.ndarray:
     return Loops(law_file(law), gains(law), points).sigma(start(law))
 
 
+def delay_margin(law: str, dc: Source = "controlled") -> float:
+    return overall_delay(Point(dc=dc).loop(law)).seconds
+
+
 @pytest.mark.parametrize(
     "point",
     [
@@ -48,13 +55,13 @@ def sigma(points: list[Point], law: str = LAW) -> np.ndarray:
     ],
 )
 def test_stack_is_the_sampled_loop(point: Point) -> None:
-    """Another program: the law discretised by the runtime, the loop by gfm_design.model.linear."""
+    """Another program: the law discretised by the runtime, its matrix by support.py."""
     par, _ = make_plant(point.plant(), T_S)
     # the printed k_35 is k_34/D_q to four digits; a search ties it exactly
     law = discretise(get_law("mimo-gfm", k_35=1.0844 / 0.05), T_S)
     op = operating_point(par, law, point.references())
     linear = linearise_law(law.law, law, op, point.references(), point.dc == "controlled")
-    loop = sampled_loop(par, linearise_plant(par, op), linear)
+    loop = reference_loop(par, linearise_plant(par, op), linear)
     expected = np.log(np.abs(np.linalg.eigvals(loop)).max()) / T_S
     # others beside it, so that it is found again among stacks of several shapes
     found = sigma([Point(delay=3.0), point, Point(L_g=5.0)], "mimo-gfm")
@@ -68,7 +75,7 @@ def test_overshoot_is_that_of_the_loop_stepped_tick_by_tick() -> None:
     op = operating_point(par, law, point.references())
     plant = linearise_plant(par, op)
     linear = linearise_law(law.law, law, op, point.references(), True)
-    loop = sampled_loop(par, plant, linear)
+    loop = reference_loop(par, plant, linear)
     n, m = len(plant.A), len(linear.A)
     x, by_ref = np.zeros(len(loop)), np.zeros(len(loop))
     by_ref[n : n + m], by_ref[n + m : n + m + 3] = linear.B_r[:, 1], linear.D_r[:, 1]

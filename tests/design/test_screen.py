@@ -42,7 +42,9 @@ def test_unstable_points_are_ranked_by_their_growth() -> None:
     values[:, [g.name for g in GAINS].index("k_34")] = (50.0, 70.0, 90.0)
     costs = PROBLEM.many(values)
     assert (costs > UNSTABLE).all()
-    assert np.argmax(costs) == np.argmax([culprit(PROBLEM, v).mode.sigma for v in values])
+    assert np.argmax(costs) == np.argmax(
+        [culprit(PROBLEM.closed_loop(v)).mode.sigma for v in values]
+    )
 
 
 def test_slopes_of_peaks_against_differences() -> None:

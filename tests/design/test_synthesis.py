@@ -105,7 +105,7 @@ def test_the_reason_when_there_are_none() -> None:
     problem = PaperProblem(file, free_gains(file))
     with pytest.raises(NotStabilised, match="no stabilising gains") as none:
         tune_paper(problem)
-    words = culprit(problem, none.value.values).words()
+    words = culprit(problem.closed_loop(none.value.values)).words()
     assert "mode at 50.7" in words
     assert "i_o" in words  # of the grid's current
 

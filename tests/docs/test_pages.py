@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_design.model.linear import loop_modes
-from gfm_design.model.operating_point import operating_point
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.norms.performance import PAPER_WEIGHTS
 from gfm_design.norms.weights import read_weights
 from gfm_hil.results.runner import Run, run_scenario
 from gfm_hil.scenario.model import load_scenario
-from gfm_plant import Plant, make_plant
-from gfm_runtime import discretise, get_law, load_law
+from gfm_plant import Plant
+from gfm_runtime import get_law, load_law
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 EXAMPLES = DOCS / "examples"
@@ -27,10 +26,8 @@ RIG = {"delay": {"samples": 1}, "sensors": {"bandwidth_hz": 300.0}}
 @pytest.mark.parametrize("name", ["my-law", "my-schedule", "droop-5-integral"])
 @pytest.mark.parametrize("plant", [{}, RIG])
 def test_example_law_is_stable(name: str, plant: dict) -> None:
-    par, _ = make_plant(Plant.model_validate(plant), 1e-4)
     for stage in load_law(str(EXAMPLES / f"{name}.toml")).laws:
-        law = discretise(stage, 1e-4)
-        assert loop_modes(par, law, operating_point(par, law, REF), REF)[0].sigma < -0.5
+        assert ClosedLoop.of(stage, Plant.model_validate(plant)).modes()[0].sigma < -0.5
 
 
 def test_droop_5_with_row_3_of_vsg_2_is_vsg_2_from_the_measurements() -> None:

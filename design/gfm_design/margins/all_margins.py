@@ -1,4 +1,4 @@
-"""All margins of a case: each loop on its own, all channels at once, delay, elements, the grid."""
+"""All margins of a loop: each loop on its own, all channels at once, delay, elements, the grid."""
 
 from __future__ import annotations
 
@@ -10,16 +10,9 @@ from gfm_design.margins.classical import GainPhase, gain_phase
 from gfm_design.margins.delays import DelayMargin, delay_at_u, delay_at_y, longest, overall_delay
 from gfm_design.margins.disk import DiskMargin, disk_margin
 from gfm_design.margins.locus import Locus, locus_at_u, locus_at_y
-from gfm_design.margins.tolerance import (
-    GridStrength,
-    Range,
-    element_ranges,
-    grid_strength,
-    mode_of,
-)
-from gfm_design.model.case import Case
+from gfm_design.margins.tolerance import GridStrength, Range, element_ranges, grid_strength
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
-from gfm_design.model.sampled import SampledLoop, outermost
 from gfm_plant.parameters import Element
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
@@ -82,25 +75,25 @@ class Margins:
     grid: GridStrength
 
 
-def margins(case: Case) -> Margins:
-    """All margins; takes some seconds.
+def margins(loop: ClosedLoop) -> Margins:
+    """All margins of a sampled loop made of a plant and a law; takes some seconds.
 
     Raises:
         UnstableLoop: there are none.
         NoEquilibrium: plant and law have no operating point.
     """
-    loop = loop_margins(case.loop())
-    return Margins(loop, element_ranges(case), grid_strength(case))
+    return Margins(loop_margins(loop), element_ranges(loop), grid_strength(loop))
 
 
-def loop_margins(loop: SampledLoop) -> LoopMargins:
+def loop_margins(loop: ClosedLoop) -> LoopMargins:
     """The margins of one sampled loop.
 
     Raises:
         UnstableLoop: there are none.
     """
-    worst = outermost(loop.closed())
-    mode = mode_of(worst, loop.T_s)
+    if loop.T_s is None:
+        raise ValueError("the margins are those of a sampled loop; sample it first")
+    mode = loop.modes()[0]
     if mode.sigma > -_AT_REST:
         raise UnstableLoop(mode)
     at_u, at_y = locus_at_u(loop), locus_at_y(loop)
@@ -115,7 +108,7 @@ def loop_margins(loop: SampledLoop) -> LoopMargins:
     )
 
 
-def _channels(loop: SampledLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargins, ...]:
+def _channels(loop: ClosedLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargins, ...]:
     names = U_NAMES if at_u else Y_NAMES
     omega, H = locus.sampled()
     found = []
@@ -127,14 +120,13 @@ def _channels(loop: SampledLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargi
     return tuple(found)
 
 
-def _confirmed(loop: SampledLoop, channel: int, at_u: bool, m: GainPhase) -> bool:
+def _confirmed(loop: ClosedLoop, channel: int, at_u: bool, m: GainPhase) -> bool:
     """Close the loop a little inside and outside of every margin and look at its eigenvalues."""
 
     def held(factor: complex) -> bool:
         by = np.ones(NU if at_u else NY, complex)
         by[channel] = factor
-        changed = loop.factored(u=by) if at_u else loop.factored(y=by)
-        return abs(outermost(changed)) < 1.0
+        return bool((loop.scaled(u=by) if at_u else loop.scaled(y=by)).sigma() < 0.0)
 
     good = True
     for gain in (m.gain_low, m.gain_high):

@@ -12,28 +12,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.sampled import SampledLoop, SampledPlant, outermost
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_runtime.signals import NU, NY
 
 _TOLERANCE = 1e-6  # relative, of what bisection ends with
 
 
-def first_loss(radius: Callable[[float], float], values: Sequence[float]) -> float | None:
+def first_loss(sigma: Callable[[float], float], values: Sequence[float]) -> float | None:
     """The last value known to be stable before the first loss; None if there is none.
 
     Args:
-        radius: spectral radius at a value; 1 and more is lost, inf where nothing can be said.
+        sigma: largest growth at a value; 0 and more is lost, inf where nothing can be said.
         values: what to scan, from the nearest to the furthest; the first one is taken as stable.
     """
     held = values[0]
     for value in values[1:]:
-        if radius(value) < 1.0:
+        if sigma(value) < 0.0:
             held = value
             continue
         lost = value
         while abs(lost - held) > _TOLERANCE * max(abs(lost), abs(held)):
             middle = 0.5 * (held + lost)
-            if radius(middle) < 1.0:
+            if sigma(middle) < 0.0:
                 held = middle
             else:
                 lost = middle
@@ -62,33 +62,34 @@ def longest(T_s: float) -> float:
     return float(np.clip(_LONGEST_S, least * T_s, most * T_s))
 
 
-def overall_delay(loop: SampledLoop) -> DelayMargin:
-    """Margin for more delay of all of u at once."""
+def overall_delay(loop: ClosedLoop) -> DelayMargin:
+    """Margin for more delay of all of u at once; 0 of a loop that does not hold as it is."""
     return _margin(loop, np.ones(NU), np.zeros(NY))
 
 
-def delay_at_u(loop: SampledLoop, channel: int) -> DelayMargin:
+def delay_at_u(loop: ClosedLoop, channel: int) -> DelayMargin:
     """Margin for more delay of one command alone."""
     return _margin(loop, np.eye(NU)[channel], np.zeros(NY))
 
 
-def delay_at_y(loop: SampledLoop, channel: int) -> DelayMargin:
+def delay_at_y(loop: ClosedLoop, channel: int) -> DelayMargin:
     """Margin for a later reading of one measurement alone."""
     return _margin(loop, np.zeros(NU), np.eye(NY)[channel])
 
 
-def _margin(loop: SampledLoop, u: Matrix, y: Matrix) -> DelayMargin:
-    def later(seconds: float) -> SampledPlant:
-        return loop.with_delay(u * seconds, y * seconds)
+def _margin(loop: ClosedLoop, u: Matrix, y: Matrix) -> DelayMargin:
+    if loop.T_s is None:
+        raise ValueError("a delay margin is that of a sampled loop; sample it first")
+    if loop.sigma() >= 0.0:
+        return DelayMargin(0.0, np.nan)
 
-    def radius(seconds: float) -> float:
-        return abs(outermost(loop.closed(later(seconds))))
+    def later(seconds: float) -> ClosedLoop:
+        return loop.later(u * seconds, y * seconds)
 
     scan, step = [0.0], _STEP * loop.T_s
     while scan[-1] < longest(loop.T_s):
         scan.append(min(longest(loop.T_s), max(scan[-1] + step, scan[-1] * _RATIO)))
-    held = first_loss(radius, scan)
+    held = first_loss(lambda seconds: later(seconds).sigma(), scan)
     if held is None:
         return DelayMargin(np.inf, np.nan)
-    z = outermost(loop.closed(later(held)))
-    return DelayMargin(held, float(abs(np.angle(z)) / (2 * np.pi * loop.T_s)))
+    return DelayMargin(held, later(held).modes()[0].frequency_hz)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.sampled import SampledLoop
+from gfm_design.model.closed_loop import ClosedLoop
 
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -71,20 +71,22 @@ class Locus:
         return omega, H
 
 
-def locus_at_u(loop: SampledLoop) -> Locus:
+def locus_at_u(loop: ClosedLoop) -> Locus:
     """H at u: all loops are cut at the commands, before their delay."""
-    p, c = loop.with_delay(), loop.law
+    p, c = loop.held, loop.law
     B = np.vstack([p.B, np.zeros((len(c.A), p.B.shape[1]))])
     return _locus(loop, B, np.hstack([c.D @ p.C, c.C]), loop.commands)
 
 
-def locus_at_y(loop: SampledLoop) -> Locus:
+def locus_at_y(loop: ClosedLoop) -> Locus:
     """H at y: all loops are cut at the measurements."""
-    p, c = loop.with_delay(), loop.law
+    p, c = loop.held, loop.law
     C = np.hstack([p.C, np.zeros((p.C.shape[0], len(c.A)))])
     return _locus(loop, np.vstack([p.B @ c.D, c.B]), C, loop.measurements)
 
 
-def _locus(loop: SampledLoop, B: Matrix, C: Matrix, channels: tuple[int, ...]) -> Locus:
+def _locus(loop: ClosedLoop, B: Matrix, C: Matrix, channels: tuple[int, ...]) -> Locus:
     k = list(channels)
-    return Locus(loop.closed(), B[:, k], C[k], loop.T_s, channels)
+    if loop.T_s is None:
+        raise ValueError("the margins are those of a sampled loop; sample it first")
+    return Locus(loop.A, B[:, k], C[k], loop.T_s, channels)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.margins.delays import first_loss
-from gfm_design.model.case import Case
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
-from gfm_design.model.sampled import outermost
 from gfm_plant import NoEquilibrium
 from gfm_plant.parameters import ELEMENTS, Element
 
@@ -67,56 +66,56 @@ class GridStrength:
         return self.now / self.range.high.factor
 
 
-def element_ranges(case: Case) -> dict[Element, Range | None]:
+def element_ranges(loop: ClosedLoop) -> dict[Element, Range | None]:
     """The range of every element; None for one whose value is 0 and has no percentage."""
     return {
-        name: element_range(case, (name,)) if case.factor(name) > 0.0 else None for name in ELEMENTS
+        name: element_range(loop, (name,)) if factor(loop, name) > 0.0 else None
+        for name in ELEMENTS
     }
 
 
-def element_range(case: Case, names: Sequence[Element]) -> Range:
-    """The range of one element, or of several together, each over its value in the case."""
-    now = {name: case.factor(name) for name in names}
-    return _range(case, lambda f: {name: v * f for name, v in now.items()})
+def factor(loop: ClosedLoop, element: Element) -> float:
+    """Real over nominal value of an element in a loop."""
+    return loop.made_of.plant.factors.get(element, 1.0)
 
 
-def grid_strength(case: Case) -> GridStrength:
+def element_range(loop: ClosedLoop, names: Sequence[Element]) -> Range:
+    """The range of one element, or of several together, each over its value in the loop."""
+    now = {name: factor(loop, name) for name in names}
+    return _range(loop, lambda f: {name: v * f for name, v in now.items()})
+
+
+def grid_strength(loop: ClosedLoop) -> GridStrength:
     """L_g and R_g together."""
-    L_g, R_g = case.factor("L_g"), case.factor("R_g")
-    found = _range(case, lambda f: {"L_g": L_g * f, "R_g": R_g * f})
-    Z = case.line(L_g, R_g)
-    return GridStrength(found, 1 / abs(Z), Z.imag / Z.real if Z.real else np.inf)
+    L_g, R_g = factor(loop, "L_g"), factor(loop, "R_g")
+    found = _range(loop, lambda f: {"L_g": L_g * f, "R_g": R_g * f})
+    R, X = (float(loop.made_of.par[name][0]) for name in ("R_g", "L_g"))
+    return GridStrength(found, 1 / np.hypot(R, X), X / R if R else np.inf)
 
 
-def _range(case: Case, at: Callable[[float], Mapping[Element, float]]) -> Range:
-    return Range(_end(case, at, FLOOR), _end(case, at, CEILING))
+def _range(loop: ClosedLoop, at: Callable[[float], Mapping[Element, float]]) -> Range:
+    return Range(_end(loop, at, FLOOR), _end(loop, at, CEILING))
 
 
-def _end(case: Case, at: Callable[[float], Mapping[Element, float]], last: float) -> End:
+def _end(loop: ClosedLoop, at: Callable[[float], Mapping[Element, float]], last: float) -> End:
     scan = np.geomspace(1.0, last, _POINTS)
-    held = first_loss(lambda f: radius(case, at(f)), [float(f) for f in scan])
+    held = first_loss(lambda f: sigma(loop, at(f)), [float(f) for f in scan])
     if held is None:
         return End(last, None, False)
     beyond = held * (1 + _BEYOND if last > 1.0 else 1 - _BEYOND)
     try:
-        z = outermost(case.loop(at(beyond)).closed())
+        lost = loop.changed(at(beyond)).modes()[0]
     except NoEquilibrium:
         return End(held, None, True)
-    return End(held, mode_of(z, case.law.T_s), True)
+    return End(held, lost, True)
 
 
-def radius(case: Case, factors: Mapping[Element, float]) -> float:
-    """Spectral radius at these factors; inf without an operating point."""
+def sigma(loop: ClosedLoop, factors: Mapping[Element, float]) -> float:
+    """Largest sigma at these factors, 1/s; inf without an operating point."""
     try:
-        return abs(outermost(case.loop(factors).closed()))
+        return float(loop.changed(factors).sigma())
     except NoEquilibrium:
         return float(np.inf)
-
-
-def mode_of(z: complex, T_s: float) -> Mode:
-    """The mode of one eigenvalue of the sampled loop."""
-    s = np.log(complex(z)) / T_s
-    return Mode(float(s.real), float(abs(s.imag) / (2 * np.pi)))
 
 
 Matrix = NDArray[np.float64]
@@ -134,14 +133,13 @@ class Region:
 
 
 def stable_region(
-    case: Case, points: int = POINTS, progress: Callable[[int], None] = lambda done: None
+    loop: ClosedLoop, points: int = POINTS, progress: Callable[[int], None] = lambda done: None
 ) -> Region:
     """Map the region, ``points`` each way, evenly by ratio; ``progress`` is told the rows done."""
     factors = np.geomspace(FLOOR, CEILING, points)
-    sigma = np.empty((points, points))
+    found = np.empty((points, points))
     for i, R_g in enumerate(factors):
         for j, L_g in enumerate(factors):
-            found = radius(case, {"L_g": float(L_g), "R_g": float(R_g)})
-            sigma[i, j] = np.log(found) / case.law.T_s if np.isfinite(found) else np.nan
+            found[i, j] = sigma(loop, {"L_g": float(L_g), "R_g": float(R_g)})
         progress(i + 1)
-    return Region(factors, factors, sigma)
+    return Region(factors, factors, np.where(np.isfinite(found), found, np.nan))

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from gfm_runtime.elements import INTEGRATOR, K_MAX, T_MAX, T_MIN, Element
 from gfm_runtime.expressions import evaluate_each
 from gfm_runtime.lawfile import ElementSpec, LawFile
-from gfm_runtime.realisation import LawStateSpace
-from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
+from gfm_runtime.realisation import LawStateSpace, Row, assemble, observer_form, powers
+from gfm_runtime.signals import NU, NY, U_NAMES
 
 Matrix = NDArray[np.float64]
 Columns = Mapping[str, Matrix]  # parameters by name, shape (N,) each
@@ -142,32 +142,15 @@ def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
     count = max(len(c) for c in numbers.values())
     builder = _Builder(numbers, count)
     rows = [_row(file, i, builder) for i in range(NU)]
-    of_row = tuple(i for i, row in enumerate(rows) for _ in range(row[0].shape[1]))
-    n = len(of_row)
-    A, C = np.zeros((count, n, n)), np.zeros((count, NU, n))
-    B_r, B_y = np.zeros((count, n, NY)), np.zeros((count, n, NY))
-    D_r, D_y = np.zeros((count, NU, NY)), np.zeros((count, NU, NY))
-    at = 0
-    for i, (a, b_r, b_y, d_r, d_y) in enumerate(rows):
-        k = slice(at, at + a.shape[1])
-        A[:, k, k], B_r[:, k], B_y[:, k], D_r[:, i], D_y[:, i] = a, b_r, b_y, d_r, d_y
-        C[:, i, at : at + min(1, a.shape[1])] = 1.0
-        at += a.shape[1]
-    A[~builder.usable], D_y[~builder.usable] = np.nan, np.nan
-    u_0, D_u0 = np.zeros(NU), np.zeros((NU, NY))
-    for i, name in enumerate(U_NAMES):
-        value = getattr(file.u_0, name)
-        if value in REF_NAMES:
-            D_u0[i, REF_NAMES.index(value)] = 1.0
-        else:
-            u_0[i] = value
-    return LawStateSpace(A, B_r, B_y, C, D_r, D_y, D_u0, u_0, of_row)
+    out = assemble(rows, [getattr(file.u_0, name) for name in U_NAMES])
+    out.A[~builder.usable], out.D_y[~builder.usable] = np.nan, np.nan
+    return out
 
 
-def _row(file: LawFile, i: int, builder: _Builder) -> tuple[Matrix, ...]:
-    """Observer form of row i: A (N,m,m), B_r, B_y (N,m,5), D_r, D_y (N,5)."""
+def _row(file: LawFile, i: int, builder: _Builder) -> Row:
+    """Observer form of row i, every matrix with a leading axis of N."""
     cells = {
-        (matrix, key): builder.cell(f"{matrix}_{key}", specs)
+        (matrix, int(key[1]) - 1): builder.cell(f"{matrix}_{key}", specs)
         for matrix, of in (("phi", file.phi), ("psi", file.psi))
         for key, specs in of.items()
         if key[0] == str(i + 1)
@@ -180,34 +163,12 @@ def _row(file: LawFile, i: int, builder: _Builder) -> tuple[Matrix, ...]:
     d = np.ones((len(builder.usable), 1))
     for factor in den:
         d = _product(d, factor)
-    lead, d = d[:, [-1]], d / d[:, [-1]]
-    m = d.shape[1] - 1
-    A = np.zeros((len(d), m, m))
-    if m:
-        A[:, :, 0] = -d[:, m - 1 :: -1]
-        A[:, : m - 1, 1:] = np.eye(m - 1)
-    B_r, B_y = np.zeros((len(d), m, NY)), np.zeros((len(d), m, NY))
-    D_r, D_y = np.zeros((len(d), NY)), np.zeros((len(d), NY))
-    for (matrix, key), cell in cells.items():
-        j = int(key[1]) - 1
-        num = cell.over(den)[:, : m + 1] / lead
-        b = np.pad(num, ((0, 0), (0, m + 1 - num.shape[1])))
-        through = b[:, m]
-        column = (b[:, :m] - through[:, None] * d[:, :m])[:, ::-1]
-        B_y[:, :, j] -= column
-        D_y[:, j] -= through
+    on_r, on_y = np.zeros((2, len(d), NY, d.shape[1]))
+    for (matrix, j), cell in cells.items():
+        num = cell.over(den)[:, : d.shape[1]] / d[:, [-1]]
+        on_y[:, j, : num.shape[1]] -= num
         if matrix == "phi":
-            B_r[:, :, j] += column
-            D_r[:, j] += through
-    T = _scale(d)[:, None] ** np.arange(m)
-    return A * T[:, None, :] / T[:, :, None], B_r / T[..., None], B_y / T[..., None], D_r, D_y
-
-
-def _scale(d: Matrix) -> Matrix:
-    """A typical frequency of monic polynomials: geometric mean of their non-zero roots.
-
-    Not rounded to powers of two as ``realise`` does: the matrices are to be smooth in the gains.
-    """
-    zeros = int(np.argmax(d[0] != 0.0))
-    order = d.shape[1] - 1 - zeros
-    return np.abs(d[:, zeros]) ** (1.0 / order) if order else np.ones(len(d))
+            on_r[:, j, : num.shape[1]] += num
+    monic = d / d[:, [-1]]
+    # not rounded to powers of two as in ``realise``: the matrices are to be smooth in the gains
+    return observer_form(monic, on_r, on_y, powers(monic))

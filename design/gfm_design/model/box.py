@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_design.model.closed_loop import T_S, ClosedLoop
 from gfm_plant import Plant
+from gfm_runtime.tustin import DiscreteLaw
 
 Matrix = NDArray[np.float64]
 
 Source = Literal["controlled", "regulated"]
+SOURCES: tuple[Source, ...] = get_args(Source)
 
-T_S = 1e-4  # s
 SENSORS_HZ = 300.0
 
 
@@ -49,6 +51,16 @@ class Point:
             }
         )
 
+    def loop(self, law: str | DiscreteLaw) -> ClosedLoop:
+        """The sampled loop of a law here.
+
+        Raises:
+            NoEquilibrium: there is no operating point.
+        """
+        # a plant's delay has a limit, that of a loop has none
+        prompt = ClosedLoop.of(law, replace(self, delay=0.0).plant(), self.references())
+        return prompt.later(self.delay * T_S)
+
     def references(self) -> Matrix:
         """(V_dcref, P_ref, omega_g, Q_ref, V_ref), p.u."""
         return np.array([1.0, self.P_ref, 1.0, 0.0, 1.0])
@@ -69,7 +81,7 @@ class Box:
     L_g: tuple[float, ...] = (0.8, 3.0, 10.0, 20.0)
     delay: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0, 5.0)
     P_ref: tuple[float, ...] = (0.0, 0.5, 1.0)
-    dc: tuple[Source, ...] = ("controlled", "regulated")
+    dc: tuple[Source, ...] = SOURCES
 
     def corners(self) -> list[Point]:
         """Every combination."""

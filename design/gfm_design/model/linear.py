@@ -1,16 +1,17 @@
-"""Small signals: the plant linearised at an operating point, and the modes of the loop it closes.
+"""Small signals: plant and law linearised at an operating point, and the plant from tick to tick.
 
 The plant's matrices come from ``gfm_plant.model.f`` and ``g`` by complex step, which takes no
-difference and is exact to rounding. The sampled loop is exact for the linearised plant too: u is
-held over the loop delay (whole samples and a fraction: the modified z-transform), the sensors'
-low-pass belongs to the plant that is held, and the law steps as the kernel steps it. Quantisation,
-noise and limits are left out. All in p.u. and s.
+difference and is exact to rounding. The sampled plant is exact too: each input is held over its
+delay (whole samples and a fraction: the modified z-transform), the sensors' low-pass belongs to
+the plant that is held, and delayed outputs are read between samples. Quantisation, noise and
+limits are left out. All in p.u. and s. ``model.closed_loop`` closes the loop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,39 +21,49 @@ from gfm_plant.model import N_X, V_DC, f, g
 from gfm_plant.records import PlantRecord
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
-from gfm_runtime.realisation import LawStateSpace, realise
+from gfm_runtime.realisation import LawStateSpace
 from gfm_runtime.signals import NU, NY
-from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw
+from gfm_runtime.tustin import DiscreteLaw, close_omega_u, tustin
 
 Matrix = NDArray[np.float64]
 
 _STEP = 1e-30  # complex step
 _NUDGE = 1e-6  # central differences, for the error map alone: it is compiled for real numbers
-_GONE = 1e-9  # |z| below this is gone within a tick: an emptied delay line, no mode
+_WHOLE = 1e-9  # samples; a fraction below this is rounding
 _MEASURED = [0, 1, 3, 4]  # the outputs that pass the sensors; omega_u does not
 
 
 @dataclass(frozen=True)
 class LinearPlant:
-    """dx/dt = A x + B u + B_d d,  y = C x: deviations from the operating point.
+    """x' = A x + B u + B_d d,  y = C x: deviations from the operating point.
 
-    Shapes: A (n,n), B (n,3), B_d (n,2), C (5,n). The first eight states are the plant's; one more
-    is the integral of a regulated DC source, four more are band-limited sensors. y is what the
-    controller is given; its row omega_u is 0, since a law is fed its own omega_u.
+    x' is dx/dt, or the x of the next tick. Shapes: A (n,n), B (n,3), B_d (n,2), C and C_true (5,n);
+    several plants have one leading axis more. The first eight states are those of
+    ``gfm_plant.model``; a regulated DC source adds its integral, band-limited sensors add four, and
+    a sampled plant ends with its delay lines. C gives what the controller reads and C_true what
+    the sensors measure. The omega_u row of both is 0, since a law is fed its own omega_u.
     """
 
     A: Matrix
     B: Matrix
     B_d: Matrix
     C: Matrix
+    C_true: Matrix
+
+    @classmethod
+    def stacked(cls, plants: Sequence[LinearPlant]) -> LinearPlant:
+        """Several plants of the same size on a leading axis."""
+        return cls(*(np.stack([getattr(p, f.name) for p in plants]) for f in fields(cls)))
 
 
 @dataclass(frozen=True)
 class LinearLaw:
     """The law around its operating point: x' = A x + B y + B_r r,  u = C x + D y + D_r r.
 
-    x' is dx/dt or the next x. The omega_u loop is closed and the error map is in the matrices, so
-    y and r are plain measurements and references. Rows that are not in force have no states.
+    x' is dx/dt, or the x of the next tick. The omega_u loop is closed and the error map is in the
+    matrices, so y and r are plain measurements and references. Shapes: A (m,m), B and B_r (m,5),
+    C (3,m), D and D_r (3,5); several laws have leading axes. ``rows`` names the row of u that each
+    state belongs to; rows that are not in force have no states.
     """
 
     A: Matrix
@@ -61,6 +72,20 @@ class LinearLaw:
     D: Matrix
     B_r: Matrix
     D_r: Matrix
+    rows: tuple[int, ...] = field(default=(), kw_only=True)
+
+    @property
+    def matrices(self) -> tuple[Matrix, ...]:
+        """(A, B, C, D, B_r, D_r)."""
+        return self.A, self.B, self.C, self.D, self.B_r, self.D_r
+
+    def sampled(self, T_s: float) -> LinearLaw:
+        """A continuous law at the sampling time T_s [s], by Tustin."""
+        inputs = np.concatenate([self.B, self.B_r], axis=-1)
+        through = np.concatenate([self.D, self.D_r], axis=-1)
+        A, B, C, D = tustin(self.A, inputs, self.C, through, T_s / 2)
+        parts = (A, B[..., :NY], C, D[..., :NY], B[..., NY:], D[..., NY:])
+        return LinearLaw(*parts, rows=self.rows)
 
 
 @dataclass(frozen=True)
@@ -75,6 +100,11 @@ class Mode:
         """Damping ratio, -sigma over the distance from s = 0."""
         size = float(np.hypot(self.sigma, 2 * np.pi * self.frequency_hz))
         return -self.sigma / size if size else 0.0
+
+    @classmethod
+    def of(cls, s: complex) -> Mode:
+        """The mode of a pole s [1/s]."""
+        return cls(float(s.real), float(abs(s.imag) / (2 * np.pi)))
 
 
 def linearise_plant(
@@ -95,16 +125,17 @@ def linearise_plant(
     B, B_d = np.zeros((n + sensors, NU)), np.zeros((n + sensors, 2))
     A[:N_X, :N_X], B[:N_X], B_d[:N_X] = np.split(slopes[:N_X], [N_X, N_X + NU], axis=1)
     C[_MEASURED, :N_X] = slopes[N_X:][_MEASURED, :N_X]
+    C_true = C.copy()
     if regulated:  # i_dc = k_p (1 - v_dc) + its integral, in place of i_u
         A[V_DC, V_DC] -= r["k_p"] * B[V_DC, 0]
         A[V_DC, N_X], A[N_X, V_DC] = B[V_DC, 0], -r["k_i"]
         B[:, 0] = 0.0
     if sensors:
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
-        C[:] = 0.0
+        C = np.zeros_like(C)
         C[_MEASURED, s] = np.eye(4)
     C[_MEASURED] *= r["gain"][:, None]
-    return LinearPlant(A, B, B_d, C)
+    return LinearPlant(A, B, B_d, C, C_true)
 
 
 def linearise_law(
@@ -127,15 +158,11 @@ def closed_law(
     B = ss.B_r @ mapped_r + ss.B_y @ mapped_y
     D = ss.D_r @ mapped_r + ss.D_y @ mapped_y
     D[..., NY:] += ss.D_u0
-    # omega_u = c x + d (y, r) + D omega_u
-    gain = 1.0 / (1.0 - D[..., [OMEGA_ROW], :][..., [OMEGA_COLUMN]])
-    b, d = B[..., [OMEGA_COLUMN]] * gain, D[..., [OMEGA_COLUMN]] * gain
-    B[..., OMEGA_COLUMN], D[..., OMEGA_COLUMN] = 0.0, 0.0
-    c_omega, d_omega = ss.C[..., [OMEGA_ROW], :], D[..., [OMEGA_ROW], :].copy()
-    A, B, C, D = ss.A + b @ c_omega, B + b @ d_omega, ss.C + d @ c_omega, D + d @ d_omega
+    A, B, C, D = close_omega_u(ss.A, B, ss.C, D)
     k = [i for i, row in enumerate(ss.rows) if dc_control or row != 0]
     A, B, C = A[..., k, :][..., k], B[..., k, :], C[..., k]
-    return LinearLaw(A, B[..., :NY], C, D[..., :NY], B[..., NY:], D[..., NY:])
+    parts = (A, B[..., :NY], C, D[..., :NY], B[..., NY:], D[..., NY:])
+    return LinearLaw(*parts, rows=tuple(ss.rows[i] for i in k))
 
 
 def error_map_slopes(
@@ -175,68 +202,54 @@ def hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return out[:n, :n], out[:n, n:]
 
 
-def sampled_loop(par: PlantRecord, plant: LinearPlant, law: LinearLaw) -> Matrix:
-    """The loop's matrix from tick to tick; state: plant, law, u[k-1], u[k-2], ..."""
-    r = par[0]
-    old = r["steps_old"] * r["h_old"]  # for so long u[k-delay-1] acts, then u[k-delay]
-    new = r["T_s"] - old
-    to_switch, by_old = hold(plant.A, plant.B, old)
-    to_end, by_new = hold(plant.A, plant.B, new)
-    delay, n, m = int(r["delay"]), len(plant.A), len(law.A)
-    oldest = delay + (old > 0.0)
-    size = n + m + NU * oldest
-    lines = np.zeros((NU * (oldest + 1), size))  # u[k], u[k-1], ... as maps of the state
-    lines[:NU, :n], lines[:NU, n : n + m] = law.D @ plant.C, law.C
-    lines[NU:, n + m :] = np.eye(NU * oldest)
-    out = np.zeros((size, size))
-    out[:n, :n] = to_end @ to_switch
-    out[:n] += by_new @ lines[NU * delay : NU * (delay + 1)]
-    if old > 0.0:
-        out[:n] += to_end @ by_old @ lines[NU * oldest :]
-    out[n : n + m, :n], out[n : n + m, n : n + m] = law.B @ plant.C, law.A
-    out[n + m :] = lines[: NU * oldest]
-    return out
+def sampled_plant(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
+    """The plant from tick to tick, with delay lines as states.
 
-
-def loop_modes(
-    par: PlantRecord,
-    law: DiscreteLaw,
-    op: OperatingPoint,
-    ref: Matrix,
-    omega_g: float = 1.0,
-    V_g: float = 1.0,
-) -> list[Mode]:
-    """Modes of the sampled closed loop at ``op``, the least damped (largest sigma) first.
+    u_j[k] acts ``u_delay[j]`` seconds after its tick, through its own hold; y_i[k] is y_i
+    ``y_delay[i]`` seconds before its tick, between samples too. Both are shifts of continuous
+    signals, so nothing is approximated. d is held from tick to tick and not delayed.
 
     Args:
-        par: the plant's parameters, from ``gfm_plant.make_plant``; its T_s must be the law's.
-        law: the law at its sampling time.
-        op: from ``gfm_design.model.operating_point`` with the same par, law, ref and grid.
-        ref: references (V_dcref, P_ref, omega_g, Q_ref, V_ref), shape (5,), p.u.
-        omega_g, V_g: the grid, p.u.
+        plant: a single continuous plant.
+        T_s: sampling time, s.
+        u_delay, y_delay: shapes (3,) and (5,), s, all >= 0.
     """
-    plant = linearise_plant(par, op, omega_g, V_g)
-    linear = linearise_law(law.law, law, op, ref, par[0]["i_u_gain"] != 0.0)
-    z = np.linalg.eigvals(sampled_loop(par, plant, linear)).astype(complex)
-    return _modes(np.log(z[np.abs(z) > _GONE]) / law.T_s)
+    n = len(plant.A)
+    # a command that does not act needs no delay line
+    u_split = [_split(d, T_s) if plant.B[:, j].any() else (0, 0.0) for j, d in enumerate(u_delay)]
+    y_split = [_split(d, T_s) for d in y_delay]
+    lines = [whole + (part > 0.0) for whole, part in (*u_split, *y_split)]
+    at = n + np.concatenate([[0], np.cumsum(lines)]).astype(int)  # where each line begins
+    size = int(at[-1])
+    now = np.eye(size + NU + plant.B_d.shape[1])  # (state, u[k], d[k]) by rows
+    aged = [np.vstack([now[size + j], now[at[j] : at[j + 1]]]) for j in range(NU)]  # u_j[k], ...
+    step = np.zeros((size, len(now)))
+    for j, count in enumerate(lines[:NU]):
+        step[at[j] : at[j + 1]] = aged[j][:count]
+    # through the tick, from one switching of a command or reading of an output to the next
+    switches = [part * T_s for _, part in u_split]
+    readings = [(1.0 - part) * T_s if part else 0.0 for _, part in y_split]
+    x, inputs = now[:n], np.hstack([plant.B, plant.B_d])
+    for t, then in pairwise(sorted({0.0, T_s, *switches, *readings})):
+        for i in range(NY):
+            if lines[NU + i] and t == readings[i]:
+                line = slice(at[NU + i], at[NU + i + 1])
+                step[line] = np.vstack([plant.C[i] @ x, now[line][:-1]])
+        u = [aged[j][whole + (t < switches[j])] for j, (whole, _) in enumerate(u_split)]
+        A, B = hold(plant.A, inputs, then - t)
+        x = A @ x + B @ np.vstack([*u, now[size + NU :]])
+    step[:n] = x
+    read = [now[at[NU + i + 1] - 1, :size] for i in range(NY)]  # the oldest of each line
+    C_true = np.pad(plant.C_true, ((0, 0), (0, size - n)))
+    prompt = np.pad(plant.C, ((0, 0), (0, size - n)))
+    C = np.where(np.array(lines[NU:])[:, None] > 0, read, prompt)
+    A, B, B_d = np.split(step, [size, size + NU], axis=1)
+    return LinearPlant(A, B, B_d, C, C_true)
 
 
-def ideal_modes(
-    par: PlantRecord,
-    law: Law,
-    op: OperatingPoint,
-    ref: Matrix,
-    omega_g: float = 1.0,
-    V_g: float = 1.0,
-) -> list[Mode]:
-    """As ``loop_modes`` for the continuous law: no sampling and no delay, whatever par says."""
-    plant = linearise_plant(par, op, omega_g, V_g)
-    c = linearise_law(law, realise(law), op, ref, par[0]["i_u_gain"] != 0.0)
-    A = plant.A + plant.B @ c.D @ plant.C
-    loop = np.block([[A, plant.B @ c.C], [c.B @ plant.C, c.A]])
-    return _modes(np.linalg.eigvals(loop).astype(complex))
-
-
-def _modes(s: NDArray[np.complex128]) -> list[Mode]:
-    found = [Mode(float(v.real), float(v.imag / (2 * np.pi))) for v in s if v.imag >= 0.0]
-    return sorted(found, key=lambda mode: -mode.sigma)
+def _split(delay: float, T_s: float) -> tuple[int, float]:
+    """Whole samples and what is left of one."""
+    samples = float(delay) / T_s
+    whole = int(np.floor(samples + _WHOLE))
+    part = samples - whole
+    return whole, part if part > _WHOLE else 0.0

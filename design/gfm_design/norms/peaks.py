@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.norms.performance import StateSpace, Weight
-from gfm_design.norms.weights import Sizes
+from gfm_design.norms.weights import sizes_of
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -68,7 +68,7 @@ def peaks(loop: StateSpace, weights: tuple[Weight, ...]) -> Peaks | None:
     near = np.abs(poles.imag[:, None] + _ACROSS * poles.real[:, None]).ravel()
     omega = np.unique(np.concatenate([_GRID, near, np.abs(poles)]))
     sizes = np.abs((1.0 / (1j * omega[:, None] - poles)) @ residues.T + through)
-    weight = Sizes(weights)
+    weight = sizes_of(weights)
     sizes *= np.sqrt(weight.squared(omega))
     padded = np.pad(sizes, ((1, 1), (0, 0)), constant_values=-np.inf)
     tall = sizes > 0.5 * _TALL * sizes.max()  # a narrow one may grow when looked at closer
@@ -120,7 +120,7 @@ def model(loops: Loops, weights: tuple[Weight, ...], at: Vector, of: Peaks) -> M
     g_a = -(dT / T).real.T
     g_ab = -np.moveaxis((ddT / T - dT[:, None] * dT[None] / T**2).real, -1, 0)
     g_aw = -(T_aw / T - dT * T_w / T**2).real.T
-    g_ww = -(T_ww / T - (T_w / T) ** 2).real - Sizes(weights).bend(of.omega, of.channel)
+    g_ww = -(T_ww / T - (T_w / T) ** 2).real - sizes_of(weights).bend(of.omega, of.channel)
     moves = (g_ww > 0.0) & (of.omega > _GRID[1]) & (of.omega < _GRID[-1])
     g_ab -= g_aw[:, :, None] * g_aw[:, None] / np.where(moves, g_ww, np.inf)[:, None, None]
     inverse = 1.0 / of.height

@@ -1,4 +1,4 @@
-"""The paper's performance problem (Section III-B): w, z, the six weights, and gamma of given gains.
+"""The paper's performance problem (Section III-B): w, z, the six weights, and the channels' norms.
 
     w = (P_ref, omega_g),   z = (P_ref - p, p, omega_u, q + V/D_q)
 
@@ -14,15 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.linear import LinearLaw, LinearPlant
 from gfm_design.norms.hinf import Norm, hinf_norm
-from gfm_runtime.signals import REF_NAMES
+from gfm_runtime.tustin import tustin
 
 Matrix = NDArray[np.float64]
 StateSpace = tuple[Matrix, Matrix, Matrix, Matrix]
 
 D_Q = 0.05  # p.u., Table III
-_P_REF = REF_NAMES.index("P_ref")
 
 
 @dataclass(frozen=True)
@@ -70,11 +68,7 @@ class Weight:
             A[0], B[0, 0] = -den[1:], 1.0
             A[1:, :-1] = np.eye(n - 1)
         C, D = (num[1:] - num[0] * den[1:])[None, :], np.array([[num[0]]])
-        if T_s is None:
-            return A, B, C, D
-        step = np.linalg.inv(np.eye(n) - T_s / 2 * A)
-        to_x = T_s * step @ B  # s = (2/T_s) (z-1)/(z+1)
-        return step @ (np.eye(n) + T_s / 2 * A), to_x, C @ step, D + C @ to_x / 2
+        return (A, B, C, D) if T_s is None else tustin(A, B, C, D, T_s / 2)
 
 
 def _lead(T_1: float, T_2: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -106,28 +100,6 @@ class Channel:
     j: int
     norm: float
     omega: float
-
-
-def performance_loop(plant: LinearPlant, law: LinearLaw, D_q: float = D_Q) -> StateSpace:
-    """State space of T(s), or T(z), from w (2) to z (4) of the closed loop.
-
-    Plant and law are both continuous, or both the steps of one tick. ``plant`` must be the ideal
-    one (no sensors): z speaks of true quantities. The law may be many, stacked on leading axes.
-    """
-    n, m = len(plant.A), law.A.shape[-1]
-    by_p_ref = law.D_r[..., _P_REF]
-    many = law.D.shape[:-2]
-    A, B = np.empty((*many, n + m, n + m)), np.empty((*many, n + m, 2))
-    A[..., :n, :n], A[..., :n, n:] = plant.A + plant.B @ law.D @ plant.C, plant.B @ law.C
-    A[..., n:, :n], A[..., n:, n:] = law.B @ plant.C, law.A
-    B[..., :n, 0], B[..., n:, 0] = by_p_ref @ plant.B.T, law.B_r[..., _P_REF]
-    B[..., :n, 1], B[..., n:, 1] = plant.B_d[:, 0], 0.0
-    p, q, V = plant.C[1], plant.C[3], plant.C[4]
-    C, D = np.zeros((*many, 4, n + m)), np.zeros((*many, 4, 2))
-    C[..., 0, :n], C[..., 1, :n], C[..., 3, :n] = -p, p, q + V / D_q
-    C[..., 2, :n], C[..., 2, n:] = law.D[..., 1, :] @ plant.C, law.C[..., 1, :]
-    D[..., 0, 0], D[..., 2, 0] = 1.0, by_p_ref[..., 1]
-    return A, B, C, D
 
 
 def channel_system(loop: StateSpace, weight: Weight, T_s: float | None = None) -> StateSpace:

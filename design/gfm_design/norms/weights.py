@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,12 @@ class Sizes:
             p, dp, ddp = ((c * f * q).sum(axis=1) for f, q in zip(factors, powers, strict=True))
             out += sign * (2 * dp / p + 4 * y * (ddp / p - (dp / p) ** 2))
         return out
+
+
+@cache
+def sizes_of(weights: tuple[Weight, ...]) -> Sizes:
+    """The sizes of these weights; a polish asks for the same ones at every step."""
+    return Sizes(weights)
 
 
 def _squared_size(c: tuple[float, ...]) -> Vector:

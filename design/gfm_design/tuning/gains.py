@@ -8,8 +8,10 @@ file, a whole population in one pass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +26,6 @@ from gfm_runtime.realisation import realise
 
 Vector = NDArray[np.float64]
 
-_MATRICES = ("A", "B", "C", "D", "B_r", "D_r")
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0  # its multiples modulo 1 never meet
 _AFFINE = 1e-9  # relative misfit at a point away from the base that still counts as affine
 
@@ -100,10 +101,6 @@ def _generic(gain: FreeGain, k: int) -> float:
     return min(max(moved, gain.low), gain.high)
 
 
-def _parts(law: LinearLaw) -> list[Vector]:
-    return [getattr(law, name) for name in _MATRICES]
-
-
 class GainedLaw:
     """A law around an operating point, as a function of its free gains.
 
@@ -143,10 +140,12 @@ class GainedLaw:
         """
         if self._affine is None:
             many = self._many(np.atleast_2d(values))
-            return many if np.ndim(values) == 2 else LinearLaw(*(m[0] for m in _parts(many)))
+            return many if np.ndim(values) == 2 else LinearLaw(*(m[0] for m in many.matrices))
         base, slopes = self._affine
+        flat, ends = base + values @ slopes, np.cumsum([0, *map(math.prod, self._shapes)])
+        parts = [flat[..., a:b] for a, b in pairwise(ends)]
         return LinearLaw(
-            *(m + np.tensordot(values, s, 1) for m, s in zip(base, slopes, strict=True))
+            *(m.reshape(*flat.shape[:-1], *s) for m, s in zip(parts, self._shapes, strict=True))
         )
 
     def exact(self, values: Vector) -> LinearLaw:
@@ -166,7 +165,7 @@ class GainedLaw:
             if p.tied is not None:
                 numbers[name] = evaluate_each(f"parameters.{name}.tied", p.tied, numbers)
         law = closed_law(realise_each(self.file, numbers), self._map(numbers), self._dc_control)
-        return LinearLaw(*(m[1:] for m in _parts(law)))
+        return LinearLaw(*(m[1:] for m in law.matrices))
 
     def _map(self, numbers: Mapping[str, Vector]) -> tuple[Vector, Vector]:
         """The error map's slopes; stacked, if it depends on free gains."""
@@ -180,25 +179,21 @@ class GainedLaw:
         r, y = (np.array(part) for part in zip(*slopes, strict=True))
         return (r[0], y[0]) if len(distinct) == 1 else (r[where], y[where])
 
-    def _try_affine(self) -> tuple[list[Vector], list[Vector]] | None:
+    def _try_affine(self) -> tuple[Vector, Vector] | None:
+        """All matrices in a row at gains of zero (K,), and their slopes (n,K)."""
         at = np.array([g.start for g in self.gains])
         step = np.array([0.1 * (abs(g.start) or 1.0) for g in self.gains])
-        here = self.exact(at)
-        sides = [self.exact(at + np.eye(len(at))[k] * step[k]) for k in range(len(at))]
-        far = self.exact(at + 0.7 * step)
-        base, slopes = [], []
-        for name in _MATRICES:
-            m = getattr(here, name)
-            if any(getattr(s, name).shape != m.shape for s in [*sides, far]):
-                return None
-            slope = np.array([(getattr(s, name) - m) / h for s, h in zip(sides, step, strict=True)])
-            predicted = m + np.tensordot(0.7 * step, slope, 1)
-            misfit = np.abs(predicted - getattr(far, name)).max(initial=0.0)
-            if misfit > _AFFINE * max(1.0, np.abs(m).max(initial=0.0)):
-                return None
-            base.append(m - np.tensordot(at, slope, 1))
-            slopes.append(slope)
-        return base, slopes
+        laws = [self.exact(at), self.exact(at + 0.7 * step)]
+        laws += [self.exact(at + aside) for aside in np.diag(step)]
+        self._shapes, *others = (tuple(m.shape for m in law.matrices) for law in laws)
+        if any(shapes != self._shapes for shapes in others):
+            return None
+        here, far, *sides = (np.concatenate([m.ravel() for m in o.matrices]) for o in laws)
+        slopes = (np.array(sides).reshape(len(at), len(here)) - here) / step[:, None]
+        misfit = np.abs(here + 0.7 * step @ slopes - far).max()
+        if misfit > _AFFINE * max(1.0, np.abs(here).max()):
+            return None
+        return here - at @ slopes, slopes
 
 
 _LINEAR = 0.01  # share of the bound up to which the coordinate is about linear

@@ -16,25 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.margins.delays import DelayMargin, overall_delay
-from gfm_design.margins.tolerance import Range, element_range, mode_of
-from gfm_design.model.case import Case
+from gfm_design.margins.tolerance import Range, element_range
+from gfm_design.model.closed_loop import T_S, ClosedLoop
 from gfm_design.model.linear import Mode
-from gfm_design.model.sampled import SampledLoop
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
 from gfm_design.tuning.gains import FreeGain, free_gains
 from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
-from gfm_design.tuning.law_comparison_modes import Culprit, culprit, late_culprit
-from gfm_design.tuning.paper_problem import PAPER_START, REFERENCES, PaperProblem
+from gfm_design.tuning.law_comparison_modes import Culprit, culprit
+from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import tune_paper
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune
 from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law
-from gfm_runtime.tustin import discretise
 
 Vector = NDArray[np.float64]
 
-T_S = 1e-4  # s
 _DIGITS = 7  # of a tuned gain: what a reader can compare and the search resolves
 _LATE_EVALUATIONS, _LATE_STARTS = 20, 2  # times the ideal search's; at the border no polish helps
 _SLOWEST = 1e-3  # Hz; what turns more slowly is no oscillation
@@ -42,7 +39,6 @@ _SAME_GAMMA = 1e-4  # relative; by so much a gain may change gamma that makes no
 _NEAR = 0.99  # of the decay asked for
 _SAME = 0.03  # relative; so much the others must not cost a channel that is pinned
 _SETTLES = 3
-_GONE = 1e-9  # |z| below this is an emptied delay line
 
 Pair = tuple[int, int]  # i, j of a channel
 After = tuple[Channel, ...] | Culprit
@@ -141,7 +137,7 @@ def search(
     try:
         found = tune_paper(problem, seed, evaluations, starts, progress)
     except NotStabilised as none:
-        ideal = culprit(problem, none.values)
+        ideal = culprit(problem.closed_loop(none.values))
         return left(None, ideal)
     ideal, spent = problem.channels(found.values), found.evaluations
     if LateProblem(problem).sigma(found.values[None])[0] > -ALPHA:
@@ -150,7 +146,7 @@ def search(
             try:
                 tried.append(late(start))
             except NotStabilised as none:
-                culprit_late = late_culprit(late_case(file, problem.law.named(none.values)))
+                culprit_late = culprit(late_loop(file, problem.law.named(none.values)))
         if not tried:
             return left(None, culprit_late)
         spent += sum(t.evaluations for t in tried)
@@ -247,29 +243,25 @@ def _channels(problem: PaperProblem, values: Vector) -> After:
     try:
         return problem.channels(values)
     except Unstable:
-        return culprit(problem, values)
+        return culprit(problem.closed_loop(values))
 
 
-def late_case(file: LawFile, gains: Mapping[str, float]) -> Case:
+def late_loop(file: LawFile, gains: Mapping[str, float]) -> ClosedLoop:
     """A law at some gains on the nominal converter, sampled at T_S, one sample late."""
-    law = discretise(build_law(file, gains), T_S)
-    return Case(Plant.model_validate({"delay": {"samples": 1}}), law, np.array(REFERENCES))
+    plant = Plant.model_validate({"delay": {"samples": 1}})
+    return ClosedLoop.of(build_law(file, gains), plant)
 
 
 def stands(file: LawFile, gains: dict[str, float]) -> Stands:
     """What the sampled loop of a law at some gains stands; takes some seconds."""
-    case = late_case(file, gains)
-    late = case.loop()
-    z = np.linalg.eigvals(late.closed()).astype(complex)
-    modes = [mode_of(complex(v), T_S) for v in z[np.abs(z) > _GONE]]
+    late = late_loop(file, gains)
+    modes = late.modes()
     worst = min((m for m in modes if m.frequency_hz > _SLOWEST), key=lambda m: m.ratio)
-    sigma = max(m.sigma for m in modes)
-    prompt = SampledLoop(late.plant, late.law, T_S, 0.0)
-    holds = bool(np.abs(np.linalg.eigvals(prompt.closed())).max() < 1.0)
+    sigma = modes[0].sigma
     return Stands(
         worst,
         sigma,
-        overall_delay(prompt) if holds else DelayMargin(0.0, np.nan),
-        element_range(case, ("L_g",)) if sigma < 0.0 else None,
-        element_range(case, ("R_f", "R_g")) if sigma < 0.0 else None,
+        overall_delay(ClosedLoop(late.plant, late.law, T_S)),
+        element_range(late, ("L_g",)) if sigma < 0.0 else None,
+        element_range(late, ("R_f", "R_g")) if sigma < 0.0 else None,
     )

@@ -10,11 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.linear import hold
+from gfm_design.model.linear import LinearLaw
 from gfm_design.tuning.gains import Encoding
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE, unstable_cost
-from gfm_runtime.signals import NU
 
 Vector = NDArray[np.float64]
 
@@ -35,23 +34,12 @@ class LateProblem:
 
     def sigma(self, values: Vector) -> Vector:
         """Largest real part of any mode, 1/s, of sets of gains, one a row; inf where no law."""
-        law, plant, T_s = self.paper.law(values), self.paper.linear, self.paper.T_s
+        law, late = self.paper.law(values), self.paper.late
         good = np.isfinite(law.A).all(axis=(1, 2)) & np.isfinite(law.D).all(axis=(1, 2))
-        A, B, C, D = (m[good] for m in (law.A, law.B, law.C, law.D))
-        # Tustin, as gfm_runtime.tustin
-        half, eye = T_s / 2, np.eye(A.shape[1])
-        backward = np.linalg.inv(eye - half * A)
-        to_u = C @ backward
-        F, G = hold(plant.A, plant.B, T_s)
-        n, law_at = len(F), slice(len(F), len(F) + A.shape[1])
-        loop = np.zeros((len(A), law_at.stop + NU, law_at.stop + NU))  # plant, law, u[k-1]
-        loop[:, :n, :n], loop[:, :n, law_at.stop :] = F, G
-        loop[:, law_at, :n] = T_s * backward @ B @ plant.C
-        loop[:, law_at, law_at] = backward @ (eye + half * A)
-        loop[:, law_at.stop :, :n] = (D + half * to_u @ B) @ plant.C
-        loop[:, law_at.stop :, law_at] = to_u
         out = np.full(len(values), np.inf)
-        out[good] = np.log(np.abs(np.linalg.eigvals(loop)).max(axis=1)) / T_s
+        if good.any():
+            some = LinearLaw(*(m[good] for m in law.matrices)).sampled(self.paper.T_s)
+            out[good] = late.with_law(some).sigma()
         return out
 
     def __call__(self, values: Vector) -> float:

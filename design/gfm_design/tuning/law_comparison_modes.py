@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gfm_design.margins.tolerance import mode_of
-from gfm_design.model.case import Case
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
-from gfm_design.tuning.paper_problem import PaperProblem
-from gfm_runtime.lawfile import build_law
-from gfm_runtime.realisation import realise
-from gfm_runtime.signals import NU, U_NAMES
+from gfm_runtime.signals import U_NAMES, Y_NAMES
 
-Matrix = NDArray[np.float64]
-
-PLANT_STATES = ("i_d", "i_q", "v_d", "v_q", "i_od", "i_oq", "delta", "v_dc")  # gfm_plant.model
+_PLANT = ("i_d", "i_q", "v_d", "v_q", "i_od", "i_oq", "delta", "v_dc")  # gfm_plant.model
+_SENSORS = tuple(f"sensor of {name}" for name in Y_NAMES if name != "omega_u")
 _SHOWN = 4
 
 
@@ -42,35 +34,25 @@ class Culprit:
         return f"mode {where} grows by {self.mode.sigma:.3g} 1/s: {who}"
 
 
-def culprit(problem: PaperProblem, values: NDArray[np.float64]) -> Culprit:
-    """The mode furthest right of the continuous loop at these gains."""
-    law = build_law(problem.file, problem.law.named(values))
-    names = (*PLANT_STATES, *_law_states(realise(law).rows))
-    s, shares = _outermost(problem.loop(values)[0], lambda s: s.real)
-    return Culprit(Mode(s.real, abs(s.imag) / (2 * np.pi)), _largest(names, shares))
-
-
-def late_culprit(case: Case) -> Culprit:
-    """The mode furthest out of a case's sampled loop."""
-    loop = case.loop()
-    ages = [f"{U_NAMES[j]} on its way" for j in range(NU) if loop.plant.B[:, j].any()]
-    names = (*PLANT_STATES, *ages, *_law_states(case.law.rows))
-    z, shares = _outermost(loop.closed(), np.abs)
-    return Culprit(mode_of(z, case.law.T_s), _largest(names, shares))
-
-
-def _law_states(rows: Sequence[int]) -> list[str]:
-    return [f"law's state of {U_NAMES[row]}" for row in rows]
-
-
-def _outermost(A: Matrix, how_far: Callable[[Any], Any]) -> tuple[complex, Matrix]:
-    """The eigenvalue that is furthest, and the participation of each state in it."""
-    s, right = np.linalg.eig(A)
-    k = int(np.argmax(how_far(s)))
+def culprit(loop: ClosedLoop) -> Culprit:
+    """The mode of a loop with the largest sigma, and the states that take part in it."""
+    values, right = np.linalg.eig(loop.A)
+    k = int(np.argmax(values.real if loop.T_s is None else np.abs(values)))
     shares = np.abs(np.linalg.inv(right)[k] * right[:, k])
-    return complex(s[k]), shares / shares.sum()
-
-
-def _largest(names: Sequence[str], shares: Matrix) -> tuple[tuple[str, float], ...]:
+    s = complex(values[k]) if loop.T_s is None else np.log(complex(values[k])) / loop.T_s
+    names, shares = _states(loop), shares / shares.sum()
     assert len(names) == len(shares)
-    return tuple((names[n], float(shares[n])) for n in np.argsort(-shares)[:_SHOWN])
+    largest = tuple((names[n], float(shares[n])) for n in np.argsort(-shares)[:_SHOWN])
+    return Culprit(Mode.of(s), largest)
+
+
+def _states(loop: ClosedLoop) -> list[str]:
+    """What the states of a single loop are, in their order."""
+    size, acts = len(loop.plant.A) - len(_PLANT), loop.plant.B.any(axis=0)
+    names = [*_PLANT, *["integral of the DC source"] * (size % len(_SENSORS))]
+    names += _SENSORS if size >= len(_SENSORS) else ()
+    late = [*zip(U_NAMES, loop.u_delay * acts, strict=True)]
+    late += zip(Y_NAMES, loop.y_delay, strict=True)
+    for name, delay in late if loop.T_s else ():
+        names += [f"{name} on its way"] * int(np.ceil(delay / loop.T_s - 1e-9))
+    return names + [f"law's state of {U_NAMES[row]}" for row in loop.law.rows]

@@ -7,28 +7,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.linear import LinearPlant, hold, linearise_law, linearise_plant
-from gfm_design.model.operating_point import OperatingPoint, operating_point
-from gfm_design.norms.performance import (
-    PAPER_WEIGHTS,
-    Channel,
-    StateSpace,
-    Weight,
-    channel_norms,
-    performance_loop,
-)
+from gfm_design.model.closed_loop import REFERENCES, T_S, ClosedLoop
+from gfm_design.model.linear import LinearPlant
+from gfm_design.model.operating_point import OperatingPoint
+from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
 from gfm_design.norms.screen import Screen
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
 from gfm_design.tuning.polish import polish
 from gfm_design.tuning.synthesis import UNSTABLE, unstable_cost
-from gfm_plant import Plant, make_plant
+from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law
-from gfm_runtime.signals import NU
-from gfm_runtime.tustin import discretise
 
 Vector = NDArray[np.float64]
-
-REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # Table III
 
 #: Section IV-A's initial K, by law: what ``tune`` starts from if not told otherwise
 PAPER_START: dict[str, dict[str, float]] = {
@@ -47,7 +37,8 @@ class PaperProblem:
     """gamma of a law on the paper's converter, as a function of its free gains.
 
     The plant is ideal whatever ``plant`` says of delay and sensors; factors and the DC source
-    count. The operating point is that of the starting gains.
+    count. The operating point is that of the starting gains. ``late`` is the loop there sampled at
+    T_s with one sample of delay, for other laws to be put into it.
     """
 
     file: LawFile
@@ -55,55 +46,46 @@ class PaperProblem:
     plant: Plant = field(default_factory=Plant)
     references: tuple[float, ...] = REFERENCES
     weights: tuple[Weight, ...] = PAPER_WEIGHTS
-    T_s: float = 1e-4
+    T_s: float = T_S
 
     def __post_init__(self) -> None:
-        ideal = self.plant.model_copy(update={"sensors": Plant().sensors})
-        self._par, _ = make_plant(ideal, self.T_s)
+        self._ideal = self.plant.model_copy(update={"sensors": Plant().sensors})
         self._screen = Screen(self.weights)
         self.move_to({g.name: g.start for g in self.gains})
 
     def move_to(self, named: dict[str, float]) -> None:
         """Take the operating point of these gains (it hardly depends on them)."""
-        ref = np.asarray(self.references)
-        law = discretise(build_law(self.file, named), self.T_s)
-        op = operating_point(self._par, law, ref, self.plant.grid.omega_g, self.plant.grid.V_g)
-        self._linear = linearise_plant(self._par, op, self.plant.grid.omega_g, self.plant.grid.V_g)
-        dc_control = self.plant.dc_source.mode == "controlled"
-        self._rest = op, ref, dc_control
-        self.law = GainedLaw(self.file, self.gains, *self._rest)
-        self._slopes = self._affine_loop() if self.gains and self.law.is_affine else None
-
-    def _affine_loop(self) -> list[tuple[Vector, Vector]]:
-        """T(s)'s matrices at gains of zero, and what each gain adds: they are affine too."""
-        base = performance_loop(self._linear, self.law(np.zeros(len(self.gains))))
-        ones = performance_loop(self._linear, self.law(np.eye(len(self.gains))))
-        return [(m, one - m) for m, one in zip(base, ones, strict=True)]
+        law, ref = build_law(self.file, named), np.asarray(self.references)
+        self._rest = ClosedLoop.of(law, self._ideal, ref, T_s=self.T_s, ideal=True)
+        self.late = self._rest.sampled(self.T_s, self.T_s)
+        controlled = self.plant.dc_source.mode == "controlled"
+        self.law = GainedLaw(self.file, self.gains, self.op, ref, controlled)
 
     @property
     def op(self) -> OperatingPoint:
         """Where plant and law rest."""
-        return self._rest[0]
+        return self._rest.made_of.op
 
     @property
     def linear(self) -> LinearPlant:
         """The plant around its operating point."""
-        return self._linear
+        return self._rest.plant
 
     def loops(self, values: Vector) -> StateSpace:
         """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
-        if self._slopes is None:
-            return performance_loop(self._linear, self.law(values))
-        A, B, C, D = (m + np.tensordot(values, s, 1) for m, s in self._slopes)
-        return A, B, C, D
+        return self.closed_loops(values).performance()
 
-    def loop(self, values: Vector) -> StateSpace:
-        """T(s) at these gains, with as few states as the law needs.
+    def closed_loop(self, values: Vector) -> ClosedLoop:
+        """The continuous loop at these gains, with as few states as the law needs.
 
         Raises:
             LawError: the gains make no law.
         """
-        return performance_loop(self._linear, self.law.exact(values))
+        return self._rest.with_law(self.law.exact(values))
+
+    def closed_loops(self, values: Vector) -> ClosedLoop:
+        """The continuous loops at rows of gains, in one; nan where they make no law."""
+        return self._rest.with_law(self.law(values))
 
     def __call__(self, values: Vector) -> float:
         """Cost: a close lower bound of gamma, or what an unstable loop costs."""
@@ -130,7 +112,7 @@ class PaperProblem:
 
     def channels(self, values: Vector) -> tuple[Channel, ...]:
         """Every channel's norm, guaranteed. Raises ``Unstable``."""
-        return channel_norms(self.loop(values), self.weights)
+        return self.closed_loop(values).channels(self.weights)
 
     def sampled_channels(self, values: Vector) -> tuple[Channel, ...]:
         """As ``channels`` of the loop at T_s: law by Tustin, u and w held over each tick, no delay.
@@ -138,10 +120,4 @@ class PaperProblem:
         Raises:
             Unstable: the sampled loop is not stable.
         """
-        file_law = build_law(self.file, self.law.named(values))
-        law = discretise(file_law, self.T_s)
-        reaction = linearise_law(file_law, law, *self._rest)
-        plant, inputs = self._linear, np.hstack([self._linear.B, self._linear.B_d])
-        A, B = hold(plant.A, inputs, self.T_s)
-        sampled = LinearPlant(A, B[:, :NU], B[:, NU:], plant.C)
-        return channel_norms(performance_loop(sampled, reaction), self.weights, self.T_s)
+        return self.closed_loop(values).sampled(self.T_s).channels(self.weights)

@@ -7,20 +7,20 @@ broken constraint costs more than gamma can gain by breaking it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.box import T_S, Point, Source
-from gfm_design.model.operating_point import operating_point
-from gfm_design.model.stack import overshoot, stacks, tustin
+from gfm_design.model.box import SOURCES, Point, Source
+from gfm_design.model.closed_loop import INPUTS, T_S, ClosedLoop
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
-from gfm_design.tuning.paper_problem import REFERENCES, PaperProblem
+from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_plant import Plant, make_plant
+from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.signals import Y_NAMES
 from gfm_runtime.tustin import discretise
 
 Vector = NDArray[np.float64]
@@ -28,6 +28,8 @@ Vector = NDArray[np.float64]
 _BROKEN = 5.0  # cost of a 1/s too little, and of gamma above its ceiling by 1
 _BEYOND = 100.0  # cost of an overshoot by a whole step too much
 _HOPELESS = 20.0  # 1/s; a loop that grows so fast has no step response worth computing
+_GRIDS = ((10, 16), (120, 16))  # stride in ticks, root of the points: to 0.26 s, to 3.1 s
+_P_REF, _P = INPUTS.index("P_ref"), Y_NAMES.index("p")
 _SHORT = 3.0  # L_g up to this factor counts as a strong grid
 
 
@@ -67,32 +69,70 @@ def _is_rig(point: Point) -> bool:
 
 
 class Loops:
-    """The sampled loops of some points as functions of a law's free gains."""
+    """The sampled loops of some points as functions of a law's free gains.
+
+    The law's error map must be linear and its rows 1 and 3 integrate, so that the operating point
+    of each point does not move with the gains. What does not depend on the gains, the plant from
+    tick to tick, is computed once, and the loops of one size are one ``ClosedLoop``.
+    """
 
     def __init__(self, file: LawFile, gains: Sequence[FreeGain], points: Sequence[Point]) -> None:
         self.points = list(points)
         law = discretise(build_law(file, {g.name: g.start for g in gains}), T_S)
-        ref = np.asarray(REFERENCES)
-        op = operating_point(make_plant(Plant(), T_S)[0], law, ref)
-        self._laws = [GainedLaw(file, gains, op, ref, dc) for dc in (False, True)]
-        self._stacks = list(stacks(self.points, law))
+        rest = ClosedLoop.of(law)
+        op, ref = rest.made_of.op, rest.made_of.ref
+        self._laws = {dc: GainedLaw(file, gains, op, ref, dc == "controlled") for dc in SOURCES}
+        loops = [point.loop(law) for point in self.points]
+        keys = [(p.dc, loop.held.A.shape) for p, loop in zip(self.points, loops, strict=True)]
+        self._stacks: list[tuple[NDArray[np.intp], Source, ClosedLoop]] = []
+        for key in sorted(set(keys)):
+            members = [k for k, other in enumerate(keys) if other == key]
+            stack = ClosedLoop.stacked([loops[k] for k in members])
+            self._stacks.append((np.array(members), key[0], stack))
 
     def sigma(self, values: Vector) -> Vector:
         """Largest real part of any mode at each point, 1/s."""
-        laws = [tustin(law(values)) for law in self._laws]
-        out = np.empty(len(self.points))
-        for stack in self._stacks:
-            z = np.linalg.eigvals(stack.loops(laws[stack.controlled])[0])
-            out[stack.members] = np.log(np.abs(z).max(axis=1)) / T_S
-        return out
+        return self._each(values, lambda loop: np.asarray(loop.sigma()))
 
     def overshoot(self, values: Vector) -> Vector:
         """How far p goes beyond a step of P_ref, as a part of the step; inf if it grows."""
-        laws = [tustin(law(values)) for law in self._laws]
+        return self._each(values, overshoot)
+
+    def _each(self, values: Vector, of: Callable[[ClosedLoop], Vector]) -> Vector:
+        laws = {dc: law(values).sampled(T_S) for dc, law in self._laws.items()}
         out = np.empty(len(self.points))
-        for stack in self._stacks:
-            out[stack.members] = overshoot(stack, *stack.loops(laws[stack.controlled]))
+        for members, dc, stack in self._stacks:
+            out[members] = of(stack.with_law(laws[dc]))
         return out
+
+
+def overshoot(loops: ClosedLoop) -> Vector:
+    """How far p goes beyond a unit step of P_ref, shape (N,); inf where it grows.
+
+    p = c A^k x_0 on a grid of ticks, of which c A^i and A^(N j) x_0 are the two factors.
+
+    Args:
+        loops: N sampled loops in one.
+    """
+    A, B, C, _ = loops.state_space
+    rest = np.linalg.solve(np.eye(A.shape[-1]) - A, B[..., [_P_REF]])
+    row = C[:, [_P]]
+    p_end = (row @ rest)[:, 0, 0]
+    beyond = np.zeros(len(A))
+    last, power, ticks = -rest, A, 1
+    for stride, side in _GRIDS:
+        power = np.linalg.matrix_power(power, stride // ticks)
+        ticks = stride
+        rows, columns = [row], [-rest]
+        for _ in range(side - 1):
+            rows.append(rows[-1] @ power)
+        leap = np.linalg.matrix_power(power, side)
+        for _ in range(side - 1):
+            columns.append(leap @ columns[-1])
+        p = np.concatenate(rows, axis=1) @ np.concatenate(columns, axis=2)
+        beyond = np.maximum(beyond, p.max(axis=(1, 2)) / p_end)
+        last = leap @ columns[-1]
+    return np.where(np.abs(last).max(axis=(1, 2)) < 1.0, beyond, np.inf)
 
 
 def paper_problem(file: LawFile, gains: Sequence[FreeGain], dc: Source) -> PaperProblem:

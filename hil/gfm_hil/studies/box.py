@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gfm_design.model.box import T_S, Point
+from gfm_design.model.box import Point
+from gfm_design.model.closed_loop import T_S
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import safe_reason

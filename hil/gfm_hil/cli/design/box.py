@@ -14,18 +14,15 @@ from rich.progress import track
 from rich.table import Table
 
 from gfm_design.margins.delays import longest, overall_delay
-from gfm_design.model.box import T_S, Box, Point, Source
-from gfm_design.model.linear import Mode, linearise_law, linearise_plant, loop_modes
-from gfm_design.model.operating_point import operating_point
-from gfm_design.model.sampled import SampledLoop
+from gfm_design.model.box import Box, Point, Source
+from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.robust import Loops, paper_problem
 from gfm_hil.cli.design.box_options import add_box, read_box
 from gfm_hil.cli.design.common import channels_as_json
 from gfm_hil.studies.box import STEP, step_run
-from gfm_plant import make_plant
-from gfm_runtime import discretise, law_file, load_law
+from gfm_runtime import law_file
 from gfm_runtime.lawfile import LawFile
 
 
@@ -54,10 +51,13 @@ def call(options: argparse.Namespace) -> int:
             sigma = _loops(file, points).sigma(_values(file))
             k = int(np.argmax(sigma))
             row = _row(dc, f"sigma, {where} [1/s]", len(points), sigma[k], points[k])
-            rows.append(row | {"mode_hz": _slowest(options.law, points[k]).frequency_hz})
+            worst = points[k].loop(options.law).modes()[0]
+            rows.append(row | {"mode_hz": worst.frequency_hz})
         gamma = _gamma(file, dc)
         rows.append(_row(dc, "gamma beside this source", 1, gamma["gamma"], Point(dc=dc)))
-        rows.append(_row(dc, "delay margin [s]", 1, delay_margin(options.law, dc), Point(dc=dc)))
+        nominal = Point(dc=dc)
+        margin = overall_delay(nominal.loop(options.law)).seconds
+        rows.append(_row(dc, "delay margin [s]", 1, margin, nominal))
         if options.bench:
             rows += _bench(options.law, box, options.json)
     result = {
@@ -72,35 +72,11 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def delay_margin(law: str, dc: Source = "controlled") -> float:
-    """What may be added to the nominal loop's one sample of delay, s.
-
-    0 if it does not hold, inf if no loss is found (``gfm_design.margins.delays``).
-    """
-    point = Point(dc=dc)
-    par, _ = make_plant(point.plant(), T_S)
-    discrete = discretise(load_law(law).laws[0], T_S)
-    op = operating_point(par, discrete, point.references())
-    linear = linearise_law(discrete.law, discrete, op, point.references(), dc == "controlled")
-    loop = SampledLoop(linearise_plant(par, op), linear, T_S, point.delay * T_S)
-    if np.abs(np.linalg.eigvals(loop.closed())).max() >= 1.0:
-        return 0.0
-    return overall_delay(loop).seconds
-
-
 def margin_text(seconds: float) -> str:
     """A delay margin for a reader."""
     if np.isinf(seconds):
         return f"> {1e3 * longest(T_S):g} ms"
     return f"{1e3 * seconds:.2f} ms"
-
-
-def _slowest(law: str, point: Point) -> Mode:
-    """The mode of a point's sampled loop with the largest sigma."""
-    par, _ = make_plant(point.plant(), T_S)
-    discrete = discretise(load_law(law).laws[0], T_S)
-    op = operating_point(par, discrete, point.references())
-    return loop_modes(par, discrete, op, point.references())[0]
 
 
 def _values(file: LawFile) -> Any:

@@ -9,12 +9,13 @@ from typing import Any
 
 from rich.console import Console
 
-from gfm_design.model.box import Box, Source
+from gfm_design.margins.delays import overall_delay
+from gfm_design.model.box import Box, Point, Source
 from gfm_design.tuning.deployable import Round, deploy
 from gfm_design.tuning.gains import free_gains, tied
 from gfm_design.tuning.robust import Wanted, paper_problem
 from gfm_design.tuning.synthesis import NotStabilised
-from gfm_hil.cli.design.box import delay_margin, margin_text
+from gfm_hil.cli.design.box import margin_text
 from gfm_hil.cli.design.box_options import add_box, read_box, wanted
 from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
 from gfm_hil.core.errors import UserError
@@ -115,7 +116,7 @@ def _write(
     try:
         path.write_text(text, encoding="utf-8")
         margins = ", ".join(
-            f"{margin_text(delay_margin(str(path), dc))} (DC source {dc})"
+            f"{margin_text(overall_delay(Point(dc=dc).loop(str(path))).seconds)} (DC source {dc})"
             for dc in dict.fromkeys(box.dc)
         )
         path.write_text(f"# delay margin at nominal {margins}\n{text}", "utf-8")

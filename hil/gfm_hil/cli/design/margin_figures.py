@@ -9,9 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from gfm_design.margins.tolerance import Region
-from gfm_design.model.case import Case
-from gfm_design.model.sampled import outermost
+from gfm_design.margins.tolerance import Region, factor
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.results.figures import COLOURS
 
 _GREY = "#888888"
@@ -19,7 +18,7 @@ _SPAN = 100.0  # 1/s; colours of sigma end there
 _DELAYS = 300
 
 
-def draw_region(path: Path, case: Case, label: str, region: Region) -> None:
+def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> None:
     """sigma in colour, its zero as a line, the printed and the scenario's line as points."""
     figure = Figure(figsize=(6.6, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
@@ -34,7 +33,7 @@ def draw_region(path: Path, case: Case, label: str, region: Region) -> None:
     if finite.min() < 0.0 < finite.max():
         axes.contour(region.L_g, region.R_g, finite, levels=[0.0], colors="k", linewidths=1.2)
     axes.plot(1.0, 1.0, "o", color="k", ms=6, mfc="none")
-    axes.plot(case.factor("L_g"), max(case.factor("R_g"), region.R_g[0]), "k*", ms=9)
+    axes.plot(factor(loop, "L_g"), max(factor(loop, "R_g"), region.R_g[0]), "k*", ms=9)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("L_g over its printed value")
@@ -54,16 +53,16 @@ def draw_region(path: Path, case: Case, label: str, region: Region) -> None:
     figure.savefig(path, dpi=110)
 
 
-def draw_delay(path: Path, case: Case, label: str, margin: float) -> None:
+def draw_delay(path: Path, loop: ClosedLoop, label: str, margin: float) -> None:
     """The largest sigma over the added delay of all of u; ``margin`` in s, inf if none found."""
-    loop = case.loop()
+    assert loop.T_s is not None
     end = 1.5 * margin if np.isfinite(margin) else 20 * loop.T_s
     delays = np.linspace(0.0, end, _DELAYS)
-    radii = [abs(outermost(loop.closed(loop.with_delay(float(d))))) for d in delays]
+    sigma = [loop.later(float(d)).sigma() for d in delays]
     figure = Figure(figsize=(6.6, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    axes.plot(1e6 * delays, np.log(radii) / loop.T_s, color=COLOURS[0], lw=1.4)
+    axes.plot(1e6 * delays, sigma, color=COLOURS[0], lw=1.4)
     axes.axhline(0.0, color=_GREY, lw=0.8)
     if np.isfinite(margin):
         axes.axvline(1e6 * margin, color=COLOURS[1], lw=1.0, ls=(0, (4, 3)))
@@ -71,7 +70,7 @@ def draw_delay(path: Path, case: Case, label: str, margin: float) -> None:
             f"{1e6 * margin:.4g} µs", (1e6 * margin, 0.0), (-4, 6), textcoords="offset points",
             ha="right", color=COLOURS[1], fontsize=9,
         )  # fmt: skip
-    axes.set_xlabel(f"delay on top of the loop's {1e6 * loop.delay:g} µs [µs]")
+    axes.set_xlabel(f"delay on top of the loop's {1e6 * loop.u_delay[0]:g} µs [µs]")
     axes.set_ylabel("largest σ [1/s]")
     axes.set_title(f"{label}: the loop over its delay", loc="left", fontsize=10)
     axes.grid(True, color="#e4e4e4", lw=0.6)

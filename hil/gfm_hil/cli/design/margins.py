@@ -7,13 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
-from gfm_design.model.case import Case
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.margin_figures import draw_delay, draw_region
 from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
@@ -47,10 +46,10 @@ def call(options: argparse.Namespace) -> int:
         scenario = load_scenario(str(options.run / "scenario.toml"), law=options.law)
     else:
         scenario = load_scenario(options.scenario, law=options.law)
-    case, label = make_case(scenario)
+    loop, label = make_loop(scenario)
     console = Console(highlight=False)
     try:
-        found = margins(case)
+        found = margins(loop)
     except UnstableLoop as problem:
         if options.json:
             content = {"law": label, "scenario": scenario.title, "stable": False}
@@ -60,13 +59,13 @@ def call(options: argparse.Namespace) -> int:
             console.print(f"{label}: no margins, {problem}")
         return EXIT_OTHERWISE
     margin = found.loop.delay.seconds
-    set_s = case.loop().delay
+    set_s = float(loop.u_delay[0])
     measured = (
         read_loop_delay(options.run, set_s, scenario.T_s, margin)
         if options.run is not None
         else None
     )
-    region = _draw(options.figures, case, label, margin) if options.figures else None
+    region = _draw(options.figures, loop, label, margin) if options.figures else None
     if options.json:
         content = {"law": label, "scenario": scenario.title, "stable": True}
         content |= as_json(found, set_s, measured)
@@ -80,21 +79,21 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def make_case(scenario: Scenario) -> tuple[Case, str]:
+def make_loop(scenario: Scenario) -> tuple[ClosedLoop, str]:
     """The scenario's first law at its start, of a scheduled law the stage in force; its label."""
     references = scenario.references.vector()
     controller = Controller([load_law(scenario.law)], scenario.T_s, references)
-    return Case(scenario.plant, controller.active_law, np.asarray(references)), controller.active
+    return ClosedLoop.of(controller.active_law, scenario.plant, references), controller.active
 
 
-def _draw(folder: Path, case: Case, label: str, margin: float) -> Region:
+def _draw(folder: Path, loop: ClosedLoop, label: str, margin: float) -> Region:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise UserError(f"--figures {folder}: {problem.strerror}") from None
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("stable region", total=POINTS)
-        region = stable_region(case, POINTS, lambda rows: bar.update(task, completed=rows))
-    draw_region(folder / "region.png", case, label, region)
-    draw_delay(folder / "delay.png", case, label, margin)
+        region = stable_region(loop, POINTS, lambda rows: bar.update(task, completed=rows))
+    draw_region(folder / "region.png", loop, label, region)
+    draw_delay(folder / "delay.png", loop, label, margin)
     return region

@@ -74,7 +74,7 @@ def call(options: argparse.Namespace) -> int:
     except NotStabilised as none:
         reason = (
             f"{none}; in the way, on the paper's converter at P_ref = {problem.references[1]:g}: "
-            f"{culprit(problem, none.values).words()}"
+            f"{culprit(problem.closed_loop(none.values)).words()}"
         )
         if options.json:
             print(json.dumps({"law": file.name, "gamma": None, "reason": reason}))

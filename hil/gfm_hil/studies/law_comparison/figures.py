@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_design.tuning.law_comparison import T_S
+from gfm_design.model.closed_loop import T_S
 from gfm_hil.results.figures import COLOURS
 from gfm_hil.studies.law_comparison.experiments import AT, TRACE_EVERY
 from gfm_hil.studies.law_comparison.tables import others, worst

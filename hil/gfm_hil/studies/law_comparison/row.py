@@ -14,7 +14,7 @@ from typing import Any
 from gfm_design.margins.tolerance import End, Range
 from gfm_design.model.linear import Mode
 from gfm_design.norms.performance import Channel
-from gfm_design.tuning.law_comparison import Found, as_it_is, late_case, search, stands
+from gfm_design.tuning.law_comparison import Found, as_it_is, late_loop, search, stands
 from gfm_design.tuning.law_comparison_late import ALPHA
 from gfm_design.tuning.law_comparison_modes import Culprit
 from gfm_hil.studies.law_comparison.experiments import EXPERIMENTS, experiment
@@ -67,7 +67,7 @@ def make_row(job: Job, folder: Path, tell: Tell) -> Row:
             lambda done, best: tell(job.law, done, best),
         )
     row |= _found(found)
-    row["order"] = late_case(file, found.gains or {}).law.order
+    row["order"] = late_loop(file, found.gains or {}).made_of.law.order
     if found.gains is None:
         return row
     loop = stands(file, found.gains)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gfm_design.margins.delays import longest
-from gfm_design.tuning.law_comparison import T_S
+from gfm_design.model.closed_loop import T_S
 
 Row = dict[str, Any]
 Column = tuple[str, Callable[[Row], str]]

@@ -1,0 +1,397 @@
+"""A law and a plant, closed: the one loop that all analysis and synthesis looks at.
+
+The loop is continuous, as the paper's (Section III), or the exact sampled one of the bench. Around
+its operating point it maps w = (references r, grid d) to y as it truly is, before the sensors:
+
+    x' = A x + B w,    y = C x + D w,    x = (plant, its delay lines, law),
+
+where x' is dx/dt or the x of the next tick. Every other quantity (modes, margins, gamma, step)
+is read off these matrices. A loop may be many at once: plants, laws or both on leading axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gfm_design.model.linear import (
+    LinearLaw,
+    LinearPlant,
+    Mode,
+    hold,
+    linearise_law,
+    linearise_plant,
+    sampled_plant,
+)
+from gfm_design.model.operating_point import OperatingPoint, operating_point
+from gfm_design.norms.performance import (
+    D_Q,
+    PAPER_WEIGHTS,
+    Channel,
+    StateSpace,
+    Weight,
+    channel_norms,
+)
+from gfm_plant import Plant, load_converter, make_plant
+from gfm_plant.parameters import Element
+from gfm_plant.records import PlantRecord
+from gfm_runtime.catalogue import get_law
+from gfm_runtime.law import Law
+from gfm_runtime.realisation import realise
+from gfm_runtime.signals import NU, NY, REF_NAMES, Y_NAMES
+from gfm_runtime.tustin import OMEGA_ROW, DiscreteLaw, discretise
+
+if TYPE_CHECKING:
+    from gfm_design.margins.all_margins import LoopMargins
+
+Matrix = NDArray[np.float64]
+Response = NDArray[np.complex128]
+
+T_S = 1e-4  # s
+REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # (V_dcref, P_ref, omega_g, Q_ref, V_ref), Table III
+#: the loop's inputs w: the references, and the grid as Eq. (15) has it
+INPUTS = (*REF_NAMES, "grid.omega_g", "grid.V_g")
+
+_GONE = 1e-9  # |z| below this is gone within a tick: an emptied delay line, no mode
+_P_REF, _OMEGA_G = INPUTS.index("P_ref"), INPUTS.index("grid.omega_g")
+_P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a loop was made of; ``ClosedLoop.changed`` makes it anew with other elements.
+
+    Attributes:
+        plant: its options.
+        law: at its sampling time; ``ideal`` says that the loop has it as its file writes it.
+        ref: references, shape (5,), p.u.
+        par: the plant's record.
+        op: where plant and law rest.
+    """
+
+    plant: Plant
+    law: DiscreteLaw
+    ideal: bool
+    ref: Matrix
+    par: PlantRecord
+    op: OperatingPoint
+
+
+class ClosedLoop:
+    """A law on a plant around one operating point.
+
+    Args:
+        plant: continuous, one or several on a leading axis.
+        law: continuous if the loop is, else from tick to tick; one or several on a leading axis.
+        T_s: sampling time, s; None for a continuous loop, which has no delay.
+        u_delay: from the tick that samples y[k] to the moment when u[k] acts, s: a number, or shape
+            (..., 3).
+        y_delay: how old y is at its tick, s: a number, or shape (..., 5).
+        origin: what it was made of, if known.
+
+    Raises:
+        ValueError: a continuous loop with a delay.
+    """
+
+    def __init__(
+        self,
+        plant: LinearPlant,
+        law: LinearLaw,
+        T_s: float | None = None,
+        u_delay: ArrayLike = 0.0,
+        y_delay: ArrayLike = 0.0,
+        origin: Origin | None = None,
+    ) -> None:
+        many = plant.A.shape[:-2]
+        self.plant, self.law, self.T_s, self.origin = plant, law, T_s, origin
+        self.u_delay: Matrix = np.broadcast_to(np.asarray(u_delay, float), (*many, NU))
+        self.y_delay: Matrix = np.broadcast_to(np.asarray(y_delay, float), (*many, NY))
+        if T_s is None and (self.u_delay.any() or self.y_delay.any()):
+            raise ValueError("a continuous loop has no delay; sample it first")
+
+    @classmethod
+    def of(
+        cls,
+        law: str | Law | DiscreteLaw,
+        plant: Plant | None = None,
+        references: Sequence[float] | Matrix = REFERENCES,
+        *,
+        T_s: float = T_S,
+        ideal: bool = False,
+    ) -> ClosedLoop:
+        """The loop of a law on a plant, around the point where both rest.
+
+        Args:
+            law: catalogue name, path of a law file (of a scheduled law its first stage), a law, or
+                one at its sampling time.
+            plant: converter, delay, sensors, DC source, grid and factors of the elements, as in a
+                scenario; by default the paper's converter, with neither delay nor sensors.
+            references: (V_dcref, P_ref, omega_g, Q_ref, V_ref), p.u.
+            T_s: sampling time, s; a law that has its own keeps it.
+            ideal: the continuous loop, neither sampled nor delayed, whatever the plant says.
+
+        Raises:
+            LawError: no such law, or it cannot be discretised.
+            NoEquilibrium: plant and law have no common rest.
+        """
+        if not isinstance(law, DiscreteLaw):
+            law = discretise(get_law(law) if isinstance(law, str) else law, T_s)
+        plant = plant or Plant()
+        ref = np.asarray(references, float)
+        return cls._made(plant, law, ideal, ref, make_plant(plant, law.T_s)[0])
+
+    @classmethod
+    def _made(
+        cls, plant: Plant, law: DiscreteLaw, ideal: bool, ref: Matrix, par: PlantRecord
+    ) -> ClosedLoop:
+        grid, delay = plant.grid, plant.delay
+        op = operating_point(par, law, ref, grid.omega_g, grid.V_g)
+        linear = linearise_plant(par, op, grid.omega_g, grid.V_g)
+        controlled = plant.dc_source.mode == "controlled"
+        state_space = realise(law.law) if ideal else law
+        reaction = linearise_law(law.law, state_space, op, ref, controlled)
+        origin = Origin(plant, law, ideal, ref, par, op)
+        if ideal:
+            return cls(linear, reaction, origin=origin)
+        seconds = (delay.samples + delay.fraction) * law.T_s
+        return cls(linear, reaction, law.T_s, seconds, origin=origin)
+
+    @classmethod
+    def stacked(cls, loops: Sequence[ClosedLoop]) -> ClosedLoop:
+        """Single loops of one sampling time, whose sampled plants have one size, as many plants.
+
+        The law is that of the first; ``with_law`` gives all of them another.
+        """
+        plants = LinearPlant.stacked([loop.plant for loop in loops])
+        u_delay, y_delay = (
+            np.stack([getattr(o, n) for o in loops]) for n in ("u_delay", "y_delay")
+        )
+        out = cls(plants, loops[0].law, loops[0].T_s, u_delay, y_delay)
+        out.__dict__["held"] = LinearPlant.stacked([loop.held for loop in loops])
+        return out
+
+    def __repr__(self) -> str:
+        kind = "continuous" if self.T_s is None else f"T_s = {self.T_s:g} s"
+        name = f"{self.origin.law.law.name}, " if self.origin else ""
+        return f"<ClosedLoop {name}{kind}, A {self.A.shape}>"
+
+    # other loops
+
+    def with_law(self, law: LinearLaw) -> ClosedLoop:
+        """The same plant under another law, or several; the sampled plant is kept."""
+        out = ClosedLoop(self.plant, law, self.T_s, self.u_delay, self.y_delay)
+        out.__dict__["held"] = self.held
+        return out
+
+    def sampled(self, T_s: float, delay: float = 0.0) -> ClosedLoop:
+        """A continuous loop with its law by Tustin at T_s and u held ``delay`` later, s."""
+        return ClosedLoop(self.plant, self.law.sampled(T_s), T_s, delay)
+
+    def later(self, u: ArrayLike = 0.0, y: ArrayLike = 0.0) -> ClosedLoop:
+        """The sampled loop with more delay of u (3,) and y (5,), s; one number is for all."""
+        u_delay, y_delay = self.u_delay + np.asarray(u), self.y_delay + np.asarray(y)
+        return ClosedLoop(self.plant, self.law, self.T_s, u_delay, y_delay, self.origin)
+
+    def scaled(self, u: ArrayLike = 1.0, y: ArrayLike = 1.0) -> ClosedLoop:
+        """The loop with u (3,) and y (5,) multiplied on their way, by complex numbers too."""
+        by_u, by_y, c = np.broadcast_to(u, NU)[:, None], np.broadcast_to(y, NY), self.law
+        parts = (c.A, c.B * by_y, by_u * c.C, by_u * c.D * by_y, c.B_r, by_u * c.D_r)
+        return self.with_law(LinearLaw(*parts, rows=c.rows))
+
+    def changed(self, factors: Mapping[Element, float]) -> ClosedLoop:
+        """The loop anew, at its own operating point, with elements at factors of their values.
+
+        Raises:
+            NoEquilibrium: plant and law have none there.
+        """
+        of = self.made_of
+        # into the record: the emulator's sub-step, which make_plant checks, plays no part here
+        par, nominal = of.par.copy(), load_converter(of.plant.converter).pu()
+        for name, factor in factors.items():
+            par[name] = nominal[name] * factor
+        return self._made(of.plant, of.law, of.ideal, of.ref, par)
+
+    @property
+    def made_of(self) -> Origin:
+        """What the loop was made of.
+
+        Raises:
+            ValueError: it was made of matrices.
+        """
+        if self.origin is None:
+            raise ValueError("this loop was made of matrices, not of a plant and a law")
+        return self.origin
+
+    # matrices
+
+    @cached_property
+    def held(self) -> LinearPlant:
+        """The plant as the law meets it: from tick to tick with its delay lines, or continuous."""
+        T_s = self.T_s
+        if T_s is None:
+            return self.plant
+        if self.plant.A.ndim == 2:
+            return sampled_plant(self.plant, T_s, self.u_delay, self.y_delay)
+        p = self.plant
+        single = [LinearPlant(*m) for m in zip(p.A, p.B, p.B_d, p.C, p.C_true, strict=True)]
+        each = zip(single, self.u_delay, self.y_delay, strict=True)
+        return LinearPlant.stacked([sampled_plant(of, T_s, u, y) for of, u, y in each])
+
+    @cached_property
+    def A(self) -> Matrix:
+        """The loop's matrix, shape (..., n, n)."""
+        p, c = self.held, self.law
+        n, m = p.A.shape[-1], c.A.shape[-1]
+        through = p.B @ c.D @ p.C
+        out = np.empty((*np.broadcast_shapes(through.shape[:-2], c.A.shape[:-2]), n + m, n + m),
+                       np.result_type(p.A, c.A, c.D))  # fmt: skip
+        out[..., :n, :n], out[..., :n, n:] = p.A + through, p.B @ c.C
+        out[..., n:, :n], out[..., n:, n:] = c.B @ p.C, c.A
+        return out
+
+    @cached_property
+    def state_space(self) -> StateSpace:
+        """(A, B, C, D) from ``INPUTS`` (7) to y = (v_dc, p, omega_u, q, V) before the sensors."""
+        p, c, A = self.held, self.law, self.A
+        n, many = p.A.shape[-1], A.shape[:-2]
+        B, D = np.zeros((*many, A.shape[-1], len(INPUTS))), np.zeros((*many, NY, len(INPUTS)))
+        C = np.zeros((*many, NY, A.shape[-1]))
+        B[..., :n, :NY], B[..., n:, :NY], B[..., :n, NY:] = p.B @ c.D_r, c.B_r, p.B_d
+        C[..., :n] = p.C_true
+        own = slice(OMEGA_ROW, OMEGA_ROW + 1), slice(2, 3)  # omega_u of u, and of y
+        C[..., own[1], :n] = c.D[..., own[0], :] @ p.C
+        C[..., own[1], n:] = c.C[..., own[0], :]
+        D[..., own[1], :NY] = c.D_r[..., own[0], :]
+        return A, B, C, D
+
+    def performance(self, D_q: float = D_Q) -> StateSpace:
+        """(A, B, C, D) of T from w = (P_ref, omega_g) to z = (P_ref - p, p, omega_u, q + V/D_q).
+
+        Section III-B of the paper. omega_g is the grid's frequency; the law's own reference omega_g
+        stays where it is (no PLL, as in the paper's MIMO-GFM).
+        """
+        A, B, C, D = self.state_space
+        w, z = [_P_REF, _OMEGA_G], np.zeros((4, NY))
+        z[0, _P], z[1, _P], z[2, 2], z[3, _Q], z[3, _V] = -1.0, 1.0, 1.0, 1.0, 1.0 / D_q
+        D = z @ D[..., w]
+        D[..., 0, 0] += 1.0
+        return A, B[..., w], z @ C, D
+
+    @cached_property
+    def commands(self) -> tuple[int, ...]:
+        """Those of u that act: i_u does not where the DC source regulates itself."""
+        acts = self.plant.B.any(axis=0) & (self.law.C.any(axis=1) | self.law.D.any(axis=1))
+        return tuple(int(j) for j in np.flatnonzero(acts))
+
+    @cached_property
+    def measurements(self) -> tuple[int, ...]:
+        """Those of y that the law uses for a command that acts."""
+        used = self.law.B.any(axis=0) | self.law.D[list(self.commands)].any(axis=0)
+        return tuple(int(i) for i in np.flatnonzero(used & self.plant.C.any(axis=1)))
+
+    # what they say
+
+    def sigma(self) -> Any:
+        """Largest real part of any mode, 1/s: a number, or the shape of the leading axes.
+
+        A sampled loop without any eigenvalue but 0 gives -inf.
+        """
+        values = np.linalg.eigvals(self.A)
+        if self.T_s is None:
+            return values.real.max(axis=-1)
+        with np.errstate(divide="ignore"):
+            return np.log(np.abs(values).max(axis=-1)) / self.T_s
+
+    def poles(self) -> Response:
+        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without emptied lines."""
+        values = np.linalg.eigvals(self.A).astype(complex)
+        return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
+
+    def modes(self) -> list[Mode]:
+        """Modes of a single loop, the least damped (largest sigma) first."""
+        upper = [Mode.of(s) for s in self.poles() if s.imag >= 0.0]
+        return sorted(upper, key=lambda mode: -mode.sigma)
+
+    def channels(
+        self, weights: tuple[Weight, ...] = PAPER_WEIGHTS, D_q: float = D_Q
+    ) -> tuple[Channel, ...]:
+        """The norm of every weighted channel W_ij T_ij; a sampled loop has the weights by Tustin.
+
+        Raises:
+            Unstable: the loop is not stable; it has no gamma.
+        """
+        return channel_norms(self.performance(D_q), weights, self.T_s)
+
+    def gamma(self, weights: tuple[Weight, ...] = PAPER_WEIGHTS, D_q: float = D_Q) -> float:
+        """The H-infinity norm of diag(W_ij T_ij), the largest of ``channels``.
+
+        Raises:
+            Unstable: the loop is not stable; it has no gamma.
+        """
+        return max(channel.norm for channel in self.channels(weights, D_q))
+
+    def margins(self) -> LoopMargins:
+        """Gain, phase, disk and delay margins of a sampled loop; takes a second.
+
+        Raises:
+            UnstableLoop: there are none.
+        """
+        from gfm_design.margins.all_margins import loop_margins  # which looks at loops itself
+
+        return loop_margins(self)
+
+    def step(
+        self, of: str = "P_ref", seconds: float = 1.0, every: float = T_S
+    ) -> tuple[Matrix, Matrix]:
+        """(t, y) after a unit step of one of ``INPUTS``: shapes (K,) in s and (K,5), p.u.
+
+        y = (v_dc, p, omega_u, q, V) are deviations, before the sensors, and exact. A sampled loop
+        gives every tick; ``every`` [s] is for a continuous one.
+
+        Raises:
+            ValueError: no such input.
+        """
+        if of not in INPUTS:
+            raise ValueError(f"{of!r} is no input of the loop; use one of {list(INPUTS)}")
+        A, B, C, D = self.state_space
+        k = INPUTS.index(of)
+        tick = self.T_s or every
+        if self.T_s is None:
+            A, B = hold(A, B, tick)
+        t = np.asarray(tick * np.arange(round(seconds / tick) + 1), np.float64)
+        x, y = np.zeros(len(A)), np.empty((len(t), NY))
+        for row in y:
+            row[:] = C @ x + D[:, k]
+            x = A @ x + B[:, k]
+        return t, y
+
+    def frequency_response(self, omega: ArrayLike) -> Response:
+        """The closed loop from ``INPUTS`` to y at omega [rad/s] (K,), shape (K, 5, 7)."""
+        return _response(self.state_space, self._at(omega))
+
+    def loop_transfer(self, omega: ArrayLike, at_y: bool = False) -> Response:
+        """L of all loops cut at u, or at y, so that S = (I + L)^-1; shape (K, 3, 3) or (K, 5, 5).
+
+        omega [rad/s] has shape (K,). Delay, sensors and the omega_u loop of the law are in it.
+        """
+        p, c, s = self.held, self.law, self._at(omega)
+        zero = np.zeros((NY, NU))
+        plant, law = _response((p.A, p.B, p.C, zero), s), _response((c.A, c.B, c.C, c.D), s)
+        return -plant @ law if at_y else -law @ plant
+
+    def _at(self, omega: ArrayLike) -> Response:
+        """s, or z = e^(s T_s), on the imaginary axis."""
+        s = 1j * np.asarray(omega, float)
+        return s if self.T_s is None else np.exp(s * self.T_s)
+
+
+def _response(of: StateSpace, s: Response) -> Response:
+    """C (s I - A)^-1 B + D, one a row of s."""
+    A, B, C, D = of
+    states = np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
+    return np.asarray(C @ states + D)

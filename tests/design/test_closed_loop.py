@@ -1,0 +1,182 @@
+"""The one closed loop: its readings against each other, other programs and the nonlinear bench."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from gfm_design.margins.locus import locus_at_u, locus_at_y
+from gfm_design.model.box import Point
+from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
+from gfm_design.norms.hinf import Unstable
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.scenario.model import check_scenario
+from gfm_plant import Plant
+from gfm_runtime import discretise, get_law, law_file
+
+from .support import reference_loop
+
+RIG: dict[str, Any] = {
+    "delay": {"samples": 1, "fraction": 0.25},
+    "sensors": {"bandwidth_hz": 300.0},
+    "factors": {"R_f": 3.0, "R_g": 3.0},
+}
+
+
+def loop(law: str = "mimo-gfm", plant: dict[str, Any] | None = None, **kind: Any) -> ClosedLoop:
+    return ClosedLoop.of(law, Plant.model_validate(plant or {}), **kind)
+
+
+@pytest.mark.parametrize(("law", "gamma"), [("mimo-gfm", 2.0209), ("vsg-2", 15.975)])
+def test_gamma_of_the_printed_gains(law: str, gamma: float) -> None:
+    assert loop(law, ideal=True).gamma() == pytest.approx(gamma, rel=5e-5)
+
+
+def test_a_law_may_be_a_name_a_law_or_a_discrete_law() -> None:
+    by_name, law = loop("vsg-5").A, get_law("vsg-5")
+    np.testing.assert_array_equal(ClosedLoop.of(law).A, by_name)
+    np.testing.assert_array_equal(ClosedLoop.of(discretise(law, 1e-4)).A, by_name)
+
+
+@pytest.mark.parametrize("law", ["mimo-gfm-deployable", "vsg-2"])
+def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
+    # 1e-4 p.u. of P_ref: what is not linear is of the order of 1e-8
+    size, ticks = 1e-4, 1500
+    content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": RIG}
+    bench = make_bench(check_scenario(content, "test"))
+    c = bench.controller
+    c.set("P_ref", REFERENCES[1] + size)
+    signals = np.full((ticks, len(PLANT_COLUMNS)), np.nan)
+    run_ticks(
+        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
+        signals, np.empty((ticks, len(CONTROLLER_COLUMNS))), 0, ticks, False,
+    )  # fmt: skip
+    p = signals[:, PLANT_COLUMNS.index("true_p")] - REFERENCES[1]
+    t, y = ClosedLoop.of(law, bench.scenario.plant).step("P_ref", seconds=ticks * 1e-4)
+    assert t[1] == pytest.approx(1e-4) and y.shape == (ticks + 1, 5)
+    assert np.abs(p / size - y[:ticks, 1]).max() < 2e-3 * np.abs(y[:, 1]).max()
+
+
+def test_step_settles_where_the_response_at_rest_says() -> None:
+    for of in (loop("mimo-gfm-deployable", RIG), loop("mimo-gfm-deployable", ideal=True)):
+        rest = of.frequency_response([0.0])[0].real
+        for k, name in enumerate(INPUTS):
+            _, y = of.step(name, seconds=8.0, every=1e-3)
+            np.testing.assert_allclose(
+                y[-1], rest[:, k], atol=2e-3 * max(1.0, abs(rest[:, k]).max())
+            )
+
+
+@pytest.mark.parametrize("ideal", [True, False])
+def test_frequency_response_is_that_of_python_control(ideal: bool) -> None:
+    of = loop("vsg-5", {} if ideal else RIG, ideal=ideal)
+    omega = np.geomspace(0.1, 2e4, 20)
+    system = control.ss(*of.state_space, *([] if ideal else [of.T_s]))
+    expected = np.moveaxis(system.frequency_response(omega).frdata, -1, 0)
+    np.testing.assert_allclose(of.frequency_response(omega), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_loop_transfer_gives_the_sensitivity_that_the_margins_use() -> None:
+    of, omega = loop("mimo-gfm", RIG), np.geomspace(1.0, 3e4, 40)
+    for at_y, locus, channels in (
+        (False, locus_at_u(of), of.commands),
+        (True, locus_at_y(of), of.measurements),
+    ):
+        L = of.loop_transfer(omega, at_y)
+        S = np.linalg.inv(np.eye(L.shape[-1]) + L)
+        H = (S - 0.5 * np.eye(L.shape[-1]))[:, list(channels)][:, :, list(channels)]
+        np.testing.assert_allclose(locus(omega), H, atol=1e-8)
+
+
+def test_many_plants_in_one_loop_are_each_of_them() -> None:
+    law = discretise(get_law("mimo-gfm"), 1e-4)
+    loops = [Point(0.1, 1.0, L_g, delay).loop(law) for L_g, delay in ((1.0, 1.4), (20.0, 2.0))]
+    many = ClosedLoop.stacked(loops)
+    again = ClosedLoop(many.plant, many.law, many.T_s, many.u_delay, many.y_delay)
+    for one in (many, again):
+        np.testing.assert_array_equal(one.A, [of.A for of in loops])
+        np.testing.assert_allclose(one.sigma(), [of.sigma() for of in loops])
+    for whole, parts in zip(many.state_space, zip(*(o.state_space for o in loops), strict=True),
+                            strict=True):  # fmt: skip
+        np.testing.assert_allclose(whole, parts, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", ["mimo-gfm", "vsg-5"])
+def test_many_laws_in_one_loop_are_each_of_them(law: str) -> None:
+    file = law_file(law)
+    problem = PaperProblem(file, free_gains(file))
+    start = np.array([g.start for g in problem.gains])
+    values = start * np.array([[1.0], [1.01], [0.98]])
+    loops = [problem.closed_loop(v) for v in values]
+    many = problem.closed_loops(values)
+    np.testing.assert_allclose(many.sigma(), [of.sigma() for of in loops], rtol=1e-6)
+    late = [of.sampled(1e-4, 1.3e-4).sigma() for of in loops]
+    np.testing.assert_allclose(many.sampled(1e-4, 1.3e-4).sigma(), late, rtol=1e-6)
+
+
+def test_sampling_a_loop_is_discretising_its_law() -> None:
+    # Tustin of the law with its omega_u loop closed, against that of the runtime, closed after it
+    ideal, exact = loop("vsg-5", ideal=True), loop("vsg-5", {"delay": {"samples": 1}})
+    ours = ideal.sampled(1e-4, 1e-4)
+    np.testing.assert_allclose(
+        sorted(np.abs(ours.poles())), sorted(np.abs(exact.poles())), rtol=1e-6
+    )
+    reference = reference_loop(exact.made_of.par, ideal.plant, ideal.law.sampled(1e-4))
+    assert ours.sigma() == pytest.approx(
+        np.log(np.abs(np.linalg.eigvals(reference)).max()) / 1e-4, abs=1e-6
+    )
+
+
+def test_sensors_are_in_the_loop_but_not_in_what_it_gives() -> None:
+    ideal, gained = loop(), loop(plant={"sensors": {"gain": {"p": 1.05}}})
+    np.testing.assert_array_equal(ideal.plant.C, ideal.plant.C_true)
+    np.testing.assert_allclose(gained.plant.C[1], 1.05 * gained.plant.C_true[1])
+    # a sensor that reads 5 % too much makes p settle 5 % lower
+    for of, rest in ((ideal, 1.0), (gained, 1 / 1.05)):
+        assert of.frequency_response([0.0])[0, 1, 1].real == pytest.approx(rest, rel=1e-6)
+
+
+def test_changed_elements_are_those_of_another_plant() -> None:
+    other = loop(plant={**RIG, "factors": {"R_f": 3.0, "R_g": 0.5, "L_g": 2.0}})
+    np.testing.assert_allclose(
+        loop(plant=RIG).changed({"R_g": 0.5, "L_g": 2.0}).A, other.A, atol=1e-9
+    )
+
+
+def test_what_cannot_be() -> None:
+    ideal = loop(ideal=True)
+    with pytest.raises(ValueError, match="continuous loop has no delay"):
+        ideal.later(1e-4)
+    with pytest.raises(ValueError, match="sample it first"):
+        ideal.margins()
+    with pytest.raises(ValueError, match="'P_reff' is no input"):
+        ideal.step("P_reff")
+    with pytest.raises(ValueError, match="made of matrices"):
+        ClosedLoop(ideal.plant, ideal.law).changed({"L_g": 2.0})
+    with pytest.raises(Unstable):
+        loop(plant={"delay": {"samples": 1}}).gamma()
+
+
+def test_representation_and_margins() -> None:
+    of = loop()
+    assert repr(of) == "<ClosedLoop mimo-gfm, T_s = 0.0001 s, A (11, 11)>"
+    assert repr(loop(ideal=True)) == "<ClosedLoop mimo-gfm, continuous, A (11, 11)>"
+    assert of.margins().worst == of.modes()[0]
+
+
+def test_a_live_process_loads_neither_synthesis_nor_its_packages() -> None:
+    code = "import sys, gfm_hil.engine.setup\nprint(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"gfm_design.model.closed_loop", "gfm_design.norms", "scipy.optimize", "cma"}
+    loaded = set(said.stdout.split())
+    assert "gfm_design.model.operating_point" in loaded
+    assert not loaded & heavy
