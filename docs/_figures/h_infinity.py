@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from gfm_design.norms.full_order import full_order
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
+from gfm_design.tuning.full_order import full_order
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import tune_paper

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from gfm_design.norms.full_order import Missing, full_order
+from gfm_design.tuning.full_order import Missing, full_order
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.law_comparison_modes import culprit
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
