@@ -25,6 +25,7 @@ FOLDERS = {
     "gfm_design": ROOT / "design" / "gfm_design",
     "gfm_hil": ROOT / "hil" / "gfm_hil",
     "gfm_pytest": ROOT / "hil" / "gfm_pytest",
+    "gfmhil": ROOT / "hil" / "gfmhil",
 }
 RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).

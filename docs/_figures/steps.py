@@ -113,8 +113,7 @@ def switchover() -> None:
     one = run(case)
     with tempfile.TemporaryDirectory() as place:
         shown = {**one.signals, **window(one, 0.8, 4.0)}
-        laws = [case.law, "vsg-2"]
-        drawn = draw_run(Path(place), case, shown, {}, one.summary, laws)
+        drawn = draw_run(Path(place), case, shown, {}, one.summary)
         shutil.move(drawn[0], FIGURES / "switchover.png")
     s = one.summary
     mantissa, exponent = f"{s['bump_pu'][0]:.1e}".split("e")

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from gfm_hil.results.run_folder import Run
+from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import Scenario, check_scenario
 from gfm_runtime import get_law

@@ -30,9 +30,7 @@ def events(count: int) -> list[dict[str, object]]:
 def test_a_run_of_any_length_is_drawn_without_a_warning(ticks, make, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        pictures = draw_run(
-            tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)}, []
-        )
+        pictures = draw_run(tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)})
     assert [p.name for p in pictures] == ["signals.png"]
     assert pictures[0].stat().st_size > 20_000
 
@@ -43,12 +41,12 @@ def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):
         signals[name][30_000:] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []}, [])
+        draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []})
 
 
 def test_a_controller_alone_has_no_picture_of_the_plant(make, tmp_path):
     signals = {"t": np.zeros(9), "ref_P_ref": np.zeros(9)}
-    assert draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []}, []) == []
+    assert draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []}) == []
 
 
 def test_many_laws_are_compared_in_one_figure(make, tmp_path):

@@ -22,7 +22,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import EVENT_COLUMNS, cell
-from gfm_hil.results.run_folder import Run, check_free
+from gfm_hil.results.run import Run
+from gfm_hil.results.run_folder import check_free
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import find_scenario
 

@@ -10,8 +10,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
 
+from gfm_hil.studies.law import cell_text
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
-from gfm_runtime.lawfile import ElementSpec, LawFile
+from gfm_runtime.lawfile import LawFile
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
 MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
@@ -28,20 +29,6 @@ def add(commands: Any) -> None:
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
     show.add_argument("--json", action="store_true", help="as JSON")
     show.set_defaults(call=call_show)
-
-
-def element_text(spec: ElementSpec | list[ElementSpec]) -> str:
-    """An element as Table II writes it, e.g. ``IF×PD``."""
-    specs = spec if isinstance(spec, list) else [spec]
-    return "×".join(s.type for s in specs)
-
-
-def cell_text(file: LawFile, key: str) -> str:
-    """One cell of Table II, with the feedback-only term in braces; 0 if empty."""
-    phi, psi = file.phi.get(key), file.psi.get(key)
-    text = element_text(phi) if phi else ""
-    text += f"{{{element_text(psi)}}}" if psi else ""
-    return text or "0"
 
 
 def call_list(options: argparse.Namespace) -> int:

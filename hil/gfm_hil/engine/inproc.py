@@ -6,11 +6,22 @@ calls the same functions in the same order.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import Part, record_command, record_controller, record_sample
+from gfm_hil.recording.recorder import (
+    CONTROLLER_COLUMNS,
+    CONTROLLER_TIMES,
+    PLANT_COLUMNS,
+    PLANT_TIMES,
+    Part,
+    record_command,
+    record_controller,
+    record_sample,
+)
 from gfm_plant import plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.names import CONTROLLER, SAFE_STATE
 from gfm_plant.protection import trip
@@ -81,6 +92,19 @@ def run_inproc(
         if not go_on(k):
             timeline.end("interrupted", "stopped by the operator", k)
     timeline.finish(k)
+
+
+def buffers(ticks: int) -> tuple[Part, Part]:
+    """Room in memory to record one run: the plant's and the controller's."""
+
+    def part(columns: Sequence[str], times: Sequence[str]) -> Part:
+        return Part(
+            np.empty((ticks, len(columns))),
+            np.empty((0, len(times)), np.int64),  # lockstep has no times
+            np.zeros(2, np.int64),
+        )
+
+    return part(PLANT_COLUMNS, PLANT_TIMES), part(CONTROLLER_COLUMNS, CONTROLLER_TIMES)
 
 
 def compile_loop(bench: Bench, plant_part: Part, controller_part: Part) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.engine.retune import change_gains
 from gfm_hil.engine.setup import Bench
 from gfm_hil.recording.log import Outcome, Status
@@ -222,6 +222,19 @@ class Timeline:
         self.flush()
         self._log.close()
         self._room.unlink(missing_ok=True)
+
+
+class TimelineInMemory(Timeline):
+    """The events of a run in process, whose log stays in ``lines``."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench, Path(os.devnull), SIDES)
+        self.lines: list[dict[str, Any]] = []
+
+    def write(self, tick: int, kind: str, **more: Any) -> None:
+        """Add a line to ``lines``."""
+        t = round(tick * self._bench.scenario.T_s, 9)
+        self.lines.append({"tick": tick, "t": t, "event": kind, **more})
 
 
 def safe_reason(ctl: Any) -> str:

@@ -95,13 +95,17 @@ def _mark(axes: Sequence[Axes], events: Sequence[dict[str, Any]]) -> None:
         )  # fmt: skip
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+def _figure(size: tuple[float, float]) -> Figure:
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for a in axes[-1]:
         a.set_xlabel("t [s]", fontsize=9)
-    return figure, list(axes.ravel())
+    return list(axes.ravel())
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -115,25 +119,28 @@ def draw_run(
     signals: Signals,
     timing: Signals,
     summary: dict[str, Any],
-    laws: Sequence[str],
 ) -> list[Path]:
     """Draw one run into its folder: signals.png and, in real time, timing.png."""
     pictures = []
     if "true_p" in signals:
-        pictures.append(_draw_signals(folder, scenario, signals, summary, laws))
+        figure, path = _figure(SIZE), folder / "signals.png"
+        draw_signals(figure, scenario, signals, summary)
+        _save(figure, path)
+        pictures.append(path)
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
         pictures.append(draw_timing(folder, scenario, timing, summary))
     return pictures
 
 
-def _draw_signals(
-    folder: Path,
-    scenario: Scenario,
-    signals: Signals,
-    summary: dict[str, Any],
-    laws: Sequence[str],
-) -> Path:
-    figure, axes = _figure(3, 2, (10.5, 7.4))
+SIZE = (10.5, 7.4)  # inches, of the six panels of a run
+SIZE_LAWS = (8.6, 8.2)
+
+
+def draw_signals(
+    figure: Figure, scenario: Scenario, signals: Signals, summary: dict[str, Any]
+) -> list[Axes]:
+    """Fill a figure with the six panels of a run: p, q, frequency, V, v_dc and currents."""
+    axes = _panels(figure, 3, 2)
     t, f_n = signals["t"], nominal_frequency(scenario)
     blue, red, green, *_ = COLOURS
 
@@ -157,9 +164,7 @@ def _draw_signals(
         f"{scenario.title} — {' → '.join(summary['laws'])}", fontsize=11, x=0.01,
         ha="left",
     )  # fmt: skip
-    path = folder / "signals.png"
-    _save(figure, path)
-    return path
+    return axes
 
 
 def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict[str, Any]) -> Path:
@@ -198,11 +203,14 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict
     return path
 
 
-def draw_comparison(
-    path: Path, scenario: Scenario, runs: Mapping[str, Signals], events: Sequence[dict[str, Any]]
-) -> None:
-    """p, frequency, q and v_dc of several laws in one figure, like the paper's."""
-    figure, axes = _figure(4, 1, (8.6, 8.2))
+def draw_laws(
+    figure: Figure,
+    scenario: Scenario,
+    runs: Mapping[str, Signals],
+    events: Sequence[dict[str, Any]],
+) -> list[Axes]:
+    """Fill a figure with p, frequency, q and v_dc of several laws, like the paper's."""
+    axes = _panels(figure, 4, 1)
     f_n = nominal_frequency(scenario)
     for a, (title, name, factor) in zip(
         axes,
@@ -222,4 +230,13 @@ def draw_comparison(
     axes[0].legend(fontsize=8.5, frameon=False, ncols=min(4, len(runs)), loc="lower right")
     _mark(axes, events)
     figure.suptitle(scenario.title, fontsize=11, x=0.01, ha="left")
+    return axes
+
+
+def draw_comparison(
+    path: Path, scenario: Scenario, runs: Mapping[str, Signals], events: Sequence[dict[str, Any]]
+) -> None:
+    """Draw several laws side by side into a file, see ``draw_laws``."""
+    figure = _figure(SIZE_LAWS)
+    draw_laws(figure, scenario, runs, events)
     _save(figure, path)

@@ -12,16 +12,14 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.log import Outcome, read_log, worst
-from gfm_hil.recording.npz import Arrays, Column
 from gfm_hil.recording.recorder import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
@@ -31,32 +29,13 @@ from gfm_hil.recording.recorder import (
     read_recording,
     remove_parts,
 )
+from gfm_hil.results.run import Run, load_run
 from gfm_hil.results.summary import summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 _COLUMNS = ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *PLANT_TIMES, *CONTROLLER_TIMES)
-
-
-@dataclass(frozen=True)
-class Run:
-    """A finished run.
-
-    Attributes:
-        folder: of the run.
-        summary: content of summary.json.
-        columns: of signals.npz, each shape (ticks,), read block by block when sliced.
-    """
-
-    folder: Path
-    summary: dict[str, Any]
-    columns: dict[str, Column]
-
-    @property
-    def signals(self) -> Arrays:
-        """The columns of signals.npz as arrays; each access reads one from the file."""
-        return Arrays(self.columns)
 
 
 def check_free(folder: Path, ticks: int) -> None:
@@ -121,8 +100,7 @@ def recover(folder: Path) -> Run:
     with _alone(folder), _kept(folder):
         if (folder / "summary.json").is_file():
             _clear(folder)
-            summary = json.loads((folder / "summary.json").read_text("utf-8"))
-            return Run(folder, summary, read_recording(folder)[0])
+            return load_run(folder)
         parts = folder / "parts"
         if not parts.is_dir() and not (folder / "signals.npz").is_file():
             lay = f" (it lay in {parts.readlink()})" if parts.is_symlink() else ""
@@ -207,7 +185,7 @@ def _complete(
     """Make the files of a run, then remove what they were made of; may be repeated at any point."""
     if (folder / "parts").is_dir():
         merge(folder, scenario.T_s, laws)
-    signals, timing, _ = read_recording(folder)
+    signals, timing, labels = read_recording(folder)
     logs = sorted(folder.glob("events_*.jsonl"))
     log = read_log(*(logs or [folder / "events.jsonl"]))
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
@@ -227,13 +205,13 @@ def _complete(
         from gfm_hil.results.figures import draw_run
         from gfm_hil.results.report import write_report
 
-        pictures = draw_run(folder, scenario, signals, timing, summary, laws)
+        pictures = draw_run(folder, scenario, signals, timing, summary)
         write_report(folder, scenario, summary, pictures)
     sync_folder(folder)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     sync_folder(folder)
     _clear(folder)
-    return Run(folder, summary, signals)
+    return Run(scenario, summary, signals, labels, log, folder)
 
 
 def _clear(folder: Path) -> None:

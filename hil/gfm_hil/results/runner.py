@@ -7,18 +7,25 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import SIDES
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.inproc import compile_loop, run_inproc
+from gfm_hil.engine.inproc import buffers, compile_loop, run_inproc
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import Part, remove_parts
-from gfm_hil.results.run_folder import Run, check_free, finish, in_use
+from gfm_hil.engine.timeline import Timeline, TimelineInMemory
+from gfm_hil.recording.log import Outcome
+from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part, remove_parts
+from gfm_hil.results.metrics import Rows
+from gfm_hil.results.run import Run
+from gfm_hil.results.run_folder import check_free, finish, in_use
+from gfm_hil.results.summary import summarise
 from gfm_hil.scenario.model import INPROC, Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_runtime.assembly import SPARE
 
 __all__ = ["Progress", "Run", "run_scenario"]
 
@@ -90,3 +97,40 @@ def _run_here(
     run_inproc(bench, parts["plant"], parts["controller"], timeline, go_on)
     timeline.close()
     return began
+
+
+def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) -> Run:
+    """Run a scenario in this process and leave nothing on the disk.
+
+    Args:
+        scenario: checked; its link and mode do not matter.
+        parts: from ``buffers``, to record into; the run's columns are copies.
+
+    Raises:
+        UserError: the scenario has no operating point.
+    """
+    bench = make_bench(scenario)
+    plant, controller = parts or buffers(scenario.ticks)
+    plant.signals[:] = np.nan
+    timeline = TimelineInMemory(bench)
+    began = time.monotonic()
+    with np.errstate(all="ignore"):  # a diverging run is a result
+        run_inproc(bench, plant, controller, timeline, lambda ticks: True)
+    timeline.close()
+    wall_s = time.monotonic() - began
+    recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
+    done = int(recorded[-1]) + 1 if len(recorded) else 0
+    columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
+    for part, names in ((plant, PLANT_COLUMNS), (controller, CONTROLLER_COLUMNS)):
+        columns |= {name: np.array(part.signals[:done, j]) for j, name in enumerate(names)}
+    outcome = timeline.outcome or Outcome("safe", "ended without a word", done)
+    summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
+    return Run(scenario, summary, columns, _known_laws(columns, bench), timeline.lines)
+
+
+def _known_laws(columns: dict[str, Rows], bench: Bench) -> list[str]:
+    """Labels of the laws that the column ``law`` may refer to: those of the scenario, and those
+    that an event made of them."""
+    labels = bench.controller.labels
+    used = int(np.nanmax(columns["law"][:], initial=-1)) + 1
+    return labels[: max(used, len(labels) - SPARE)]

@@ -163,7 +163,7 @@ class Experiment(Steps):
             # half a second of imports, which only failures need
             from gfm_hil.testing.picture import draw, draw_times
 
-            figure = run.folder / f"{what}_{signal}.png"
+            figure = run.file(f"{what}_{signal}.png")
             if what == "miss":
                 draw_times(figure, run, self.setting.scenario)
             else:
@@ -171,5 +171,5 @@ class Experiment(Steps):
             self._notice(figure)
             lines.append(f"figure: {figure}")
         if not self.setting.controller_command:
-            lines.append(f"again: gfmhil run {run.folder / 'scenario.toml'}")
+            lines.append(f"again: gfmhil run {run.file('scenario.toml')}")
         raise AssertionError("\n".join(lines))

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
-from gfm_hil.results.run_folder import Run
+from gfm_hil.results.run import Run
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.testing.checks import Finding
 from gfm_hil.testing.signals import unit
@@ -82,8 +82,8 @@ def draw(
 
 def draw_times(path: Path, run: Run, scenario: Scenario) -> None:
     """Draw when a run in real time was late, as its report would."""
-    with np.load(run.folder / "timing.npz") as timing:
-        draw_timing(run.folder, scenario, dict(timing), run.summary).rename(path)
+    with np.load(run.file("timing.npz")) as timing:
+        draw_timing(path.parent, scenario, dict(timing), run.summary).rename(path)
 
 
 def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:

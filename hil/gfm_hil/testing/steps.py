@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.run_folder import Run
+from gfm_hil.results.run import Run, Signals
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.results.summary import nominal_frequency
 from gfm_hil.testing.plan import Plan
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
-from gfm_hil.testing.signals import Signals, same
+from gfm_hil.testing.signals import same
 from gfm_runtime.signals import REF_NAMES
 
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
@@ -148,7 +147,7 @@ class Steps:
     @property
     def signals(self) -> Signals:
         """What was recorded, by name; see ``Signals``."""
-        return Signals(self.result.signals, nominal_frequency(self.setting.scenario))
+        return self.result.signals
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -158,7 +157,7 @@ class Steps:
     @property
     def folder(self) -> Path:
         """The run folder, whose scenario.toml repeats the run."""
-        return self.result.folder
+        return self.result.file("scenario.toml").parent
 
     @property
     def result(self) -> Run:

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES
-from gfm_hil.engine.inproc import compile_loop, run_inproc
+from gfm_hil.engine.inproc import buffers, compile_loop
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.recorder import (
-    CONTROLLER_COLUMNS,
-    CONTROLLER_TIMES,
-    PLANT_COLUMNS,
-    PLANT_TIMES,
     Part,
 )
-from gfm_hil.results.summary import summarise
+from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
 
@@ -37,31 +28,6 @@ _EVENT_KEYS = ("t", "tick", "label")  # of a summary's event; the scenario has t
 
 class RunFailed(Exception):
     """A run ended by an error of the program; the message names the run."""
-
-
-class _LogInMemory(Timeline):
-    """A timeline that keeps its log instead of writing it."""
-
-    def __init__(self, bench: Any) -> None:
-        super().__init__(bench, Path(os.devnull), SIDES)
-        self.lines: list[dict[str, Any]] = []
-
-    def write(self, tick: int, kind: str, **more: Any) -> None:
-        t = round(tick * self._bench.scenario.T_s, 9)
-        self.lines.append({"tick": tick, "t": t, "event": kind, **more})
-
-
-def buffers(ticks: int) -> tuple[Part, Part]:
-    """Room to record one run: the plant's and the controller's."""
-
-    def part(columns: Sequence[str], times: Sequence[str]) -> Part:
-        return Part(
-            np.empty((ticks, len(columns))),
-            np.empty((0, len(times)), np.int64),  # lockstep has no times
-            np.zeros(2, np.int64),
-        )
-
-    return part(PLANT_COLUMNS, PLANT_TIMES), part(CONTROLLER_COLUMNS, CONTROLLER_TIMES)
 
 
 def compile_once(campaign: Campaign) -> None:
@@ -98,23 +64,10 @@ def simulate(
 ) -> tuple[dict[str, Any], NDArray[np.float64]]:
     """The summary of a run, as ``run_scenario`` would write it, and p at every tick, p.u."""
     try:
-        bench = make_bench(scenario)
+        run = run_in_memory(scenario, (plant, controller))
     except UserError as problem:
         return {"status": "no-steady-state", "reason": str(problem), "events": []}, np.empty(0)
-    plant.signals[:] = np.nan
-    timeline = _LogInMemory(bench)
-    with np.errstate(all="ignore"):  # a diverging run is a result
-        run_inproc(bench, plant, controller, timeline, lambda ticks: True)
-    timeline.close()
-    recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
-    done = int(recorded[-1]) + 1 if len(recorded) else 0
-    signals: dict[str, NDArray[Any]] = {"tick": np.arange(done)}
-    for j, name in enumerate(PLANT_COLUMNS):
-        if name.startswith("true_"):
-            signals[name] = np.array(plant.signals[:done, j])
-    outcome = timeline.outcome or Outcome("safe", "ended without a word", done)
-    summary = summarise(scenario, signals, {}, timeline.lines, outcome, {}, 0.0)
-    return summary, signals["true_p"]
+    return run.summary, np.asarray(run.columns["true_p"])
 
 
 def record(

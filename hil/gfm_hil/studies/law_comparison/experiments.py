@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from gfm_hil.engine.inproc import buffers
 from gfm_hil.recording.recorder import PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
-from gfm_hil.studies.campaign.worker import buffers, simulate
+from gfm_hil.studies.campaign.worker import simulate
 
 START = "mimo-gfm"  # the law that the switchover comes from
 AT = 0.5  # s

@@ -1,0 +1,185 @@
+"""A law as an object: taken from the catalogue or a file, changed, shown, saved, run."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.scenario.toml_out import toml_text
+from gfm_runtime import DiscreteLaw, LawError, build_law, discretise, law_file, law_names, parse_law
+from gfm_runtime import Law as BuiltLaw
+from gfm_runtime.lawfile import ElementSpec, LawFile
+from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
+
+if TYPE_CHECKING:
+    from gfm_design.model.closed_loop import ClosedLoop
+
+
+def laws() -> tuple[str, ...]:
+    """Names of the laws that ship."""
+    return law_names()
+
+
+def element_text(spec: ElementSpec | list[ElementSpec]) -> str:
+    """An element as Table II of the paper writes it, e.g. ``IF×PD``."""
+    specs = spec if isinstance(spec, list) else [spec]
+    return "×".join(s.type for s in specs)
+
+
+def cell_text(file: LawFile, key: str) -> str:
+    """One cell of Table II, with the feedback-only term in braces; 0 if empty."""
+    phi, psi = file.phi.get(key), file.psi.get(key)
+    text = element_text(phi) if phi else ""
+    text += f"{{{element_text(psi)}}}" if psi else ""
+    return text or "0"
+
+
+@dataclass(frozen=True, repr=False)
+class Law:
+    """A grid-forming law, u = u_0 + Phi(s) (Y_ref − y) − Psi(s) y (Fig. 6 of the paper).
+
+    Args:
+        file: the content of its law file; see ``Law.load`` for a name or a path.
+    """
+
+    file: LawFile
+
+    @classmethod
+    def load(cls, name: str | Path) -> Law:
+        """A law of the catalogue, or of a ``.toml`` file.
+
+        Raises:
+            LawError: an unknown name, or a file that is no law; every mistake is named.
+        """
+        return cls(law_file(str(name)))
+
+    @classmethod
+    def from_toml(cls, text: str) -> Law:
+        """A law from the text of a law file.
+
+        Raises:
+            LawError: as ``load``.
+        """
+        made = cls(parse_law(text))
+        made.built()
+        return made
+
+    @property
+    def name(self) -> str:
+        """Its name, e.g. ``vsg-2``."""
+        return self.file.name
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """Its parameters by name; ``units`` has their units."""
+        return {name: spec.value for name, spec in self.file.parameters.items()}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each parameter."""
+        return {name: spec.unit for name, spec in self.file.parameters.items()}
+
+    def with_gains(self, name: str | None = None, **gains: float) -> Law:
+        """The same law with other values of some parameters.
+
+        Args:
+            name: of the new law; ``<name>-changed`` if None.
+            gains: values by parameter, in the unit of the parameter.
+
+        Raises:
+            LawError: no such parameter, or a value that makes no law.
+        """
+        for gain in gains:
+            if gain not in self.file.parameters:
+                known = sorted(self.file.parameters)
+                raise LawError(f"parameter {gain}", f"unknown to {self.name}; known: {known}")
+        content = self.file.model_dump(mode="json", exclude_none=True)
+        for gain, value in gains.items():
+            content["parameters"][gain] |= {"value": float(value), "source": "with_gains"}
+        content["name"] = name or f"{self.name.removesuffix('-changed')}-changed"
+        return Law.from_toml(toml_text(content))
+
+    def built(self) -> BuiltLaw:
+        """Its elements as numbers, which the runtime works with."""
+        return build_law(self.file)
+
+    def discretised(self, T_s: float = 1e-4) -> DiscreteLaw:
+        """Its matrices after Tustin at T_s [s], which the kernel runs."""
+        return discretise(self.built(), T_s)
+
+    def to_control(self) -> Any:
+        """Phi(s) as a transfer matrix of python-control, 3 × 5, p.u. and rad/s.
+
+        Raises:
+            UserError: python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError:
+            raise UserError(
+                "to_control: needs python-control: pip install 'gfmhil[design]'"
+            ) from None
+        built = self.built()
+        cells = [[built.element("phi", (i, j)) for j in range(NY)] for i in range(NU)]
+        num = [[e.num[::-1] for e in row] for row in cells]
+        den = [[_product(e.den) for e in row] for row in cells]
+        return control.tf(num, den, inputs=[f"error_{y}" for y in Y_NAMES], outputs=list(U_NAMES))
+
+    def closed_loop(self, plant: Any = None, **more: Any) -> ClosedLoop:
+        """This law around a plant, linearised: modes, margins, gamma, step, frequency response.
+
+        Args:
+            plant: a ``gfm_plant.Plant``; the paper's converter with ideal sensors if None.
+            more: as for ``ClosedLoop.of``, e.g. ``T_s`` [s], None for the continuous loop.
+        """
+        from gfm_design.model.closed_loop import ClosedLoop
+        from gfm_plant import Plant
+
+        return ClosedLoop.of(self.built(), plant or Plant(), **more)
+
+    def save(self, path: str | Path) -> Path:
+        """Write a law file; returns its path.
+
+        Raises:
+            UserError: it is there already, or cannot be written.
+        """
+        path = Path(path)
+        if path.exists():
+            raise UserError(f"{path}: is there already; choose another name")
+        try:
+            write_text(path, toml_text(self.file.model_dump(mode="json", exclude_none=True)))
+        except OSError as problem:
+            raise UserError(f"{path}: {problem.strerror}") from None
+        return path
+
+    def __repr__(self) -> str:
+        return f"<Law {self.name}: {self.file.title}>"
+
+    def _repr_html_(self) -> str:
+        """The matrix of elements, for a notebook."""
+        head = "".join(f"<th>{y}</th>" for y in Y_NAMES)
+        rows = "".join(
+            f"<tr><th>{u}</th>"
+            + "".join(
+                f"<td>{html.escape(cell_text(self.file, f'{i + 1}{j + 1}'))}</td>"
+                for j in range(NY)
+            )
+            + "</tr>"
+            for i, u in enumerate(U_NAMES)
+        )
+        title = f"{html.escape(self.name)}: {html.escape(self.file.title)}"
+        return f"<table><caption>{title}</caption><tr><th>Φ(s)</th>{head}</tr>{rows}</table>"
+
+
+def _product(factors: Any) -> list[float]:
+    """The product of polynomials in ascending powers, in descending powers."""
+    found = np.ones(1)
+    for factor in factors:
+        found = np.convolve(found, factor)
+    return [float(c) for c in found[::-1]]

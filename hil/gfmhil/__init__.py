@@ -1,0 +1,41 @@
+"""The public API: run scenarios, compare laws, change gains, load runs, from Python.
+
+    import gfmhil
+
+    run = gfmhil.run("pref_step", law="vsg-2")
+    run.signals["p"], run.metrics, run.plot()
+
+Runs stay in memory and print nothing. Errors are ``UserError`` and ``LawError``, in one line.
+"""
+
+from importlib import import_module
+from typing import Any
+
+from gfm_hil.core import blas as _blas  # noqa: F401  before NumPy is first imported
+
+_HOMES = {
+    "UserError": "gfm_hil.core.errors",
+    "load_run": "gfm_hil.results.run",
+    "Run": "gfm_hil.results.run",
+    "load_scenario": "gfm_hil.scenario.model",
+    "Scenario": "gfm_hil.scenario.model",
+    "Law": "gfm_hil.studies.law",
+    "laws": "gfm_hil.studies.law",
+    "run": "gfm_hil.studies.notebook",
+    "compare": "gfm_hil.studies.notebook",
+    "Comparison": "gfm_hil.studies.notebook",
+    "LawError": "gfm_runtime.errors",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    """Load what is asked for, when it is."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'gfmhil' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
