@@ -183,8 +183,8 @@ def _complete(
     outside: Outcome | None,
 ) -> Run:
     """Make the files of a run, then remove what they were made of; may be repeated at any point."""
-    if (folder / "parts").is_dir():
-        merge(folder, scenario.T_s, laws)
+    if (folder / "parts").is_dir() or not (folder / "signals.npz").is_file():
+        merge(folder, scenario.T_s, laws)  # of no parts where no side came so far
     signals, timing, labels = read_recording(folder)
     logs = sorted(folder.glob("events_*.jsonl"))
     log = read_log(*(logs or [folder / "events.jsonl"]))
