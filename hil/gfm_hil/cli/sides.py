@@ -34,10 +34,10 @@ def call(options: argparse.Namespace) -> int:
     """Carry one side out; returns the exit code."""
     side: Side = options.side
     scenario = resolve(options, law=options.law)
-    if options.part is None and scenario.link.endpoint is None:
-        raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
     if scenario.link.type == INPROC:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
+    if scenario.link.endpoint is None:
+        raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
     folder = new_folder(options.out, side)
     if options.part is not None:  # of `gfmhil run`, which puts the parts together
         end_with_parent(options.part)

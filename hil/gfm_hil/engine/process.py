@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.errors import PeerLost, UserError
+from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import Side
 from gfm_hil.core.stopping import Interrupt
@@ -49,7 +49,7 @@ from gfm_runtime.signals import names
 def run_side(
     side: Side, scenario: Scenario, folder: Path, notice: Callable[[str], None] = print
 ) -> Outcome:
-    """Run one side of a scenario at ``scenario.link.endpoint``, recording into ``folder``.
+    """Run one side of a scenario at ``scenario.link.endpoint``, which is set; record to ``folder``.
 
     Returns:
         How it ended; the parts of the recording, ``events_<side>.jsonl`` and ``link_<side>.json``
@@ -58,8 +58,7 @@ def run_side(
     Raises:
         UserError: the endpoint is not to be had, or the scenario has no operating point.
     """
-    if scenario.link.endpoint is None:
-        raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
+    assert scenario.link.endpoint is not None
     with Interrupt() as interrupt:
         return _run(side, scenario, scenario.link.endpoint, folder, notice, interrupt)
 
