@@ -212,7 +212,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
     )  # fmt: skip
     finished, going, held = place / "finished", place / "going", place / "held"
     run_scenario(scenario, finished, figures=False)
-    held.mkdir()
+    held.mkdir(0o700)
     going.mkdir()
     (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")
     for side in ("plant", "controller"):

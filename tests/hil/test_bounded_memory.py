@@ -248,7 +248,7 @@ def test_the_largest_block_gets_through():
 OPERATOR = """
 import sys
 from pathlib import Path
-from gfm_hil.errors import UserError
+from gfm_hil.core.errors import UserError
 from gfm_hil.operator import client
 client._ANSWER_MS = 1000
 operator = client.Operator(Path({folder!r}))

@@ -160,7 +160,8 @@ fcntl.flock(handle, fcntl.LOCK_EX)
 START = """
 import sys
 from pathlib import Path
-from gfm_hil import recording, scratch
+from gfm_hil.core import temporary as scratch
+from gfm_hil.recording import recorder as recording
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 recording._MEMORY = segment.FOLDER = shared = Path(sys.argv[1])

@@ -1,4 +1,4 @@
-"""CSV: one header line with the names, then a line a tick, every number exactly."""
+"""CSV, MAT and Parquet: what a library writes, in a page of ours each."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import numpy as np
 from gfm_hil.recording.npz import Column
 from gfm_hil.results.export.table import RunTable, event_text
 
-_LINES = 10_000  # turned into Python's numbers at a time
+_LINES = 10_000  # of CSV, turned into Python's numbers at a time
+_ROWS = 1 << 17  # of a row group of Parquet, which is held in memory
 
 
 def write_csv(table: RunTable, file: Path) -> None:
-    """Write a run; a float is the shortest text that is read back as the same float."""
+    """Write one header line with the names, then a line a tick. A float is the shortest text that
+    is read back as the same float."""
     with file.open("w", newline="", encoding="utf-8") as out:
         writer = csv.writer(out)
         writer.writerow(table.values)
@@ -66,9 +68,6 @@ class _OneByOne(dict[str, Any]):
         for name, column in self._columns.items():
             yield name, column[:].reshape(-1, 1)
         yield from super().items()
-
-
-_ROWS = 1 << 17  # of a row group, which is held in memory
 
 
 def write_parquet(table: RunTable, file: Path) -> None:
