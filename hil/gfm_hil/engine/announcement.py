@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
@@ -12,6 +13,23 @@ from gfm_hil.core.roles import SIDES, Side
 
 SCHEME = "ipc://"
 LARGEST = 65536  # bytes of a command, and of its answer
+
+
+class _Law(BaseModel):
+    """A law that the recording's indices mean."""
+
+    label: str
+    name: str
+    gains: dict[str, float]
+
+
+class Announcement(BaseModel):
+    """What a role that is running says of itself: where its command server is, and its laws."""
+
+    endpoint: str
+    T_s: float = 0.0
+    names: list[str] = []
+    laws: list[_Law] = []
 
 
 def announcement(folder: Path, side: Side) -> Path:
@@ -27,15 +45,15 @@ def announced(folder: Path, side: Side) -> dict[str, Any] | None:
     """
     file = announcement(folder, side)
     try:
-        found = dict(json.loads(file.read_text(encoding="utf-8")))
-        place = Path(str(found["endpoint"]).removeprefix(SCHEME)).parent
-        return found if scratch.held(place) else None
+        found = Announcement.model_validate_json(file.read_bytes())
+        place = Path(found.endpoint.removeprefix(SCHEME)).parent
+        return found.model_dump() if scratch.held(place) else None
     except FileNotFoundError:
         return None
     except OSError as problem:
         raise UserError(f"{file}: {problem.strerror}") from None
-    except (ValueError, TypeError, KeyError) as problem:
-        raise UserError(f"{file}: not an announcement of a run: {problem!r}") from None
+    except ValueError:
+        raise UserError(f"{file}: not an announcement of a run") from None
 
 
 def present(folder: Path) -> list[Side]:

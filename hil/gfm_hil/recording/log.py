@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from gfm_hil.core.errors import UserError
 from gfm_plant.names import CONTROLLER_SAFE
 from gfm_runtime.states import PLANT_TRIP, REASONS
 
@@ -45,6 +46,22 @@ def read_log(*paths: Path) -> list[dict[str, Any]]:
                     if isinstance(line, dict) and isinstance(line.get("tick"), int):
                         lines.append(line)
     return sorted(lines, key=lambda line: line["tick"])
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of a run's summary.json.
+
+    Raises:
+        FileNotFoundError: the run is not over, or was cut off.
+        UserError: it is no summary.
+    """
+    path = folder / "summary.json"
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        _ = content["status"], content["reason"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise UserError(f"{path}: is not the summary of a run") from None
+    return dict(content)
 
 
 def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:

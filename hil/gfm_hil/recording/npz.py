@@ -32,6 +32,7 @@ _BLOCKS = 4000  # at most: an extra field holds 64 KiB
 # times the time
 _LEVEL = 1
 _SPOOL = 1 << 20  # bytes of a column, compressed, that are kept in memory
+_DENSEST = 1032  # bytes that deflate can make of one
 _FIELD = 0x6667  # id of the extra field: rows a block, then where each block begins
 _DAMAGED = (zlib.error, zipfile.BadZipFile, struct.error, ValueError, KeyError, EOFError)
 _LAST = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS).flush()  # ends a deflate stream
@@ -213,6 +214,8 @@ def _open(path: Path) -> dict[str, Column]:
                     (2, 0): np.lib.format.read_array_header_2_0,
                 }[version]
                 (rows,), _, dtype = read(member)
+            if rows * dtype.itemsize > _DENSEST * (info.compress_size + 1):
+                raise ValueError(f"{info.filename} cannot hold {rows} rows")
             step, starts = max(1, rows), ()
             if field := _field(info.extra):
                 file.seek(info.header_offset + 26)  # lengths of name and extra field

@@ -344,4 +344,7 @@ def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], 
     if "laws" not in signals:
         raise UserError(f"{folder / 'signals.npz'}: has no column laws")
     laws = [str(label) for label in signals.pop("laws")[:]]
+    lengths = {name: len(column) for name, column in [*signals.items(), *timing.items()]}
+    if len(set(lengths.values())) > 1:
+        raise UserError(f"{folder}: the columns of the recording differ in length: {lengths}")
     return signals, timing, laws

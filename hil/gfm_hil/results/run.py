@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.recording.log import read_log
+from gfm_hil.recording.log import read_log, read_summary
 from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.recorder import read_recording
 from gfm_hil.results.export.columns import describe
@@ -232,7 +232,7 @@ def load_run(folder: str | Path) -> Run:
     folder = Path(folder)
     try:
         columns, _, laws = read_recording(folder)
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_summary(folder)
         # The law files of the scenario may be gone; all else of it is in the file.
         scenario = Scenario.model_validate(read_toml(folder / "scenario.toml"))
     except FileNotFoundError as problem:

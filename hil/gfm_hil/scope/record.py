@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.engine.announcement import announced, present
-from gfm_hil.recording.log import read_log
+from gfm_hil.recording.log import read_log, read_summary
 from gfm_hil.recording.recorder import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
@@ -113,12 +112,10 @@ class Record:
             UserError: it cannot be told whether the run goes on.
         """
         try:
-            content = json.loads((self.folder / "summary.json").read_text("utf-8"))
+            content = read_summary(self.folder)
         except FileNotFoundError:
             return self._gone()
-        except ValueError:  # it is just being written
-            return None
-        return {key: content[key] for key in ("status", "reason")}
+        return {key: str(content[key]) for key in ("status", "reason")}
 
     def _gone(self) -> dict[str, str] | None:
         """A run of which only the recording is left: both desks were there and are no more."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.recording.recorder import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
@@ -64,7 +65,12 @@ def describe(name: str, laws: list[str]) -> Described:
     Args:
         name: of the column.
         laws: labels of the run's laws, in the order of the recording's indices.
+
+    Raises:
+        UserError: there is no such column.
     """
+    if name not in all_columns():
+        raise UserError(f"column {name!r}: is none of a recording; there are {all_columns()}")
     words = {
         "law": tuple(enumerate(laws)),
         "state": tuple(enumerate(STATES)),

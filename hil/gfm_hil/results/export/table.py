@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.log import read_log
+from gfm_hil.recording.log import read_log, read_summary
 from gfm_hil.recording.npz import Column
 from gfm_hil.recording.recorder import read_recording
 from gfm_hil.results.export.columns import Described, describe
@@ -61,7 +60,7 @@ def load_run(folder: Path) -> RunTable:
     """
     try:
         signals, timing, laws = read_recording(folder)
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_summary(folder)
     except FileNotFoundError as problem:
         going = (folder / "scenario.toml").is_file()
         what = "the run is not over, see gfmhil stream, or was cut off, see gfmhil recover"
