@@ -16,7 +16,7 @@ from gfm_hil.recording import recorder as recording
 HOLD = """
 import sys, time
 from pathlib import Path
-from gfm_hil.recording import Part, keep_in_memory
+from gfm_hil.recording.recorder import Part, keep_in_memory
 folder = Path(sys.argv[1])
 keep_in_memory(folder, 100)
 part = Part.create(folder, sys.argv[2], 100)
