@@ -23,6 +23,9 @@ StateSpace = tuple[Matrix, Matrix, Matrix, Matrix]
 D_Q = 0.05  # p.u., Table III
 
 
+_LARGEST = 1e30  # of a coefficient against den[0]; beyond it products overflow
+
+
 @dataclass(frozen=True)
 class Weight:
     """W_ij(s) = num(s)/den(s) on T_ij, the transfer function from w_j to z_i (i, j from 1).
@@ -48,6 +51,8 @@ class Weight:
             raise ValueError(f"{name}: needs a numerator and a denominator")
         if not np.isfinite([*self.num, *self.den]).all() or self.den[0] == 0.0:
             raise ValueError(f"{name}: coefficients must be finite, den[0] not 0")
+        if np.abs([*self.num, *self.den]).max() > _LARGEST * abs(self.den[0]):
+            raise ValueError(f"{name}: no coefficient may exceed {_LARGEST:g} times den[0]")
         if not any(self.num):
             raise ValueError(f"{name}: its numerator is zero; leave the weight out instead")
         if len(self.den) > 1 and np.roots(self.den).real.max() >= 0.0:
