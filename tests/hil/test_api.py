@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -106,3 +108,12 @@ def test_importing_it_loads_nothing_heavy():
     program = "import sys, gfmhil; print(sorted({'numba', 'matplotlib', 'zmq'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout == "[]\n", done.stderr
+
+
+def test_the_program_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+    text = (Path(__file__).resolve().parents[2] / "README.md").read_text("utf-8")
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    monkeypatch.chdir(tmp_path)
+    exec(program, {})
+    assert "completed" in capsys.readouterr().out
+    assert (tmp_path / "runs" / "mine" / "signals.npz").is_file()
