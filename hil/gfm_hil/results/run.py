@@ -38,7 +38,8 @@ class Signals(Mapping[str, NDArray[Any]]):
 
     ``p``, ``q``, ``V``, ``v_dc``, ``omega_u``, ``i``, ``delta``, ``omega_g`` and ``V_g`` are the
     plant's own, without sensors; ``f_hz`` is omega_u in Hz; ``t`` is in s. All columns of the
-    recording are there under their own names too: ``y_p`` as measured, ``u_E_u``, ``ref_P_ref``.
+    recording are there under their own names too: ``y_p`` as measured, ``u_E_u``, ``ref_P_ref``;
+    iterating gives those.
 
     Args:
         columns: of signals.npz.
@@ -57,13 +58,14 @@ class Signals(Mapping[str, NDArray[Any]]):
         for known in (name, f"true_{name}"):
             if known in self._columns:
                 return np.asarray(self._columns[known][:])
-        raise UserError(f"signal = {name!r}: was not recorded; there are {sorted(self)}")
+        there = sorted([*self._columns, *self._names])
+        raise UserError(f"signal = {name!r}: was not recorded; there are {there}")
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self._columns, *self._names])
+        return iter(self._columns)
 
     def __len__(self) -> int:
-        return len(self._columns) + len(self._names)
+        return len(self._columns)
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns or name in self._names
