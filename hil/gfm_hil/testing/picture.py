@@ -51,7 +51,7 @@ def draw(
     main = rows["main"]
     first, last = around or (signals["t"][0], signals["t"][-1])
     shown = (signals["t"] >= first) & (signals["t"] <= last)
-    _curve(main, signal, {name: column[shown] for name, column in signals.items()})
+    _curve(main, signal, {name: signals[name][shown] for name in {*signals, signal}})
     if finding is not None:
         _band(main, finding, signals[signal])
         worst = int(np.searchsorted(signals["t"], finding.at - 1e-9))
