@@ -45,7 +45,7 @@ def announced(folder: Path, side: Side) -> dict[str, Any] | None:
     """
     file = announcement(folder, side)
     try:
-        found = Announcement.model_validate_json(file.read_bytes())
+        found = Announcement.model_validate_json(file.read_text("utf-8"))
         place = Path(found.endpoint.removeprefix(SCHEME)).parent
         return found.model_dump() if scratch.held(place) else None
     except FileNotFoundError:
