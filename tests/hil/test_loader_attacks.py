@@ -295,10 +295,11 @@ def spoilt(content: dict[str, Any]) -> st.SearchStrategy[str]:
             with contextlib.suppress(KeyError, IndexError, TypeError):  # changed before
                 for key in path[:-1]:
                     at = at[key]
+                last = str(path[-1]) if isinstance(at, dict) else path[-1]
                 if value is None:
-                    del at[path[-1]]
+                    del at[last]
                 else:
-                    at[path[-1]] = value
+                    at[last] = copy.deepcopy(value)  # a list put into itself has no end
         return toml_text(changed).replace('"@date"', "1979-05-27")
 
     return changes.map(apply)
