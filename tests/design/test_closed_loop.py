@@ -18,7 +18,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant
 from gfm_runtime import discretise, get_law, law_file

@@ -14,7 +14,8 @@ from gfm_design.model.linear import Mode, hold, linearise_plant
 from gfm_design.model.operating_point import operating_point
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.recording.recorder import PLANT_COLUMNS, Part
+from gfm_hil.recording.columns import PLANT_COLUMNS
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant, make_plant
 from gfm_plant.model import DELTA, N_X, f, g

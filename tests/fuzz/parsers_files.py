@@ -18,7 +18,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
 from gfm_hil.scenario.toml_out import scenario_toml

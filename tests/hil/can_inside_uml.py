@@ -21,7 +21,7 @@ import pytest
 
 from gfm_hil.core.roles import SIDES
 from gfm_hil.links.can.dbc import write_dbc
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.scenario.toml_out import toml_text
 

@@ -10,7 +10,8 @@ from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
-from gfm_hil.recording.recorder import PLANT_COLUMNS, record_command, record_sample
+from gfm_hil.recording.columns import PLANT_COLUMNS
+from gfm_hil.recording.recorder import record_command, record_sample
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.signals import Group, names

@@ -21,8 +21,9 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.npz import Arrays
-from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 
 from .test_links import in_threads
@@ -100,7 +101,7 @@ def run_pair(
             raise problem
     pair.log = read_log(*sorted(folder.glob("events_*.jsonl")))
     merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    pair.signals = dict(Arrays(read_recording(folder)[0]))
+    pair.signals = {name: x[:] for name, x in read_recording(folder)[0].items()}
     with np.load(folder / "timing.npz") as file:
         pair.timing = dict(file)
     return pair

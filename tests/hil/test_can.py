@@ -32,8 +32,9 @@ from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.recording.npz import Arrays
-from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
 
@@ -103,7 +104,7 @@ def both_sides(
         if isinstance(outcome, Exception):
             raise outcome
     merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    return dict(Arrays(read_recording(folder)[0])), found
+    return {name: x[:] for name, x in read_recording(folder)[0].items()}, found
 
 
 BOTH_WAYS = pytest.mark.parametrize("portable", [True, False])

@@ -5,6 +5,7 @@ One side runs its real loop; the other side is played by a peer that lies.
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
@@ -26,7 +27,8 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
+from gfm_hil.results.run_folder import finish
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.signals import NU, Group, names
@@ -150,11 +152,18 @@ def honest_then_frozen(liar: Liar) -> None:
 @pytest.mark.attack("1.6", "a plant whose tick stands still", "RUNNING for ever")
 @by_link
 def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now):
-    found = lied_to("controller", make(**REALTIME), place, link, honest_then_frozen)
+    scenario = make(**REALTIME)
+    found = lied_to("controller", scenario, place, link, honest_then_frozen)
     status, reason, tick = found.end
     assert (status, reason) == ("safe", REASONS[STALE])
     assert set(found.refused) <= {"tick"}
     assert found.reader.e2e == "invalid"
+    faults = found.reader.faults
+    end = {"side": "controller", "faults": faults, "e2e": found.reader.e2e, "one_clock": True}
+    (place / "link_controller.json").write_text(json.dumps(end), encoding="utf-8")
+    summary = finish(scenario, place, [scenario.law], 0.0, figures=False).summary
+    assert summary["e2e"] == {"controller": "invalid"}
+    assert summary["faults"] == {"controller": {f: n for f, n in faults.items() if n}}
     when, _, state, code = found.liar.last_words()
     assert (state, code) == (SAFE, STALE)
     ticks = (when - int(found.part.times[tick, 1])) / T_NS

@@ -13,7 +13,8 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.can.dbc import SEGMENT, STATUS, VECTORS
 from gfm_hil.links.can.loopback import LoopbackBus
-from gfm_hil.results.export import export_run, load_run
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.export import export_run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 
@@ -102,16 +103,16 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
 def test_cantools_decodes_what_the_run_recorded(tmp_path):
     run_over_can(tmp_path / "run", 19530)
     found, dbc = exported(tmp_path / "run", tmp_path)
-    table = load_run(tmp_path / "run")
+    table = RecordedRun.load(tmp_path / "run")
     for group in ("y", "u"):
         message = dbc.get_message_by_name(VECTORS[group])
         frames = [m for m in found if m.arbitration_id == message.frame_id]
-        assert len(frames) == len(table.values["tick"])
-        np.testing.assert_allclose([m.timestamp for m in frames], table.values["t"][:], atol=1e-9)
+        assert len(frames) == len(table.recorded["tick"])
+        np.testing.assert_allclose([m.timestamp for m in frames], table.recorded["t"][:], atol=1e-9)
         values = [message.decode(m.data) for m in frames]
         for signal in message.signals[2:]:
             seen = np.array([v[signal.name] for v in values])
-            away = np.abs(seen - table.values[f"{group}_{signal.name}"][:])
+            away = np.abs(seen - table.recorded[f"{group}_{signal.name}"][:])
             # commands came over the bus in counts; measurements are recorded as the A/D read them
             assert away.max() <= (1e-12 if group == "u" else signal.scale / 2 + 1e-12)
 

@@ -10,7 +10,8 @@ import pytest
 from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
 from gfm_runtime import law_names
 

@@ -24,8 +24,9 @@ from gfm_hil.links import Link, open_link
 from gfm_hil.links.frame import FrameReader, FrameWriter, frame_dtype
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.recording.log import read_log, worst
-from gfm_hil.recording.npz import Arrays
-from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.states import RUNNING, SAFE
 
@@ -85,7 +86,7 @@ def both_sides(
         if problem is not None:
             raise problem
     merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    return dict(Arrays(read_recording(folder)[0]))
+    return {name: x[:] for name, x in read_recording(folder)[0].items()}
 
 
 def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:

@@ -26,7 +26,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, Port, open_link, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime import law_names
 from gfm_runtime.signals import names

@@ -16,7 +16,7 @@ from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE, VENDOR, Image
 from gfm_hil.modbus.measures import Measures
 from gfm_hil.modbus.view import View
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_runtime.states import RUNNING, SAFE
 

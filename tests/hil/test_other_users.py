@@ -22,7 +22,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
-from gfm_hil.recording import recorder as recording
+from gfm_hil.recording import parts as recording
 
 from .test_shm import header
 
@@ -161,7 +161,7 @@ START = """
 import sys
 from pathlib import Path
 from gfm_hil.core import temporary as scratch
-from gfm_hil.recording import recorder as recording
+from gfm_hil.recording import parts as recording
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 recording._MEMORY = segment.FOLDER = shared = Path(sys.argv[1])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import SIDES
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.toml_out import toml_text
 
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
@@ -118,6 +118,7 @@ def test_two_processes_in_lockstep_are_bit_for_bit_one(start, tmp_path):
     assert (code, err) == (0, "")
     assert json.loads(out) == summary(tmp_path / "apart")
     assert json.loads(out)["link"] == "zmq"
+    assert json.loads(out)["e2e"] == {"controller": "valid", "plant": "valid"}
     code, out, _ = end(start("run", scenario, "--link", "inproc", "--out", "together", "--json",
                              "--no-figures"))  # fmt: skip
     assert (code, json.loads(out)["link"]) == (0, "inproc")

@@ -26,8 +26,10 @@ from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording import npz
-from gfm_hil.recording.recorder import Part, merge
-from gfm_hil.results.export import export_run, load_run
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.export import export_run
 from gfm_hil.results.run_folder import finish, recover
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
@@ -292,7 +294,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
     run = recover(folder)
     assert run.summary["status"] == "safe"
     assert run.summary["reason"] == ("events_both.jsonl cannot be written: No space left on device")
-    told = [e for e in load_run(folder).events if e["event"] == "reference"]
+    told = [e for e in RecordedRun.load(folder).events if e["event"] == "reference"]
     assert 0 < len(told) < 249
     assert 0 <= run.summary["ticks"] - told[-1]["tick"] <= 10  # the run ended where its log did
     assert np.isfinite(run.signals["true_p"]).all()
@@ -374,11 +376,13 @@ def test_metrics_of_a_file_are_those_of_arrays(run, make):
 
 @pytest.mark.parametrize("piece", [7, 100, 1 << 18])
 def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeypatch):
+    from gfm_hil.recording import columns
     from gfm_hil.results import metrics
 
     whole = dict(run(duration=0.3, events=EVENTS).signals)
     expected = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
-    monkeypatch.setattr(metrics, "_PIECE", piece)
+    for module in (columns, metrics):
+        monkeypatch.setattr(module, "PIECE", piece)
     found = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
     for name, value in expected.items():
         assert found[name] == (value if value is None else pytest.approx(value, rel=1e-12)), name

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from gfm_hil.core import temporary as scratch
-from gfm_hil.recording import recorder as recording
+from gfm_hil.recording import parts as recording
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from gfm_hil.recording.recorder import Part, keep_in_memory
+from gfm_hil.recording.parts import Part, keep_in_memory
 folder = Path(sys.argv[1])
 keep_in_memory(folder, 100)
 part = Part.create(folder, sys.argv[2], 100)
@@ -45,7 +45,7 @@ def record(memory) -> Iterator[Record]:
     def call(folder: Path, side: str) -> subprocess.Popen[str]:
         folder.mkdir(exist_ok=True)
         where = (
-            "import gfm_hil.recording.recorder as r, pathlib; "
+            "import gfm_hil.recording.parts as r, pathlib; "
             f"r._MEMORY = pathlib.Path({str(memory)!r})"
         )
         process = subprocess.Popen(

@@ -16,9 +16,10 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.operator import Operator
-from gfm_hil.recording.recorder import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
+from gfm_hil.recording.parts import Part
 from gfm_hil.telemetry import BlockReader
 from gfm_hil.telemetry.blocks import block_dtype, messages
 from gfm_hil.telemetry.follow import Follower, Rows
@@ -197,7 +198,7 @@ def parsed(found: list[list[bytes]]) -> list[dict]:
 
 def test_samples_count_misses_on_and_keep_the_least_slack():
     sampler = Sampler(1e-4, 1000.0, misses=5)
-    received = rows(3, 25).time("received").copy()
+    received = rows(3, 25).columns["plant_received"].copy()
     received[[4, 20]] = -1  # ticks 7 and 23
     received[9] += 30_000  # tick 12
     found = parsed(sampler.messages(rows(3, 25, received=received), 25e-4))
@@ -321,15 +322,15 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
             shutil.rmtree(tmp_path / "parts", ignore_errors=True)
         return False
 
-    find, calls = follower._find, iter(range(100))
+    find, calls = Part.open, iter(range(100))
     problems = {2: OSError(24, "Too many open files"), 3: ValueError("a mistake of ours")}
 
-    def sometimes(from_now: bool) -> None:
-        if problem := problems.get(next(calls)):
+    def sometimes(folder: Path, side: Side) -> Part | None:
+        if problem := problems.get(next(calls, 0)):
             raise problem
-        find(from_now)
+        return find(folder, side)
 
-    monkeypatch.setattr(follower, "_find", sometimes)
+    monkeypatch.setattr(Part, "open", sometimes)
     with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:
         sent = publisher.follow(follower, 500.0, stopped)
     assert sent == ticks

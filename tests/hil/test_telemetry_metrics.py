@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from gfm_hil.cli import main
 from gfm_hil.operator import Operator
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics

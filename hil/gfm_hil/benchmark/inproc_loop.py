@@ -21,7 +21,8 @@ from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, seconds, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.recording.recorder import Part, record_command, record_controller, record_sample
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled

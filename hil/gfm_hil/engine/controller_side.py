@@ -16,7 +16,8 @@ from gfm_hil.engine.waiting import await_message, part_from
 from gfm_hil.links import Link
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.recording.log import PLANT_LEFT
-from gfm_hil.recording.recorder import Part, record_controller
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_controller
 from gfm_runtime.controller import heed, missed
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 

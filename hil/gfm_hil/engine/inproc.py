@@ -12,16 +12,14 @@ import numpy as np
 
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import (
+from gfm_hil.recording.columns import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
     PLANT_COLUMNS,
     PLANT_TIMES,
-    Part,
-    record_command,
-    record_controller,
-    record_sample,
 )
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_plant import plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.names import CONTROLLER, SAFE_STATE
 from gfm_plant.protection import trip

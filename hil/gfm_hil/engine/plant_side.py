@@ -18,7 +18,8 @@ from gfm_hil.engine.waiting import await_message, part_from
 from gfm_hil.links import Link
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.recording.log import CONTROLLER_LEFT
-from gfm_hil.recording.recorder import Part, record_command, record_sample
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_command, record_sample
 from gfm_hil.scenario.expectation import CONTROLLER_GONE
 from gfm_plant import NO_FRESH_U, plant_ahead, plant_go_on, plant_sample, plant_take
 from gfm_plant.names import CONTROLLER, SAFE_STATE, SILENT

@@ -14,28 +14,24 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.log import Outcome, read_log, worst
-from gfm_hil.recording.recorder import (
-    CONTROLLER_COLUMNS,
-    CONTROLLER_TIMES,
-    PLANT_COLUMNS,
-    PLANT_TIMES,
-    merge,
-    read_recording,
-    remove_parts,
-)
-from gfm_hil.results.run import Run, load_run
+from gfm_hil.recording.columns import BYTES_PER_TICK
+from gfm_hil.recording.log import Outcome, read_events, worst
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import remove_parts
+from gfm_hil.recording.run import read_recording
+from gfm_hil.results.run import Run
 from gfm_hil.results.summary import summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
-_COLUMNS = ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *PLANT_TIMES, *CONTROLLER_TIMES)
+_BYTES_PER_TICK = BYTES_PER_TICK + 16  # in the files, which have tick and t as well
 
 
 def check_free(folder: Path, ticks: int) -> None:
@@ -53,7 +49,7 @@ def check_free(folder: Path, ticks: int) -> None:
     if there == folder and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     # the parts stay until the run's files are there, which compression may not make smaller
-    needed = 2 * 8 * len(_COLUMNS) * ticks
+    needed = 2 * _BYTES_PER_TICK * ticks
     free = shutil.disk_usage(there).free
     if needed > free:
         raise UserError(
@@ -100,7 +96,7 @@ def recover(folder: Path) -> Run:
     with _alone(folder), _kept(folder):
         if (folder / "summary.json").is_file():
             _clear(folder)
-            return load_run(folder)
+            return Run.load(folder)
         parts = folder / "parts"
         if not parts.is_dir() and not (folder / "signals.npz").is_file():
             lay = f" (it lay in {parts.readlink()})" if parts.is_symlink() else ""
@@ -186,20 +182,10 @@ def _complete(
     if (folder / "parts").is_dir() or not (folder / "signals.npz").is_file():
         merge(folder, scenario.T_s, laws)  # of no parts where no side came so far
     signals, timing, labels = read_recording(folder)
-    logs = sorted(folder.glob("events_*.jsonl"))
-    log = read_log(*(logs or [folder / "events.jsonl"]))
+    log = read_events(folder)
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
-    faults, injected, one_clock = {}, {}, True
-    for path in sorted(folder.glob("link_*.json")):
-        content = json.loads(path.read_text())
-        faults[content["side"]] = {k: v for k, v in content["faults"].items() if v}
-        one_clock &= content["one_clock"]
-        if "injected" in content:
-            injected[content["side"]] = content["injected"]
     outcome = worst(log, outside)
-    summary = summarise(scenario, signals, timing, log, outcome, faults, wall_s, one_clock)
-    if injected:
-        summary["injected"] = injected
+    summary = summarise(scenario, signals, timing, log, outcome, _link_ends(folder), wall_s)
     if figures and len(signals["tick"]):
         # a second of imports, which the sides' processes do without
         from gfm_hil.results.figures import draw_run
@@ -211,7 +197,14 @@ def _complete(
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     sync_folder(folder)
     _clear(folder)
-    return Run(scenario, summary, signals, labels, log, folder)
+    return Run(scenario, summary, signals, labels, log, folder, timing)
+
+
+def _link_ends(folder: Path) -> dict[str, dict[str, Any]]:
+    """What each side wrote about its end of the link: the faults that it counted, the state of the
+    end-to-end protection, whether both sides share a clock, the faults injected on purpose."""
+    ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
+    return {end["side"]: end for end in ends}
 
 
 def _clear(folder: Path) -> None:
