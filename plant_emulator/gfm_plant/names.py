@@ -32,5 +32,6 @@ SAFE_STATE, SILENT = 0.0, 1.0
 CONTROLLER_SAFE = "the controller is in its safe state"
 NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 
-TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip")
-"""What `plant_truth` writes, in this order; i = |i_dq|, delta in rad, trip a reason code."""
+TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip", "i_dc")
+"""What `plant_truth` writes, in this order, in p.u.: i is |i_dq|, i_dc the current of the DC
+source, delta is in rad, and trip is a key of `TRIP_REASONS`."""
