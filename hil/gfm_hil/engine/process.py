@@ -17,12 +17,10 @@ from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import Side
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import Desk
-from gfm_hil.engine.controller_side import run_controller
 from gfm_hil.engine.drive import compile_loops
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.engine.loop_records import RING, TOLD
-from gfm_hil.engine.loop_thread import run_compiled
-from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.loop_records import FLAGS, WAKE
+from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -41,7 +39,7 @@ from gfm_hil.recording.recorder import (
 )
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
-from gfm_plant import plant_go_on, plant_sample, plant_take
+from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import names
 
@@ -80,15 +78,15 @@ def _run(
     part = Part.create(folder, side, scenario.ticks)
     compile_side(side, bench, part)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
-    told = np.zeros(TOLD, np.int64)
+    flags = np.zeros(FLAGS, np.int64)
 
-    def ring() -> None:
-        told[RING] += 1
+    def wake() -> None:
+        flags[WAKE] += 1
 
     # the desk comes first: its threads must not inherit the rights that the loop asks for
-    with Desk(side, bench, timeline, folder, ring, interrupt.ask):
+    with Desk(side, bench, timeline, folder, wake, interrupt.ask):
         try:
-            seen = _meet_and_run(side, bench, endpoint, part, timeline, told, interrupt, notice)
+            seen = _meet_and_run(side, bench, endpoint, part, timeline, flags, interrupt, notice)
             with contextlib.suppress(OSError):  # on a full disk these counts are lost, no more
                 write_text(folder / f"link_{side}.json", json.dumps({"side": side, **seen}))
         except PeerLost as problem:
@@ -105,7 +103,7 @@ def _meet_and_run(
     endpoint: str,
     part: Part,
     timeline: Timeline,
-    told: NDArray[np.int64],
+    flags: NDArray[np.int64],
     interrupt: Interrupt,
     notice: Callable[[str], None],
 ) -> dict[str, Any]:
@@ -128,7 +126,7 @@ def _meet_and_run(
         if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
             link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: not after START
         if rights is not None:
-            if link.port is None:  # a loop in Python never sleeps
+            if good.port is None:  # a thread in Python pumps its messages, and hardly ever sleeps
                 rights["policy"] = ordinary_priority()
             else:
                 awake = kept_awake(rights["processor"], scenario.keep_awake)
@@ -138,11 +136,7 @@ def _meet_and_run(
         notify(f"STATUS=waiting for the other side at {endpoint}")
         start = shake_hands(side, good, scenario, stopped, notice)
         with Watched(scenario, part.progress):
-            if link.port is not None:
-                reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped, told)
-            else:
-                run = run_controller if side == "controller" else run_plant
-                reader = run(bench, link, part, timeline, start.t0_ns, stopped)
+            reader = run_loop(side, bench, link, part, timeline, start.t0_ns, stopped, flags)
     finally:
         resources.close()
         link.close()
@@ -157,8 +151,8 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
     par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
     plant_sample(par, st, y)
-    plant_go_on(par, st)
-    plant_take(par, st, u)
+    plant_step(par, st)
+    plant_command(par, st, u)
     warm_up(bench.controller)
     for group in DATA_IDS:
         values = np.zeros(len(names(group)))
