@@ -36,6 +36,7 @@ class ShmLink:
         self._handle = np.zeros(ring.HANDLE, np.int64)
         self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
+        warm_up()
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 
@@ -108,3 +109,12 @@ class ShmLink:
         h[ring.OUT_HEAD], h[ring.IN_HEAD] = base + np.array(segment.HEADS)[[out, into]]
         h[ring.OUT], h[ring.IN] = base + np.array(segment.RINGS)[[out, into]]
         self._segment = found
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) what an end calls, on a handle that is not open."""
+    handle, message = np.zeros(ring.HANDLE, np.int64), np.zeros(1, np.uint8)
+    ring.put(handle, message)
+    ring.take(handle, message)
+    ring.waiting(handle)
+    Port(handle, ring.port_send, ring.port_receive, _SPINS)
