@@ -91,10 +91,7 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         x = loop.A @ x
     bench.st["x"][0, DELTA] += angle
     parts = [Part.create(place, side, ticks) for side in ("plant", "controller")]
-    done = run_ticks(
-        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        parts[0].signals, parts[1].signals, 0, ticks, False,
-    )  # fmt: skip
+    done = run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     assert done == ticks
     p = parts[0].signals[:, PLANT_COLUMNS.index("y_p")]
     return p - bench.start.y[1], predicted

@@ -16,7 +16,7 @@ def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:
 
 
 def _warm_up(options: LinkOptions) -> None:
-    from gfm_hil.links.shm.link import warm_up
+    from gfm_hil.links.ring import warm_up
 
     warm_up()
 

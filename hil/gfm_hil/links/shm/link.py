@@ -8,9 +8,10 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Side
+from gfm_hil.links import ring
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
-from gfm_hil.links.shm import ring, segment
+from gfm_hil.links.shm import segment
 
 _SPINS = 200  # looks, about 10 µs; on one processor the peer then needs it
 _FIRST_S, _LONGEST_S = 50e-6, 1e-3  # sleeps of a wait, from the first to the longest
@@ -36,7 +37,7 @@ class ShmLink:
         self._handle = np.zeros(ring.HANDLE, np.int64)
         self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
-        warm_up()
+        ring.warm_up()
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 
@@ -109,12 +110,3 @@ class ShmLink:
         h[ring.OUT_HEAD], h[ring.IN_HEAD] = base + np.array(segment.HEADS)[[out, into]]
         h[ring.OUT], h[ring.IN] = base + np.array(segment.RINGS)[[out, into]]
         self._segment = found
-
-
-def warm_up() -> None:
-    """Compile (or load from the cache) what an end calls, on a handle that is not open."""
-    handle, message = np.zeros(ring.HANDLE, np.int64), np.zeros(1, np.uint8)
-    ring.put(handle, message)
-    ring.take(handle, message)
-    ring.waiting(handle)
-    Port(handle, ring.port_send, ring.port_receive, _SPINS)

@@ -10,8 +10,10 @@ whole state: whoever takes an end over goes on from them.
 
 from __future__ import annotations
 
+import numpy as np
+
 from gfm_hil.links.base import LONGEST
-from gfm_hil.links.port import free_port_function
+from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.realtime.atomics import copy, load_acquire, pause, store_release
 from gfm_runtime.compiled import compiled
 
@@ -84,3 +86,12 @@ def port_send(handle, message):
 @free_port_function
 def port_receive(handle, message):
     return take(handle, message)
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) all functions, on a handle that is not open."""
+    handle, message = np.zeros(HANDLE, np.int64), np.zeros(1, np.uint8)
+    put(handle, message)
+    take(handle, message)
+    waiting(handle)
+    Port(handle, port_send, port_receive, 0)
