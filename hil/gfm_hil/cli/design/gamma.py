@@ -7,7 +7,6 @@ import json
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import FreeGain, tied
@@ -22,6 +21,7 @@ from gfm_hil.cli.design.common import (
     weights_of,
 )
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_runtime import law_file
 
 
@@ -57,7 +57,7 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps({"law": file.name, "gamma": None, "reason": str(found)}))
         else:
-            Console().print(f"{file.name}: no gamma, {found}", highlight=False)
+            terminal().print(f"{file.name}: no gamma, {found}", highlight=False)
         return EXIT_OTHERWISE
     if options.json:
         print(json.dumps({"law": file.name, **channels_as_json(channels)}, indent=2))

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gfm_design.tuning.full_order import Missing, full_order
@@ -26,6 +25,7 @@ from gfm_hil.cli.design.common import (
     weights_of,
 )
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.tuned_law import write_law
 from gfm_runtime import law_file
 
@@ -79,7 +79,7 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps({"law": file.name, "gamma": None, "reason": reason}))
         else:
-            Console(stderr=True).print(f"{file.name}: {reason}", highlight=False, soft_wrap=True)
+            terminal(stderr=True).print(f"{file.name}: {reason}", highlight=False, soft_wrap=True)
         return EXIT_OTHERWISE
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
@@ -106,7 +106,7 @@ def call(options: argparse.Namespace) -> int:
         + (f"; law file: {options.out}" if options.out else ""),
         said,
     ]
-    Console(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
+    terminal(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
     return 0
 
 
@@ -116,7 +116,7 @@ def _searched(problem: PaperProblem, options: argparse.Namespace) -> Tuned:
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("γ {task.fields[best]}"),
-        console=Console(stderr=True, quiet=options.quiet),
+        console=terminal(stderr=True, quiet=options.quiet),
         transient=True,
     ) as bar:
         starts = options.starts or starts_for(len(problem.gains))
@@ -136,7 +136,7 @@ def _bound(problem: PaperProblem, result: dict[str, Any]) -> str:
     try:
         found = full_order(problem.linear, problem.weights)
     except Missing as missing:
-        Console(stderr=True).print(str(missing), highlight=False, soft_wrap=True)
+        terminal(stderr=True).print(str(missing), highlight=False, soft_wrap=True)
         return ""
     if found is None:
         return "full order: the solver came to no result in time"
