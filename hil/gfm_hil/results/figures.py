@@ -54,12 +54,8 @@ def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
     )
 
 
-def draw_panel(
-    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
-) -> None:
-    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
-    for t, x, colour, label in curves:
-        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, label=label)
+def dress(axes: Axes, title: str = "") -> None:
+    """What every panel has: a title at the left, a faint grid, no box."""
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.tick_params(labelsize=8.5, color=_GREY)
@@ -67,6 +63,15 @@ def draw_panel(
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(_GREY)
+
+
+def draw_panel(
+    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
+) -> None:
+    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
+    for t, x, colour, label in curves:
+        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, label=label)
+    dress(axes, title)
     axes.ticklabel_format(useOffset=False)
     low, high = axes.get_ylim()
     least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise
