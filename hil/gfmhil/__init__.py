@@ -1,4 +1,4 @@
-"""The public API: run scenarios, compare laws, change gains, load runs, from Python.
+"""The public API: run scenarios, compare laws, change gains, load runs, from Python::
 
     import gfmhil
 

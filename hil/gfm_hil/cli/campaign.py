@@ -20,7 +20,7 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
 from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult, verdict
+from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult, verdict, write_result
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.tables import print_campaign, print_record
@@ -81,7 +81,7 @@ def call(options: argparse.Namespace) -> int:
                 except WorkerLost as problem:
                     lost = problem
     found = CampaignResult(campaign, store.sorted(campaign), store_at)
-    result = found.write(store_at, axes, options.dask or workers, time.monotonic() - began)
+    result = write_result(found, store_at, axes, options.dask or workers, time.monotonic() - began)
     if options.json:
         print(json.dumps(result, indent=2))
     else:

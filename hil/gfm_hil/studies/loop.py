@@ -23,6 +23,7 @@ Vector = NDArray[np.float64]
 
 _LOWEST_HZ, _TOP_HZ = 0.02, 5e3  # of a figure; a sampled loop ends at its Nyquist frequency
 _POINTS = 1000
+_LEAST_DB = -100.0  # the hold has zeros at the Nyquist frequency
 _NYQUIST = 3.0  # half a side of the figure: beyond it L is not near -1
 _GREY = "#888888"
 
@@ -52,6 +53,7 @@ class Loop(ClosedLoop):
             _curve(gain, hz, 20 * np.log10(np.abs(L)), k, name)
             _curve(phase, hz, _degrees(L), k, name)
         gain.axhline(0.0, color=_GREY, lw=0.8)
+        gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
         phase.axhline(-180.0, color=_GREY, lw=0.8)
         return _finish([gain, phase], f"{self._name()}: L, one loop cut", "|L| [dB]", "∠L [°]")
 

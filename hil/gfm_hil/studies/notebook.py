@@ -18,7 +18,7 @@ from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import Here, execute, processes
 from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
-from gfm_hil.studies.campaign.result import CampaignResult
+from gfm_hil.studies.campaign.result import CampaignResult, write_result
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.worker import compile_once
 from gfm_hil.studies.law import Law
@@ -186,5 +186,5 @@ def campaign(
                 execute(made, jobs, pool, workers, store.append, lambda: False)
         found = CampaignResult(made, store.sorted(made), place)
     if place is not None:
-        found.write(place, axes, workers, time.monotonic() - began)
+        write_result(found, place, axes, workers, time.monotonic() - began)
     return found

@@ -89,25 +89,6 @@ class CampaignResult:
             raise UserError("plot: the campaign has no run yet")
         return fill_map(pyplot.figure(), self.campaign, self.records, *axes)
 
-    def write(
-        self, folder: Path, axes: tuple[Axis, Axis | None], workers: int | str, wall_s: float
-    ) -> dict[str, Any]:
-        """Write campaign.json and map.png into the folder; returns the content of the former.
-
-        Args:
-            folder: it is there.
-            axes: of the map.
-            workers: number of processes, or the address of the cluster.
-            wall_s: how long the last call took, s.
-        """
-        from gfm_hil.studies.campaign.figure import draw_map
-
-        if self.records:
-            draw_map(folder / "map.png", self.campaign, self.records, *axes)
-        content = {**self.summary, "workers": workers, "wall_s": wall_s}
-        (folder / "campaign.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
-        return content
-
     def __repr__(self) -> str:
         lines = [
             f"  {law}: " + ", ".join(f"{n} {v}" for v, n in found.items() if n)
@@ -115,6 +96,31 @@ class CampaignResult:
         ]
         title = self.campaign.file.title
         return "\n".join([f"<CampaignResult {title!r}, {len(self.records)} runs", *lines, ">"])
+
+
+def write_result(
+    found: CampaignResult,
+    folder: Path,
+    axes: tuple[Axis, Axis | None],
+    workers: int | str,
+    wall_s: float,
+) -> dict[str, Any]:
+    """Write campaign.json and map.png into the folder; returns the content of the former.
+
+    Args:
+        found: what the campaign showed.
+        folder: it is there.
+        axes: of the map.
+        workers: number of processes, or the address of the cluster.
+        wall_s: how long the last call took, s.
+    """
+    from gfm_hil.studies.campaign.figure import draw_map
+
+    if found.records:
+        draw_map(folder / "map.png", found.campaign, found.records, *axes)
+    content = {**found.summary, "workers": workers, "wall_s": wall_s}
+    (folder / "campaign.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    return content
 
 
 def verdict(record: Record, ripple_max: float) -> str:
