@@ -8,16 +8,18 @@ controller's own number and passes the sensors and the A/D untouched.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from gfm_plant.names import SENSED
 from gfm_plant.parameters import Element, NonNegative, Positive, check_factors
 from gfm_plant.records import MAX_DELAY
+from gfm_runtime.signals import Y_NAMES
 
 Measured = Literal["v_dc", "p", "q", "V"]
 Command = Literal["i_u", "omega_u", "E_u"]
-MEASURED: tuple[Measured, ...] = ("v_dc", "p", "q", "V")
+MEASURED = cast("tuple[Measured, ...]", tuple(Y_NAMES[k] for k in SENSED))
 COMMANDS: tuple[Command, ...] = ("i_u", "omega_u", "E_u")
 """The channels, in the order of the records."""
 

@@ -58,10 +58,7 @@ def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
     c = bench.controller
     c.set("P_ref", REFERENCES[1] + size)
     signals = np.full((ticks, len(PLANT_COLUMNS)), np.nan)
-    run_ticks(
-        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        signals, np.empty((ticks, len(CONTROLLER_COLUMNS))), 0, ticks, False,
-    )  # fmt: skip
+    run_ticks(bench, signals, np.empty((ticks, len(CONTROLLER_COLUMNS))), 0, ticks)
     p = signals[:, PLANT_COLUMNS.index("true_p")] - REFERENCES[1]
     t, y = ClosedLoop.of(law, bench.scenario.plant).step_response("P_ref", seconds=ticks * 1e-4)
     assert t[1] == pytest.approx(1e-4) and y.shape == (ticks + 1, 5)

@@ -195,11 +195,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     bench = make_bench(check_scenario(content, "test"))
     bench.st["x"][0, DELTA] += 1e-7
     parts = [Part.create(tmp, side, ticks) for side in ("plant", "controller")]
-    c = bench.controller
-    run_ticks(
-        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        parts[0].signals, parts[1].signals, 0, ticks, False,
-    )  # fmt: skip
+    run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     p = np.diff(parts[0].signals[:, PLANT_COLUMNS.index("true_p")])
     third = ticks // 3
     return float(np.abs(p[2 * third :]).max() / np.abs(p[third : 2 * third]).max())

@@ -1,11 +1,11 @@
 """The start: both sides show what they are about to run, and refuse what does not fit.
 
 Plant: HELLO every 100 ms until answered. Controller: HELLO back. Plant: START with the time of
-tick 0. Messages are JSON; frames begin only after START. START is said once: where a link has lost
-it, the plant's first frame that gets through says when tick 0 was.
+tick 0. Messages are JSON; frames begin only after START. The plant sends START once. If the
+link loses it, the first frame that arrives tells the controller when tick 0 was.
 
-A greeting that cannot be one is refused and counted, and the wait goes on. What a peer has said is
-only ever shown escaped and cut.
+A side refuses and counts a malformed greeting, and goes on waiting. It shows what a peer said only
+escaped and cut.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from gfm_runtime.signals import NY, TABLE_VERSION, table_hash
 
 _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
-_AGAIN_NS = 2_000_000_000  # after which a link that knows how reaches out anew
+_AGAIN_NS = 2_000_000_000  # after which a link that can do so connects again
 _LEAD_NS = 20_000_000  # from START to tick 0
 _MOST_LEAD_NS = 10_000_000_000  # of a plant that is not ours
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux; CLOCK_MONOTONIC counts from that boot
 
-#: what both sides must have in common, in the order of looking, and its name in words
+#: what both sides must have in common, in the order of checking, and its name in words
 _MUST_FIT = {
     "version": "version of the signal table",
     "table": "signal table",
@@ -52,7 +52,7 @@ _Text = Annotated[str, Field(max_length=100)]
 
 
 class _Greeting(BaseModel):
-    """A controller of somebody else may send more fields than ours has; they are not looked at."""
+    """A foreign controller may send more fields than ours; they are ignored."""
 
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -83,10 +83,10 @@ class Start:
     """What both sides agreed on.
 
     Attributes:
-        t0_ns: time of tick 0 by our own CLOCK_MONOTONIC; where the other side has another one,
-            the controller's is late by the time that START took to come.
+        t0_ns: time of tick 0 on our own CLOCK_MONOTONIC. If the other side has another clock, the
+            controller's value is late by the travel time of START.
         one_clock: both sides run on one machine.
-        refused: how many greetings could not be one.
+        refused: how many malformed greetings came.
     """
 
     t0_ns: int
@@ -95,14 +95,14 @@ class Start:
 
 
 class _Refused(Exception):
-    """A greeting that cannot be one; says why."""
+    """A malformed greeting; says what is wrong with it."""
 
 
 class _Heard:
-    """What came over a link that is no good greeting.
+    """Counts what came over a link other than a good greeting.
 
     Attributes:
-        refused: messages that begin as a greeting does.
+        refused: malformed messages that begin as a greeting does.
     """
 
     def __init__(self, link: Link) -> None:
@@ -114,7 +114,7 @@ class _Heard:
         self.refused, self._why = self.refused + 1, str(why)
 
     def no_greeting(self) -> None:
-        """Count a message that does not even begin as one."""
+        """Count a message that does not begin as a greeting."""
         self._others += 1
 
     def __str__(self) -> str:
@@ -130,8 +130,8 @@ def shake_hands(
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
 
-    ``notice`` is told, within a second and then every five, that the other side is awaited, and
-    what came instead.
+    Calls ``notice`` within a second, and then every five, with what it waits for and what came
+    instead.
 
     Raises:
         PeerLost: no good greeting came within ``link.start_timeout_s``, or the other side runs
@@ -154,13 +154,13 @@ def shake_hands(
         try:
             greeting = None if message is None else _read(message)
             if isinstance(greeting, _Hello):
-                # answer first: both shall see a misfit; and once for all that had piled up
+                # answer first, so that both sides see a misfit, and once for all queued greetings
                 if side == "controller" and now - answered >= _REPEAT_NS:
                     answered = now
                     link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
                 _compare(mine, greeting)
                 one_clock = bool(boot) and greeting.boot == boot
-                if not met:  # from here on it is there, so that silence means what it always does
+                if not met:  # the peer is there: from now on its silence is a fault
                     met, deadline = True, now + int(scenario.link.peer_timeout_s * 1e9)
                 if side == "plant":
                     start = now + _LEAD_NS
@@ -174,7 +174,7 @@ def shake_hands(
                 return Start(greeting.t0, one_clock, heard.refused)
             elif message is not None and greeting is None:
                 tick = _tick(message, scenario) if met else None
-                if tick is not None:  # it runs: START was lost
+                if tick is not None:  # the plant runs already: START was lost
                     t0 = now - round(tick * scenario.T_s * 1e9)
                     return Start(t0, one_clock, heard.refused)
                 heard.no_greeting()
@@ -199,7 +199,7 @@ def shake_hands(
 
 
 def _nothing() -> None:
-    """Of a link that has no second way, or cannot know whether a peer is there."""
+    """Stands in for a method that a link does not have."""
 
 
 def _what_runs(scenario: Scenario) -> dict[str, Any]:
@@ -229,10 +229,10 @@ def _tick(message: bytes, scenario: Scenario) -> int | None:
 
 
 def _read(message: bytes) -> _Hello | _Go | None:
-    """The greeting in a message; None if it does not begin as one.
+    """The greeting in a message; None if the message does not begin as a greeting.
 
     Raises:
-        _Refused: it begins as one, but is none.
+        _Refused: it begins as one and is malformed.
     """
     if message[: len(_PREFIX)] != _PREFIX[: len(message)]:
         return None
@@ -245,7 +245,7 @@ def _read(message: bytes) -> _Hello | _Go | None:
 
 
 def _check_time(t0: int, begin: int, now: int) -> None:
-    """See that tick 0 is neither before this side asked for it nor far away.
+    """Check that tick 0 is neither before this side's greeting nor far away.
 
     Raises:
         _Refused: it is.

@@ -22,14 +22,15 @@ class Link(Protocol):
     A message is delivered whole or not at all, and in order. Nothing is queued without bound:
     a message that the peer has no room for is dropped, and ``send`` says so.
 
-    A link may have two more methods, which the handshake calls where they are: ``again()`` reaches
-    out anew to a peer that has not come, and ``connected()`` says whether a peer is at the other
-    end, with None where the link cannot know it.
+    A link may have more methods. The handshake calls ``again()``, which reaches out anew to a peer
+    that has not come, and ``connected()``, which says whether a peer is at the other end, with None
+    where the link cannot know it. The loop calls ``start()`` before its first tick and ``stop()``
+    after its last message.
     """
 
     @property
     def port(self) -> Port | None:
-        """The same end for compiled loops, or None: the loops then run in Python."""
+        """The same end for the compiled loops, or None: a thread then pumps its messages."""
 
     def send(self, message: bytes) -> bool:
         """Hand a message over; False if it had to be dropped."""

@@ -37,7 +37,8 @@ class Port:
             for loops without deadlines, once they have looked in vain for a while. On a crowded
             machine a thread that yields for ever keeps the very peer from running that it waits
             for. None: the loop takes naps.
-        looks: that while: some hundred microseconds, so that naps are for a crowded machine.
+        spin_limit: reads in vain after which a loop in lockstep may nap: some hundred microseconds,
+            so that only a crowded machine sees naps.
     """
 
     handle: NDArray[np.int64]
@@ -45,7 +46,7 @@ class Port:
     receive: Any
     spins: int
     patient: Any = None
-    looks: int = 5000
+    spin_limit: int = 5000
 
 
 def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> Any:

@@ -8,9 +8,10 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Side
+from gfm_hil.links import ring
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
-from gfm_hil.links.shm import ring, segment
+from gfm_hil.links.shm import segment
 
 _SPINS = 200  # looks, about 10 µs; on one processor the peer then needs it
 _FIRST_S, _LONGEST_S = 50e-6, 1e-3  # sleeps of a wait, from the first to the longest
