@@ -70,6 +70,12 @@ def test_the_transfer_matrix_is_that_of_the_law(name):
         assert np.allclose(matrix(1j * omega), built(1j * omega), rtol=1e-9, atol=1e-12)
 
 
+def test_a_package_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(gfmhil.UserError, match=r"needs python-control: pip install 'gfmhil\[desig"):
+        gfmhil.Law.load("vsg-2").to_control()
+
+
 def test_a_closed_loop_of_a_law_draws_what_it_says():
     law = gfmhil.Law.load("mimo-gfm")
     loop = law.closed_loop("rig_pref_step")
