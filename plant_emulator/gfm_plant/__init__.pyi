@@ -2,10 +2,10 @@ from .bases import Bases
 from .build import make_plant
 from .emulator import (
     plant_advance,
-    plant_ahead,
-    plant_go_on,
+    plant_command,
     plant_init,
-    plant_take,
+    plant_is_delayed,
+    plant_step,
     plant_truth,
 )
 from .grid import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
@@ -34,14 +34,14 @@ __all__ = [
     "make_plant",
     "phase_jump",
     "plant_advance",
-    "plant_ahead",
+    "plant_command",
     "plant_equilibrium",
-    "plant_go_on",
     "plant_init",
+    "plant_is_delayed",
     "plant_par_dtype",
     "plant_sample",
     "plant_state_dtype",
-    "plant_take",
+    "plant_step",
     "plant_truth",
     "trip_reason",
 ]

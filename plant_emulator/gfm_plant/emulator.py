@@ -59,18 +59,18 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
 
     With a delay of n samples and a fraction of one, u[k-n-1] acts for that fraction of the
     period and u[k-n] for the rest; without delay u[k] acts at once. With at least one sample of
-    it u[k] need not be known before the plant goes on, see ``plant_ahead``.
+    it u[k] need not be known before the plant goes on, see ``plant_is_delayed``.
     """
-    if plant_ahead(par):
-        plant_go_on(par, st)
-        plant_take(par, st, u)
+    if plant_is_delayed(par):
+        plant_step(par, st)
+        plant_command(par, st, u)
     else:
-        plant_take(par, st, u)
-        plant_go_on(par, st)
+        plant_command(par, st, u)
+        plant_step(par, st)
 
 
 @compiled
-def plant_ahead(par: PlantRecord) -> bool:
+def plant_is_delayed(par: PlantRecord) -> bool:
     """Whether a plant goes on first and takes the command then: nothing of u[k] acts in period k.
 
     Whoever waits for u[k] can let the plant go on meanwhile.
@@ -79,7 +79,7 @@ def plant_ahead(par: PlantRecord) -> bool:
 
 
 @compiled
-def plant_take(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
+def plant_command(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
     """Put u (3,) through the D/A into the delay line."""
     r, s = par[0], st[0]
     for j in range(3):
@@ -92,7 +92,7 @@ def plant_take(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> Non
 
 
 @compiled
-def plant_go_on(par: PlantRecord, st: PlantRecord) -> None:
+def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     """Go on by one sampling period under the commands in the delay line."""
     r, s = par[0], st[0]
     newest = max(r.delay - 1, 0)  # place in the line: u[k] itself is not in it yet, if delayed
@@ -124,8 +124,8 @@ def plant_go_on(par: PlantRecord, st: PlantRecord) -> None:
 
 @compiled
 def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> None:
-    """Write the true values at this tick to out (10,), in the order of `TRUTH`."""
-    s = st[0]
+    """Write the true values at this tick to out (11,), in the order of `TRUTH`."""
+    r, s = par[0], st[0]
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
     out[2] = s.u_now[1]
@@ -134,6 +134,9 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[7] = s.omega_g
     out[8] = s.V_g
     out[9] = s.trip
+    i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
+    i_max = r.i_max if s.trip == 0 else 0.0
+    out[10] = min(max(i_dc, -i_max), i_max)
 
 
 @compiled

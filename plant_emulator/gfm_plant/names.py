@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from gfm_runtime.signals import D_NAMES, U_NAMES, Y_NAMES
+
 TRIPS = (
     # option, quantity, sign (+1: trips above the threshold, -1: below)
     ("over_current", "|i_dq|", +1),
@@ -32,5 +34,9 @@ SAFE_STATE, SILENT = 0.0, 1.0
 CONTROLLER_SAFE = "the controller is in its safe state"
 NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 
-TRUTH = ("v_dc", "p", "omega_u", "q", "V", "i", "delta", "omega_g", "V_g", "trip")
-"""What `plant_truth` writes, in this order; i = |i_dq|, delta in rad, trip a reason code."""
+SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
+"""Indices of the y that pass the sensors; omega_u is a command and known exactly."""
+
+TRUTH = (*Y_NAMES, "i", "delta", *D_NAMES, "trip", "i_dc")
+"""What `plant_truth` writes, in this order, in p.u.: i is |i_dq|, i_dc the current of the DC
+source, delta is in rad, and trip is a key of `TRIP_REASONS`."""

@@ -12,7 +12,7 @@ from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import (
     MAX_STAGES,
     control,
-    heed,
+    follow_plant,
     make_controller,
     missed,
     set_reference,
@@ -172,6 +172,6 @@ def warm_up(controller: Controller) -> None:
     ctl, states = controller.ctl.copy(), controller.states.copy()
     ctl["state"], ctl["request"] = RUNNING, ctl["active"]
     y, u = np.ones(NY), np.ones(NU)
-    heed(ctl, False)
+    follow_plant(ctl, False)
     control(ctl, controller.laws, states, controller.est.copy(), y, u)
     missed(ctl)

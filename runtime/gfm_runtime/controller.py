@@ -103,7 +103,7 @@ def missed(ctl):
 
 
 @compiled
-def heed(ctl, tripped):
+def follow_plant(ctl, tripped):
     """Take in what the plant's frame says of it: a trip takes a running controller to SAFE, and a
     plant that is well again a READY one to RUNNING."""
     c = ctl[0]

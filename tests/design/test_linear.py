@@ -19,7 +19,9 @@ from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant, make_plant
 from gfm_plant.model import DELTA, N_X, f, g
-from gfm_runtime import discretise, get_law, law_names
+from gfm_runtime import discretise, get_law
+
+from ..runtime.support import every_law
 
 REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
 RIG = {
@@ -92,10 +94,7 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         x = loop.A @ x
     bench.st["x"][0, DELTA] += angle
     parts = [Part.create(place, side, ticks) for side in ("plant", "controller")]
-    done = run_ticks(
-        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        parts[0].signals, parts[1].signals, 0, ticks, False,
-    )  # fmt: skip
+    done = run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     assert done == ticks
     p = parts[0].signals[:, PLANT_COLUMNS.index("y_p")]
     return p - bench.start.y[1], predicted
@@ -168,7 +167,7 @@ def test_known_figures(
     assert mode.frequency_hz == pytest.approx(frequency, abs=0.5)
 
 
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_sampling_fast_leads_to_the_continuous_loop(law: str) -> None:
     # without delay the hold's half a sample is all that differs: at 1 us 1.1 kHz turns by 0.4 deg
     home = get_law(law).home_grid

@@ -197,11 +197,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     bench = make_bench(check_scenario(content, "test"))
     bench.st["x"][0, DELTA] += 1e-7
     parts = [Part.create(tmp, side, ticks) for side in ("plant", "controller")]
-    c = bench.controller
-    run_ticks(
-        bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-        parts[0].signals, parts[1].signals, 0, ticks, False,
-    )  # fmt: skip
+    run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     p = np.diff(parts[0].signals[:, PLANT_COLUMNS.index("true_p")])
     third = ticks // 3
     return float(np.abs(p[2 * third :]).max() / np.abs(p[third : 2 * third]).max())
@@ -242,6 +238,8 @@ def test_grid_strength_and_region() -> None:
     nominal = load_converter(loop.made_of.plant.converter).pu()
     assert grid.now == pytest.approx(1 / abs(0.5 * nominal["R_g"] + 1j * nominal["L_g"]))
     assert grid.weakest == pytest.approx(grid.now / grid.range.high.factor)
+    weak = grid_strength(loop_of("mimo-gfm", "pref_step", grid={"scr": 20.0, "x_over_r": 8.0}))
+    assert (weak.now, weak.x_over_r) == (pytest.approx(20.0), pytest.approx(8.0))
     assert grid.range.high.lost is not None
     assert grid.range.high.lost.frequency_hz == pytest.approx(1008.0, abs=2.0)
     region = stable_region(loop, points=4)

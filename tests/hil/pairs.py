@@ -1,4 +1,4 @@
-"""Both sides of a run in two threads of this process, over any link, in either kind of loop."""
+"""Both sides of a run in two threads of this process, over any link."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import SIDES, Side
-from gfm_hil.engine.controller_side import run_controller
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.engine.loop_records import TOLD
-from gfm_hil.engine.loop_thread import run_compiled
-from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_side
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -79,16 +76,12 @@ def run_pair(
         bench, part, impairment = benches[side], parts[side], scenario.link.impairment
         end = open_link(link, side, endpoint, options)
         timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
-        used, told = touch(side, end), np.zeros(TOLD, np.int64)
+        used = touch(side, end)
         if impairment is not None and impairment.hits(side):
             used = ImpairedLink(used, impairment, side)
         try:
             t0 = shake_hands(side, end, scenario, lambda: False, lambda text: None).t0_ns
-            if used.port is not None:
-                reader = run_compiled(side, bench, used, part, timeline, t0, stopped, told)
-            else:
-                run = run_controller if side == "controller" else run_plant
-                reader = run(bench, used, part, timeline, t0, stopped)
+            reader = run_loop(side, bench, used, part, timeline, t0, stopped)
             pair.faults[side] = dict(reader.faults)
             if isinstance(used, ImpairedLink):
                 pair.injected[side] = used.injected

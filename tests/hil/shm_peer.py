@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from gfm_hil.links import open_link
-from gfm_hil.links.shm.ring import LONGEST
+from gfm_hil.links.ring import LONGEST
 from gfm_hil.realtime.clock import give_way
 
 

@@ -17,10 +17,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import SIDES, Side
-from gfm_hil.engine.controller_side import run_controller
-from gfm_hil.engine.loop_records import TOLD
-from gfm_hil.engine.loop_thread import run_compiled
-from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_side
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -121,12 +118,7 @@ def lied_to(
         thread.start()
         assert ends[side].wait(30)
         t0 = time.monotonic_ns()
-        if ends[side].port is not None:
-            told = np.zeros(TOLD, np.int64)
-            reader = run_compiled(side, bench, ends[side], part, timeline, t0, stopped, told)
-        else:
-            run = run_controller if side == "controller" else run_plant
-            reader = run(bench, ends[side], part, timeline, t0, stopped)
+        reader = run_loop(side, bench, ends[side], part, timeline, t0, stopped)
         liar.over.set()
         thread.join()
         give_up = time.monotonic() + LIMIT_S

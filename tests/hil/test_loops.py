@@ -1,4 +1,4 @@
-"""The compiled loops do what the loops in Python do, and what the rules of real time say.
+"""The loops over a link do what the loop in process does, and what the rules of real time say.
 
 Nothing here depends on how fast the machine is: what a run missed is read off its recording, and
 the rules must hold for it.
@@ -16,10 +16,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import SIDES, Side
-from gfm_hil.engine.controller_side import run_controller
-from gfm_hil.engine.loop_records import TOLD
-from gfm_hil.engine.loop_thread import run_compiled
-from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_side
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -28,10 +25,10 @@ from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime import law_names
 from gfm_runtime.signals import names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
+from ..runtime.support import every_law
 from .conftest import home_plant
 from .pairs import PATIENT, run_pair
 from .test_frames import resealed
@@ -41,24 +38,24 @@ PORTS = ("shm", "zmq")
 
 
 def three_ways(content: dict[str, Any], link: str, make: Any, run: Any, place: Path) -> Any:
-    """A run by compiled loops, by loops in Python and in process; returns the first and the last.
+    """A run over a link with a port, over one without, and in process; returns first and last.
 
     The log of all but the order in which the sides end must be the same too.
     """
     scenario = make(**content)
-    compiled = run_pair(scenario, place / "c", link)
-    python = run_pair(scenario, place / "p", "zmq", {"portable": True})
+    ported = run_pair(scenario, place / "c", link)
+    pumped = run_pair(scenario, place / "p", "zmq", {"portable": True})
     together = run(**content)
-    assert_same(compiled.signals, together.signals)
-    assert_same(python.signals, together.signals)
-    assert compiled.ends() == python.ends()
-    events = [[e for e in pair.log if e["event"] != "end"] for pair in (compiled, python)]
+    assert_same(ported.signals, together.signals)
+    assert_same(pumped.signals, together.signals)
+    assert ported.ends() == pumped.ends()
+    events = [[e for e in pair.log if e["event"] != "end"] for pair in (ported, pumped)]
     assert events[0] == events[1]
-    return compiled, together
+    return ported, together
 
 
 @pytest.mark.parametrize("link", PORTS)
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_every_law_in_lockstep(law, link, make, run, place):
     content = {
         "law": law,
@@ -95,8 +92,8 @@ def test_every_event_and_changes_of_law(link, make, run, place):
             {"tick": 799, "type": "reference", "Q_ref": 0.01},
         ],
     }
-    compiled, _ = three_ways(content, link, make, run, place)
-    assert [e["law"] for e in compiled.log if e["event"] == "law-active"] == ["vsg-2", "droop-1"]
+    ported, _ = three_ways(content, link, make, run, place)
+    assert [e["law"] for e in ported.log if e["event"] == "law-active"] == ["vsg-2", "droop-1"]
 
 
 @pytest.mark.parametrize("link", PORTS)
@@ -114,9 +111,9 @@ def test_a_trip_and_a_safe_state(plant, status, link, make, run, place):
         "plant": plant,
         "events": [{"tick": 30, "type": "grid-phase-jump", "degrees": 120.0}],
     }
-    compiled, together = three_ways(content, link, make, run, place)
+    ported, together = three_ways(content, link, make, run, place)
     assert together.summary["status"] == status
-    ends = compiled.ends()
+    ends = ported.ends()
     assert {ends[side][0] for side in SIDES} == {status}
     own = "plant" if status == "tripped" else "controller"
     assert ends[own][1] == together.summary["reason"]
@@ -199,7 +196,7 @@ def after(sent: list[bytes], group: str, tick: int, state: int, reason: int = 0)
 
 @dataclass
 class Alone:
-    """What one side's compiled loop left, whose other side was played."""
+    """What one side's loop left, whose other side was played."""
 
     faults: dict[str, int]
     part: Part
@@ -220,7 +217,6 @@ def alone(
     heard: list[bytes],
     link: str = "shm",
     stopped: Callable[[], bool] = lambda: False,
-    compiled: bool = True,
 ) -> Alone:
     """Run one side's loop over messages that are there before it starts, however slow it is."""
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
@@ -235,12 +231,7 @@ def alone(
             assert ends[other].send(message)
         assert not heard or ends[side].wait(30)
         t0 = time.monotonic_ns()
-        if compiled:
-            told = np.zeros(TOLD, np.int64)
-            reader = run_compiled(side, bench, ends[side], part, timeline, t0, stopped, told)
-        else:
-            run = run_controller if side == "controller" else run_plant
-            reader = run(bench, ends[side], part, timeline, t0, stopped)
+        reader = run_loop(side, bench, ends[side], part, timeline, t0, stopped)
         answers = FrameReader("u" if side == "controller" else "y")
         values, said = np.zeros(len(names(answers.group))), []
         while ends[other].wait(0.05):
@@ -310,8 +301,7 @@ def test_the_stop_flag_ends_both(mode, link, place, make):
     assert "stopped by the operator" in {ends[side][1] for side in SIDES}
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_an_event_whose_tick_was_lost_is_carried_out_with_the_next_frame(compiled, place, make):
+def test_an_event_whose_tick_was_lost_is_carried_out_with_the_next_frame(place, make):
     content = {
         "link": LIVE,
         "law": "vsg-2",
@@ -323,7 +313,7 @@ def test_an_event_whose_tick_was_lost_is_carried_out_with_the_next_frame(compile
     }
     heard = frames("y", 0, 1, 5, 6, 11, 12)
     heard = after(heard, "y", 13, STOPPED)
-    found = alone("controller", make(**content), place, heard, compiled=compiled)
+    found = alone("controller", make(**content), place, heard)
     assert found.end == ("completed", "", 12)
     happened = [(e["tick"], e["event"]) for e in found.log if "label" in e]
     assert happened == [(5, "reference"), (6, "reference"), (11, "law")]

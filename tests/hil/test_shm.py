@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from numba import njit
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.links import link_kind, open_link
+from gfm_hil.links import link_kind, open_link, ring
 from gfm_hil.links.port import PORT_CALL
-from gfm_hil.links.shm import ring, segment
+from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 
 Pair = tuple[ShmLink, ShmLink]

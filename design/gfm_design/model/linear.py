@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_plant.model import N_X, V_DC, f, g
+from gfm_plant.names import SENSED
 from gfm_plant.records import PlantRecord
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
@@ -30,7 +31,7 @@ Matrix = NDArray[np.float64]
 _STEP = 1e-30  # complex step
 _NUDGE = 1e-6  # central differences, for the error map alone: it is compiled for real numbers
 _WHOLE = 1e-9  # samples; a fraction below this is rounding
-_MEASURED = [0, 1, 3, 4]  # the outputs that pass the sensors; omega_u does not
+_MEASURED = list(SENSED)
 
 
 @dataclass(frozen=True)

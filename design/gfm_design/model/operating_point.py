@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gfm_plant import NoEquilibrium, plant_equilibrium
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
+from gfm_plant.names import SENSED
 from gfm_plant.records import PlantRecord
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.tustin import DiscreteLaw
@@ -105,7 +106,7 @@ def _unpack(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
     y = g(x, u)
-    measured = np.array([0, 1, 3, 4])  # omega_u passes the sensors untouched
+    measured = np.array(SENSED)
     y[measured] = par[0]["gain"] * y[measured] + par[0]["offset"]
     x_law = np.zeros(law.order)
     x_law[kept] = z[N_X + 2 :]

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from gfm_design.model.linear import LinearPlant
 from gfm_design.norms.hinf import balance
 from gfm_design.norms.performance import D_Q, StateSpace, Weight
+from gfm_plant.names import SENSED
 
 Matrix = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ _REGULAR = 1e-4
 _U_SCALE = (1.0, 1e-4, 1.0)  # omega_u moves by 1e-4 p.u. where the others move by one
 # in these units, by j: 1e-2 p.u. on omega_u where W_32 asks for 1, more where W_31 asks for 1e6
 _REGULAR_U = {1: (1e-4, 1e-5, 1e-4), 2: (1e-4, 1e-6, 1e-4)}
-_MEASURED = [0, 1, 3, 4]
+_MEASURED = list(SENSED)
 
 
 class Missing(ModuleNotFoundError):

@@ -110,19 +110,15 @@ class Loop:
             UserError: the run ended early, so that there is nothing to time.
         """
         b, n = self.reset(), ticks or self.ticks
-        c = b.controller
         done = 0
 
         def run() -> None:
             nonlocal done
-            done = run_ticks(
-                b.par, b.st, c.ctl, c.laws, c.states, c.est, b.y, b.u,
-                self.plant, self.controller, 0, n, False,
-            )  # fmt: skip
+            done = run_ticks(b, self.plant, self.controller, 0, n)
 
         time = seconds(run) / n * 1e9
         if done != n:
-            raise UserError(f"{c.active}: tripped or safe at tick {done - 1} of {n}")
+            raise UserError(f"{b.controller.active}: tripped or safe at tick {done - 1} of {n}")
         return time
 
     def plant_part(self) -> float:

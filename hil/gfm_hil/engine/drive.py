@@ -1,7 +1,6 @@
-"""Driving the compiled loops: call them, and say in Python what they came back for.
+"""Driving the compiled loops: call them, and do in Python what they came back for.
 
-Both functions do what ``run_plant`` and ``run_controller`` do for a link without a port, with the
-same rules, words and recording. They are meant for a thread of their own.
+Both functions are meant for a thread of their own.
 """
 
 from __future__ import annotations
@@ -16,18 +15,12 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import Side
 from gfm_hil.engine.controller_ticks import controller_ticks
 from gfm_hil.engine.loop_records import (
-    BELL,
-    DONE,
-    EVENT,
-    GONE,
-    LATE,
-    LOOK,
-    PEER_SAFE,
-    PEER_STOPPED,
-    RESTORE,
-    SILENT,
-    STOPPED_HERE,
-    TOLD,
+    FLAGS,
+    ControllerRecords,
+    LinkEnd,
+    PlantRecords,
+    Records,
+    Why,
     make_loop,
 )
 from gfm_hil.engine.plant_ticks import plant_ticks
@@ -43,7 +36,7 @@ from gfm_hil.scenario.expectation import CONTROLLER_GONE
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
-_FAR = 2**62  # as of a timeline without events
+_FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
 
 
@@ -51,34 +44,41 @@ class _Loop:
     """One side's compiled loop with everything that its calls have in common."""
 
     def __init__(
-        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, told: NDArray[np.int64]
+        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, flags: NDArray[np.int64]
     ) -> None:
         assert link.port is not None
-        scenario, port, self.part = bench.scenario, link.port, part
+        scenario, port, c = bench.scenario, link.port, bench.controller
         plant = side == "plant"
-        self.bench, self.link = bench, link
+        self.link = link
         self.writer = FrameWriter("y" if plant else "u")
         self.reader = FrameReader.of(side, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
-        self.loop["looks"] = port.looks
-        w, r, c = self.writer, self.reader, bench.controller
-        records = (bench.par, bench.st) if plant else (c.ctl, c.laws, c.states, c.est)
-        self._arguments: tuple[Any, ...] = (
+        self.loop["spin_limit"] = port.spin_limit
+        w, r = self.writer, self.reader
+        end = LinkEnd(
             port.send, port.receive, port.patient or _rest, port.handle, port.spins,
-            (w.sequence, w.frame, w.message), (r.frame, r.message), r.record, self.loop, told,
-            *records, bench.y, bench.u, part.signals, part.times, part.progress,
+            (w.sequence, w.frame, w.message), (r.frame, r.message), r.record,
         )  # fmt: skip
+        records = Records(
+            self.loop, flags, bench.y, bench.u, part.signals, part.times, part.progress
+        )
+        own = (
+            PlantRecords(bench.par, bench.st)
+            if plant
+            else ControllerRecords(c.ctl, c.laws, c.states, c.est)
+        )
+        self._arguments = end, records, own
         self._call = plant_ticks if plant else controller_ticks
 
-    def go(self, until: int) -> int:
-        """Run until that tick or until there is something to say.
+    def go(self, until: int) -> Why:
+        """Run until that tick, or until the loop returns for another reason.
 
         Raises:
             PeerLost: the link is gone.
         """
-        why = int(self._call(*self._arguments, until))
-        if why == GONE:
-            self.link.receive()  # which knows more
+        why: Why = self._call(*self._arguments, until)
+        if why == Why.GONE:
+            self.link.receive()  # raises and says more
             raise PeerLost("the link is gone")
         return why
 
@@ -88,37 +88,37 @@ class _Loop:
         return int(self.loop["tick"][0])
 
     def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
-        """Tell the other side how this one ends."""
+        """Tell the other side how this side ends."""
         tick = max(self.tick, 0)
         part_from(self.link, self.writer, self.reader, tick, state, reason, values)
 
 
 def drive_plant(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, told: NDArray[np.int64]
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, flags: NDArray[np.int64]
 ) -> FrameReader:
     """Run the plant's side of a scenario after the handshake; returns its frame counters."""
-    loop, ticks = _Loop("plant", bench, link, part, t0_ns, told), bench.scenario.ticks
+    loop, ticks = _Loop("plant", bench, link, part, t0_ns, flags), bench.scenario.ticks
     loop.loop["u_last"] = loop.loop["u_before"] = bench.u
     waits = bench.scenario.after_trip == "wait"
     while timeline.running:
         timeline.carry_out(loop.tick)
         why = loop.go(min(timeline.next_tick(), ticks))
         tick = loop.tick
-        if why == RESTORE:
+        if why == Why.RESTORE:
             bench.restore_plant(tick)
             loop.loop["u_last"] = loop.loop["u_before"] = bench.u
         timeline.look(max(tick - 1, 0))
-        if tick >= ticks and why in (DONE, LOOK, RESTORE):
+        if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):
             timeline.finish(tick)
-        elif why == STOPPED_HERE:
+        elif why == Why.STOPPED_HERE:
             timeline.end("interrupted", "stopped by the operator", tick)
-        elif why == PEER_SAFE:
+        elif why == Why.PEER_SAFE:
             timeline.end("safe", REASONS[loop.reader.reason], tick)
-        elif why == PEER_STOPPED:
+        elif why == Why.PEER_STOPPED:
             timeline.end("interrupted", CONTROLLER_LEFT, tick)
-        elif why == SILENT:
+        elif why == Why.SILENT:
             timeline.end("safe", CONTROLLER_GONE, tick)
-        elif why == LATE:
+        elif why == Why.LATE:
             timeline.end("safe", NO_FRESH_U, tick)
     assert timeline.outcome is not None
     status = timeline.outcome.status
@@ -128,53 +128,53 @@ def drive_plant(
 
 
 def drive_controller(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, told: NDArray[np.int64]
+    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, flags: NDArray[np.int64]
 ) -> FrameReader:
     """Run the controller's side of a scenario after the handshake; returns its frame counters."""
-    loop, ctl = _Loop("controller", bench, link, part, t0_ns, told), bench.controller.ctl
-    why = EVENT
+    loop, ctl = _Loop("controller", bench, link, part, t0_ns, flags), bench.controller.ctl
+    why = Why.EVENT
     loop.loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running:
         event = timeline.next_tick()
-        if loop.loop["pending"][0]:  # frames were lost on the way to the event
+        if loop.loop["pending"][0]:  # the frame of the event's own tick was lost
             timeline.carry_out(loop.tick)
             event = timeline.next_tick()
-        elif event <= loop.tick + 1 or why == BELL:
+        elif event <= loop.tick + 1 or why == Why.WOKEN:
             timeline.carry_out(loop.tick + 1)
             event = timeline.next_tick()
         why = loop.go(event)
         tick = loop.tick
-        if why in (LOOK, EVENT) and not loop.loop["pending"][0]:
+        if why in (Why.CHANGED, Why.EVENT) and not loop.loop["pending"][0]:
             timeline.look(max(tick, 0))
-        if why == STOPPED_HERE:
+        if why == Why.STOPPED_HERE:
             timeline.end("interrupted", "stopped by the operator", tick)
             loop.last_words(STOPPED, 0, bench.u)
-        elif why == PEER_SAFE:
+        elif why == Why.PEER_SAFE:
             timeline.end("tripped", REASONS[PLANT_TRIP], tick)
             loop.last_words(SAFE, PLANT_TRIP, bench.u)
-        elif why == PEER_STOPPED:
+        elif why == Why.PEER_STOPPED:
             if loop.reader.reason:
                 timeline.end("interrupted", PLANT_LEFT, tick)
             else:
                 timeline.finish(tick)
             loop.last_words(STOPPED, 0, bench.u)
-        elif why == SILENT:
+        elif why == Why.SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
             loop.last_words(SAFE, LOST_PEER, bench.u)
-        elif not timeline.running:  # the look has found and written down a safe state
+        elif not timeline.running:  # ``timeline.look`` found a safe state and wrote it down
             loop.last_words(SAFE, int(ctl["reason"][0]), bench.u)
     return loop.reader
 
 
 def compile_loops(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
-    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(TOLD, np.int64))
+    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(FLAGS, np.int64))
     loop.go(_FAR if side == "controller" else 0)
 
 
 @port_function
 def _rest(handle, message):
-    """What a loop without deadlines does where the link cannot sleep until a message comes."""
+    """Sleep for 100 µs: lockstep on a link that cannot sleep until a message comes."""
     sleep_until(now_ns() + _NAP_NS)
     return 0
 
@@ -185,6 +185,8 @@ def _nothing(handle, message):
 
 
 class _Nowhere:
-    """A link to nobody: the loops are the same for all links."""
+    """A link without a peer; enough to compile a loop, which is the same for all links."""
 
-    port = Port(np.zeros(1, np.int64), _nothing, _nothing, 0)
+    @property
+    def port(self) -> Port:
+        return Port(np.zeros(1, np.int64), _nothing, _nothing, 0)

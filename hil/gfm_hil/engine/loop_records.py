@@ -1,49 +1,122 @@
-"""What a compiled loop remembers from one call to the next, and why it came back."""
+"""What a compiled loop works on, what it remembers from call to call, and why it returns."""
 
 from __future__ import annotations
 
+from enum import IntEnum
+from typing import Any, NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import NU
 from gfm_runtime.states import RUNNING
 
-#: why a loop returned
-(
-    DONE, STOPPED_HERE, LOOK, PEER_SAFE, PEER_STOPPED, SILENT, LATE, EVENT, BELL, RESTORE, GONE,
-) = range(11)  # fmt: skip
 
-#: what other threads tell a loop, int64: to come back for good, and, by counting up, for a moment
-STOP, RING, TOLD = range(3)
+class Why(IntEnum):
+    """Why a compiled loop returned."""
+
+    GO_ON = 0  #: only between compiled functions: there is no reason to return
+    DONE = 1  #: plant: it reached the tick it was to run to
+    STOPPED_HERE = 2  #: this process was told to stop
+    CHANGED = 3  #: the law, the controller's state or the plant's protection changed
+    PEER_SAFE = 4  #: the other side is in SAFE, and the run does not wait for a reset
+    PEER_STOPPED = 5  #: the other side left
+    SILENT = 6  #: nothing new came for ``link.peer_timeout_s``
+    LATE = 7  #: plant, real time: no fresh u for longer than ``late_policy.hold``
+    EVENT = 8  #: controller: an event is due in the next tick
+    WOKEN = 9  #: another thread has something to be carried out
+    RESTORE = 10  #: plant: tripped, and the controller is READY: back to the start
+    GONE = 11  #: the link itself is gone
+
+
+#: Indices of ``flags``, int64, by which other threads speak to a loop: a number other than 0 in
+#: STOP ends it; it returns once whenever the number in WAKE has changed.
+STOP, WAKE, FLAGS = range(3)
 
 loop_dtype = np.dtype(
     [
         ("realtime", "i8"),
-        ("clock_every", "i8"),  # at first, looks in vain between two looks at the clock, 25 ns
-        ("looks", "i8"),  # lockstep: looks in vain after which it may sleep
+        ("clock_every", "i8"),  # reads of the link between two reads of the clock, at first
+        ("spin_limit", "i8"),  # lockstep: reads in vain after which the loop may sleep
         ("tick", "i8"),  # plant: the next one; controller: the last one received, -1 before
         ("t0", "i8"),  # of tick 0, ns
         ("T", "i8"),  # sampling time, ns
         ("patience", "i8"),  # silence after which the other side is gone, ns
         ("hold", "i8"),  # misses in a row that the plant allows
-        ("extrapolate", "i8"),  # plant: misses in a row over which u goes on along its trend
+        ("extrapolate", "i8"),  # plant: misses in a row over which u continues its trend
         ("repeat", "i8"),  # lockstep: silence after which the plant sends y again, ns
         ("repeats", "i8"),  # how often it did
         ("unrested", "i8"),  # plant: ticks in a row without a sleep
         ("late", "i8"),  # misses in a row
         ("misses", "i8"),
-        ("heard", "i8"),  # when the last message came, ns
-        ("pending", "i8"),  # a frame was taken but not yet computed
+        ("heard", "i8"),  # when the last newer frame came, ns
+        ("pending", "i8"),  # the controller took a frame and has not computed its tick yet
         ("done", "i8"),  # ticks computed
-        ("bell", "i8"),  # as last heard
+        ("woken", "i8"),  # ``flags[WAKE]`` as last seen
         ("waits", "i8"),  # after a trip or in SAFE: for a reset, instead of ending the run
-        ("seen", "i8"),  # controller: the state that was last come back with
+        ("seen", "i8"),  # controller: the state with which it last returned
         ("u_last", "f8", (NU,)),  # the two newest u that came in time
         ("u_before", "f8", (NU,)),
         ("phase", "f8"),  # controller: earliest arrivals of frames after t0 + k T, ns
     ],
     align=True,
 )
+
+
+class LinkEnd(NamedTuple):
+    """One end of a link as the loops use it: ``gfm_hil.links.Port`` and the frames' buffers.
+
+    Attributes:
+        send, receive, patient, handle, spins: of the port.
+        out: sequence, record and bytes of the frame to send.
+        into: record and bytes of a frame received.
+        reader: counters of what was received, see ``gfm_hil.links.frame``.
+    """
+
+    send: Any
+    receive: Any
+    patient: Any
+    handle: NDArray[np.int64]
+    spins: int
+    out: tuple[Any, Any, Any]
+    into: tuple[Any, Any]
+    reader: NDArray[Any]
+
+
+class Records(NamedTuple):
+    """What a loop writes, whichever role it has.
+
+    Attributes:
+        loop: one element of ``loop_dtype``.
+        flags: shape (FLAGS,), int64, written by other threads.
+        y, u: measurements (5,) and inputs (3,) of the current tick, p.u.
+        rows, times, progress: of the recording's part.
+    """
+
+    loop: NDArray[Any]
+    flags: NDArray[np.int64]
+    y: NDArray[np.float64]
+    u: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    times: NDArray[np.int64]
+    progress: NDArray[np.int64]
+
+
+class PlantRecords(NamedTuple):
+    """The plant's parameters and state, see ``gfm_plant``."""
+
+    par: NDArray[Any]
+    st: NDArray[Any]
+
+
+class ControllerRecords(NamedTuple):
+    """The controller's records, see ``gfm_runtime.controller``."""
+
+    ctl: NDArray[Any]
+    laws: NDArray[Any]
+    states: NDArray[Any]
+    est: NDArray[Any]
 
 
 _CLOCK_EVERY = 64

@@ -1,4 +1,4 @@
-"""A compiled loop in a thread of its own, watched by the main thread, which hears Ctrl-C."""
+"""A compiled loop in a thread of its own, watched by the main thread, which receives Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.roles import Side
 from gfm_hil.engine.drive import drive_controller, drive_plant
-from gfm_hil.engine.loop_records import STOP
+from gfm_hil.engine.loop_records import FLAGS, STOP
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link
 from gfm_hil.links.frame import FrameReader
+from gfm_hil.links.pump import ported
 from gfm_hil.realtime.priority import stand_back
 from gfm_hil.recording.parts import Part
 
 _LOOK_S = 0.05
 
 
-def run_compiled(
+def run_loop(
     side: Side,
     bench: Bench,
     link: Link,
@@ -30,22 +31,31 @@ def run_compiled(
     timeline: Timeline,
     t0_ns: int,
     stopped: Callable[[], bool],
-    told: NDArray[np.int64],
+    flags: NDArray[np.int64] | None = None,
 ) -> FrameReader:
-    """Run one side after the handshake, over a link with a port; returns its frame counters.
+    """Run one side of a scenario after the handshake; returns its frame counters.
 
-    The thread inherits processor and priority from the caller, who then steps back to ordinary
-    priority and only looks, a few times a second, whether to stop and what to write down.
-    ``told`` is what other threads tell the loop, see ``gfm_hil.engine.loop_records``.
+    The thread inherits processor and priority from the caller. The caller then steps back to
+    ordinary priority and only looks, a few times a second, whether to stop and what to write down.
+    A link without a port gets a thread that pumps its messages.
+
+    Args:
+        flags: shape (FLAGS,), what other threads tell the loop, see
+            ``gfm_hil.engine.loop_records``.
     """
+    if flags is None:
+        flags = np.zeros(FLAGS, np.int64)
+    link = ported(link)
+    start, stop = (getattr(link, name, _nothing) for name in ("start", "stop"))
+    start()
     found: list[FrameReader] = []
     failed: list[BaseException] = []
 
     def work() -> None:
         try:
             drive = drive_plant if side == "plant" else drive_controller
-            found.append(drive(bench, link, part, timeline, t0_ns, told))
-        except BaseException as problem:  # to be raised where somebody sees it
+            found.append(drive(bench, link, part, timeline, t0_ns, flags))
+        except BaseException as problem:  # the caller's thread raises it
             failed.append(problem)
 
     timeline.put_off = True
@@ -56,13 +66,18 @@ def run_compiled(
         while thread.is_alive():
             thread.join(_LOOK_S)
             timeline.flush()
-            told[STOP] = stopped() or bool(timeline.failed)
-    finally:  # a second Ctrl-C: the thread must not outlive what it writes to
-        told[STOP] = 1
+            flags[STOP] = stopped() or bool(timeline.failed)
+    finally:  # also after a second Ctrl-C: the thread must end before its arrays go
+        flags[STOP] = 1
         while thread.is_alive():
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
         timeline.put_off = False
+        stop()
     if failed:
         raise failed[0]
     return found[0]
+
+
+def _nothing() -> None:
+    """The start and the stop of a link that has neither method."""

@@ -1,24 +1,15 @@
-"""The plant's ticks over a port: sample, send, take u, advance, until something is to be said.
+"""The plant's ticks over a link: sample, send, wait for u, advance, until Python has to act.
 
-The same rules as ``gfm_hil.engine.plant_side``, which does it in Python for links without a port.
+Lockstep: the plant waits for u[k], and sends y[k] again if nothing comes. Real time: the plant
+samples tick k at its deadline t_0 + k T_s on CLOCK_MONOTONIC, and u[k] has until the next deadline.
+A u[k] that is not there by then is a miss: the plant holds the last u, and after
+``late_policy.hold`` misses in a row it blocks.
 """
 
 from __future__ import annotations
 
-from gfm_hil.engine.loop_records import (
-    BELL,
-    DONE,
-    GONE,
-    LATE,
-    LOOK,
-    PEER_SAFE,
-    PEER_STOPPED,
-    RESTORE,
-    RING,
-    SILENT,
-    STOP,
-    STOPPED_HERE,
-)
+from gfm_hil.engine.loop_records import STOP, WAKE, Why
+from gfm_hil.engine.tick import advance, obey, sample
 from gfm_hil.links.frame import INVALID, judge, pack, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
@@ -28,14 +19,14 @@ from gfm_hil.realtime.clock import (
     sleep_until,
     wait_until,
 )
-from gfm_hil.recording.recorder import record_command, record_sample
-from gfm_plant import plant_ahead, plant_go_on, plant_sample, plant_take
-from gfm_plant.names import CONTROLLER, SAFE_STATE
+from gfm_hil.recording.recorder import record_command
+from gfm_plant import plant_is_delayed, plant_step
+from gfm_plant.names import CONTROLLER
 from gfm_plant.names import SILENT as NOT_HEARD
 from gfm_plant.protection import trip
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.signals import NU
-from gfm_runtime.states import PLANT_TRIP, READY, SAFE, STOPPED
+from gfm_runtime.states import PLANT_TRIP, SAFE
 
 _U_ID = 2
 FRESH, OVERDUE, LEAVING, CUT_OFF = range(4)
@@ -43,77 +34,65 @@ _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 
 @compiled
-def plant_ticks(
-    send, receive, patient, handle, spins, out, into, reader, loop, told, par, st, y, u, rows,
-    times, progress, last,
-):  # fmt: skip
-    """Run ticks until ``last``; returns why it came back, one of ``gfm_hil.engine.loop_records``.
+def plant_ticks(end, records, plant, last):
+    """Run ticks until ``last``; returns why it came back, a ``Why``.
 
     Args:
-        send, receive, patient, handle, spins: of the link's ``Port``.
-        out: sequence, record and bytes of the frame to send; ``into``: record and bytes to
-            receive into; see ``gfm_hil.links.frame``.
-        reader: counters of what was received.
-        loop: one-element array of ``loop_dtype``.
-        told: shape (2,), int64, what other threads tell it, see ``gfm_hil.engine.loop_records``.
-        par, st, y, u: the plant's records and the vectors of ``gfm_hil.engine.setup.Bench``.
-        rows, times, progress: of the recording's part.
+        end: ``gfm_hil.engine.loop_records.LinkEnd``.
+        records, plant: ``Records`` and ``PlantRecords`` from there.
+        last: the tick before which it stops.
     """
-    r = loop[0]
-    sequence, frame, message = out
-    got, got_bytes = into
-    ahead = plant_ahead(par)
-    # Then in lockstep the next frame leaves right after an answer, and one look at the clock does
-    # for both. The processor goes nowhere until a look is done, so two took a tenth of the tick.
-    hurried, unseen, why = ahead and not r.realtime, -1, DONE
+    loop, flags, y, u, rows, times, progress = records
+    par, st = plant
+    reader, r = end.reader, loop[0]
+    sequence, frame, message = end.out
+    delayed = plant_is_delayed(par)
+    # In lockstep a delayed plant sends its next frame right after an answer, so one reading of the
+    # clock serves both. A reading stalls the processor: two of them took a tenth of the tick.
+    hurried, unseen, why = delayed and not r.realtime, -1, Why.DONE
     while r.tick < last:
-        if told[STOP] != 0:
-            why = STOPPED_HERE
+        if flags[STOP] != 0:
+            why = Why.STOPPED_HERE
             break
-        if told[RING] != r.bell:
-            r.bell = told[RING]
-            why = BELL
+        if flags[WAKE] != r.woken:
+            r.woken = flags[WAKE]
+            why = Why.WOKEN
             break
         k = reader[0].newest = r.tick
         due = r.t0 + k * r.T
         gap = 0
         if r.realtime:
             r.unrested = 0 if due - now_ns() > AHEAD_NS else r.unrested + 1
-            gap = wait_until(due, spins)
+            gap = wait_until(due, end.spins)
             times[k, 0], times[k, 1] = due, now_ns()
-        plant_sample(par, st, y)
-        tripped = st[0].trip
+        tripped = sample(par, st, y, rows[k])
         state, reason = (SAFE, PLANT_TRIP) if tripped != 0 else (0, 0)
-        record_sample(rows[k], y, par, st)
         pack(sequence, frame, message, k, state, reason, y)
-        send(handle, message)
+        end.send(end.handle, message)
         sent = now_ns()
         times[k, 2] = sent
-        if r.realtime and spins == 0:
-            give_way()  # to the link's own thread, before a look in vain
+        if r.realtime and end.spins == 0:
+            give_way()  # to the link's own thread, before the first look
         if unseen >= 0:
             times[unseen, 3] = sent
             unseen = -1
-        if ahead:  # u[k] does not act in this period: it can come meanwhile
-            plant_go_on(par, st)
-        if r.unrested > _UNRESTED:  # or the kernel would have the whole loop rest, for 50 ms
+        if delayed:  # u[k] does not act in this period: it can come meanwhile
+            plant_step(par, st)
+        if r.unrested > _UNRESTED:  # else the kernel throttles the whole loop for 50 ms
             sleep_until(sent + _REST_NS)
             r.unrested = 0
         until = due + r.T if r.realtime else sent + r.patience
         again = sent + (r.patience if r.realtime else r.repeat)
         while True:
-            came, gap = _answer(
-                receive, patient, handle, spins, got, got_bytes, reader, r, told, u, times, k,
-                min(until, again), gap, hurried,
-            )  # fmt: skip
+            came, gap = _answer(end, r, flags, u, times, k, min(until, again), gap, hurried)
             if came != OVERDUE or again >= until:
                 break
             again = now_ns() + r.repeat
             r.repeats += 1
             pack(sequence, frame, message, k, state, reason, y)
-            send(handle, message)
+            end.send(end.handle, message)
         if came == CUT_OFF:
-            why = GONE
+            why = Why.GONE
             break
         if came == FRESH:
             if hurried:
@@ -126,17 +105,12 @@ def plant_ticks(
                 u[j] = r.u_last[j] + (r.late + 1) * (r.u_last[j] - r.u_before[j])
         record_command(rows[k], u)
         progress[0] = k + 1
-        if reader[0].state == SAFE:
-            if not r.waits:
-                why = PEER_SAFE
-                break
-            trip(st[0], CONTROLLER, SAFE_STATE)
-        if reader[0].state == STOPPED:
-            why = PEER_STOPPED
+        why = obey(st, r.waits, reader[0].state)
+        if why != Why.GO_ON:
             break
         if came != FRESH:
             if not r.realtime:
-                why = SILENT if came == OVERDUE else STOPPED_HERE
+                why = Why.SILENT if came == OVERDUE else Why.STOPPED_HERE
                 judge(reader, came == OVERDUE, True)
                 break
             r.misses += 1
@@ -145,42 +119,39 @@ def plant_ticks(
         judge(reader, r.late > r.hold, tripped != 0)
         times[k, 4] = gap
         r.tick = k + 1
-        if tripped != 0 and reader[0].state == READY and came == FRESH:
-            why = RESTORE
+        why = advance(par, st, u, delayed, tripped, reader[0].state, came == FRESH)
+        if why != Why.GO_ON:
             break
-        plant_take(par, st, u)
-        if not ahead:
-            plant_go_on(par, st)
         if r.waits and reader[0].e2e == INVALID:
             trip(st[0], CONTROLLER, NOT_HEARD)
         if st[0].trip != tripped:
-            why = LOOK
+            why = Why.CHANGED
             break
         if r.late * r.T >= r.patience:
             judge(reader, True, True)
-            why = SILENT
+            why = Why.SILENT
             break
         if reader[0].e2e == INVALID and not r.waits:
-            why = LATE
+            why = Why.LATE
             break
+        why = Why.DONE
     if unseen >= 0:
         times[unseen, 3] = now_ns()
     return why
 
 
 @inlined
-def _answer(
-    receive, patient, handle, spins, got, got_bytes, reader, r, told, u, times, k, until, gap,
-    hurried,
-):  # fmt: skip
-    """Wait for u[k]: whether it is FRESH, OVERDUE or not awaited any more (LEAVING), and the
-    longest gap between two looks at the clock. Whoever is hurried looks at the clock later."""
+def _answer(end, r, flags, u, times, k, until, gap, hurried):
+    """Wait for u[k]: whether it is FRESH, OVERDUE or no longer awaited (LEAVING), and the longest
+    gap between two looks at the clock. A ``hurried`` loop looks at the clock later."""
+    got, got_bytes = end.into
+    reader = end.reader
     before = times[k, 2]
     looks = 0
     while True:
-        size = receive(handle, got_bytes)
-        if size <= 0 and looks > r.looks and not r.realtime:
-            size = patient(handle, got_bytes)
+        size = end.receive(end.handle, got_bytes)
+        if size <= 0 and looks > r.spin_limit and not r.realtime:
+            size = end.patient(end.handle, got_bytes)
         if size > 0:
             tick = unpack(reader, _U_ID, got, got_bytes, size, u)
             # a controller that leaves says so under the last tick it saw
@@ -195,13 +166,13 @@ def _answer(
         elif size < 0:
             return CUT_OFF, gap
         looks += 1
-        if looks % r.clock_every == 0 or looks > r.looks:
+        if looks % r.clock_every == 0 or looks > r.spin_limit:
             now = now_ns()
             gap = max(gap, now - before)
             before = now
             if now >= until:
                 return OVERDUE, gap
         if size <= 0:
-            if not r.realtime and told[STOP] != 0:
+            if not r.realtime and flags[STOP] != 0:
                 return LEAVING, gap
-            between_looks(looks, spins)
+            between_looks(looks, end.spins)

@@ -1,4 +1,4 @@
-"""One side as a process of its own: ready the bench, meet the other side, run, keep everything."""
+"""One role as a process of its own: set up the bench, shake hands, run, record."""
 
 from __future__ import annotations
 
@@ -16,17 +16,15 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import Side
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.command_server import Desk
-from gfm_hil.engine.controller_side import run_controller
+from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.drive import compile_loops
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.engine.loop_records import RING, TOLD
-from gfm_hil.engine.loop_thread import run_compiled
-from gfm_hil.engine.plant_side import run_plant
+from gfm_hil.engine.loop_records import FLAGS, WAKE
+from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.links import Link, open_link
+from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.realtime.prevent_idle import kept_awake
@@ -36,7 +34,7 @@ from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
-from gfm_plant import plant_go_on, plant_sample, plant_take
+from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import names
 
@@ -51,7 +49,7 @@ def run_side(
         (frame counters) are in ``folder``.
 
     Raises:
-        UserError: the endpoint is not to be had, or the scenario has no operating point.
+        UserError: the endpoint cannot be opened, or the scenario has no operating point.
     """
     assert scenario.link.endpoint is not None
     with Interrupt() as interrupt:
@@ -68,23 +66,23 @@ def _run(
 ) -> Outcome:
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "scenario.toml").exists():  # a side alone; observers want to know what it runs
+    if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
         write_text(folder / "scenario.toml", scenario_toml(scenario))
     if scenario.mode == "realtime":
         keep_in_memory(folder, scenario.ticks, notice)
     part = Part.create(folder, side, scenario.ticks)
     compile_side(side, bench, part)
     timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
-    told = np.zeros(TOLD, np.int64)
+    flags = np.zeros(FLAGS, np.int64)
 
-    def ring() -> None:
-        told[RING] += 1
+    def wake() -> None:
+        flags[WAKE] += 1
 
-    # the desk comes first: its threads must not inherit the rights that the loop asks for
-    with Desk(side, bench, timeline, folder, ring, interrupt.ask):
+    # the command server first: its threads must not inherit the loop's priority
+    with CommandServer(side, bench, timeline, folder, wake, interrupt.ask):
         try:
-            seen = _meet_and_run(side, bench, endpoint, part, timeline, told, interrupt, notice)
-            with contextlib.suppress(OSError):  # on a full disk these counts are lost, no more
+            seen = _meet_and_run(side, bench, endpoint, part, timeline, flags, interrupt, notice)
+            with contextlib.suppress(OSError):  # a full disk costs these counts and nothing else
                 write_text(folder / f"link_{side}.json", json.dumps({"side": side, **seen}))
         except PeerLost as problem:
             timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
@@ -100,15 +98,15 @@ def _meet_and_run(
     endpoint: str,
     part: Part,
     timeline: Timeline,
-    told: NDArray[np.int64],
+    flags: NDArray[np.int64],
     interrupt: Interrupt,
     notice: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Open the link, meet the other side, run; returns what the link saw.
+    """Open the link, meet the other side, run; returns what the link counted.
 
     Raises:
-        PeerLost: there was nobody to run with.
-        UserError: the endpoint is not to be had.
+        PeerLost: the other side did not come.
+        UserError: the endpoint cannot be opened.
     """
     scenario = bench.scenario
     rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
@@ -121,9 +119,9 @@ def _meet_and_run(
     resources = ExitStack()
     try:
         if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
-            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: not after START
+            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: before START
         if rights is not None:
-            if link.port is None:  # a loop in Python never sleeps
+            if good.port is None:  # a thread in Python pumps its messages, and hardly ever sleeps
                 rights["policy"] = ordinary_priority()
             else:
                 awake = kept_awake(rights["processor"], scenario.keep_awake)
@@ -133,26 +131,23 @@ def _meet_and_run(
         notify(f"STATUS=waiting for the other side at {endpoint}")
         start = shake_hands(side, good, scenario, stopped, notice)
         with Watched(scenario, part.progress):
-            if link.port is not None:
-                reader = run_compiled(side, bench, link, part, timeline, start.t0_ns, stopped, told)
-            else:
-                run = run_controller if side == "controller" else run_plant
-                reader = run(bench, link, part, timeline, start.t0_ns, stopped)
+            reader = run_loop(side, bench, link, part, timeline, start.t0_ns, stopped, flags)
     finally:
         resources.close()
         link.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
-    counted = getattr(good, "counters", {})  # of a link that sees more than whole messages
+    counted = getattr(good, "counters", {})  # of a link in several frames a message
     faults = {**reader.faults, **counted, "refused_greetings": start.refused}
-    return {"faults": faults, "e2e": reader.e2e, "one_clock": start.one_clock, **injected}
+    met = {"one_clock": start.one_clock, "run": start.run, "controller": start.controller}
+    return {"faults": faults, "e2e": reader.e2e, **met, **injected}
 
 
 def compile_side(side: Side, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
     par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
     plant_sample(par, st, y)
-    plant_go_on(par, st)
-    plant_take(par, st, u)
+    plant_step(par, st)
+    plant_command(par, st, u)
     warm_up(bench.controller)
     for group in DATA_IDS:
         values = np.zeros(len(names(group)))
@@ -160,6 +155,7 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
         reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
         reader.judge(False, False)
     compile_loops(side, bench, part)
+    pump.warm_up()
     if side == "plant":
         record_sample(part.signals[0].copy(), y, par, st)
         record_command(part.signals[0].copy(), u)

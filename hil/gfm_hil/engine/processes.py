@@ -1,4 +1,4 @@
-"""Both sides as processes of their own: started, watched to their end, never left behind."""
+"""Starts controller and plant as processes, watches them to their end, and leaves none behind."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.process import compile_side
-from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import link_kind
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
@@ -27,7 +25,7 @@ from gfm_hil.scenario.model import Scenario
 Progress = Callable[[int, int], None]
 
 _LOOK_S = 0.05
-_GRACE_S = 2.0  # how long a side may take to end once it should, beyond link.peer_timeout_s
+_GRACE_S = 2.0  # time that a side gets to end, beyond link.peer_timeout_s
 
 
 @dataclass
@@ -55,15 +53,12 @@ class Processes:
         """Start both, watch them to their end.
 
         Returns:
-            When the first tick was run (``time.monotonic``), and how it ended for a side that did
-            not live to say so itself.
+            When the first tick ran (``time.monotonic``), and how a killed side ended that could not
+            say so itself.
 
         Raises:
-            UserError: a side refused to start, as for an endpoint that is occupied.
+            UserError: a side refused to start, for example because the endpoint is occupied.
         """
-        self._compile_once()
-        if self.interrupt.came:
-            return time.monotonic(), self._interrupted
         with contextlib.ExitStack() as stack:
             endpoint = self.scenario.link.endpoint
             if endpoint is None:  # a Unix socket's path may hold 107 bytes, so not the run folder
@@ -87,14 +82,6 @@ class Processes:
     def _interrupted(self) -> Outcome:
         return Outcome("interrupted", "stopped by the operator", 0)
 
-    def _compile_once(self) -> None:
-        """Fill numba's cache here, so that two processes do not compile the same at a time."""
-        self.notice("compiling the kernels (once a machine) …")
-        bench = make_bench(self.scenario)
-        with scratch.temporary("gfmhil-run-") as place:
-            for side in ("plant",) if self.controller_command else SIDES:
-                compile_side(side, bench, Part.create(place, side, 1))
-
     def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
         folder = self.folder.absolute()  # a name such as "--" must not look like an option
         scenario = str(folder / "scenario.toml")
@@ -109,7 +96,7 @@ class Processes:
             ]
         with self._log(side).open("wb") as log:
             try:
-                # own session: Ctrl-C reaches the sides through us, once
+                # a session of its own: Ctrl-C reaches the process through us, once
                 return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
             except OSError as problem:
                 raise UserError(f"{command[0]}: cannot be started: {problem.strerror}") from None
@@ -118,7 +105,7 @@ class Processes:
         return self.folder / f"{side}.log"
 
     def _watch(self) -> float:
-        """Wait until both have ended; a side that outlives its time is told to stop, then killed.
+        """Wait until both have ended; stop and then kill a side that takes too long.
 
         A side ends by itself when the other one says goodbye or falls silent, but not while it
         still waits for its handshake.
@@ -156,7 +143,7 @@ class Processes:
                 process.send_signal(number)
 
     def _crash(self, side: Side) -> str:
-        """How a side ended if not by itself."""
+        """How a side ended that did not end by itself."""
         code = self._sides[side].returncode
         if code < 0:
             return f"the {side} was ended by {signal.Signals(-code).name}"

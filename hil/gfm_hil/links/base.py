@@ -22,14 +22,15 @@ class Link(Protocol):
     A message is delivered whole or not at all, and in order. Nothing is queued without bound:
     a message that the peer has no room for is dropped, and ``send`` says so.
 
-    A link may have two more methods, which the handshake calls where they are: ``again()`` reaches
-    out anew to a peer that has not come, and ``connected()`` says whether a peer is at the other
-    end, with None where the link cannot know it.
+    A link may have more methods. The handshake calls ``again()``, which reaches out anew to a peer
+    that has not come, and ``connected()``, which says whether a peer is at the other end, with None
+    where the link cannot know it. The loop calls ``start()`` before its first tick and ``stop()``
+    after its last message.
     """
 
     @property
     def port(self) -> Port | None:
-        """The same end for compiled loops, or None: the loops then run in Python."""
+        """The same end for the compiled loops, or None: a thread then pumps its messages."""
 
     def send(self, message: bytes) -> bool:
         """Hand a message over; False if it had to be dropped."""
@@ -58,6 +59,10 @@ def _may(endpoint: str | None, options: Any) -> None:
     """Any endpoint with any options."""
 
 
+def _nothing(options: Any) -> None:
+    """A link that compiles nothing."""
+
+
 @dataclass(frozen=True)
 class LinkKind:
     """What the bench knows of a link before it opens one.
@@ -73,6 +78,7 @@ class LinkKind:
         check: sees that options fit the sampling time in s; raises ValueError in one line.
         check_both: sees that an endpoint (None: a fresh one) may be used with options; raises
             ValueError likewise.
+        warm_up: compiles, or loads from numba's cache, what an end with these options calls.
         exact: float64 arrives as sent, so that results are those of a run in process.
     """
 
@@ -85,6 +91,7 @@ class LinkKind:
     options: type[LinkOptions] = LinkOptions
     check: Callable[[Any, float], None] = _fits
     check_both: Callable[[str | None, Any], None] = _may
+    warm_up: Callable[[Any], None] = _nothing
     exact: bool = True
 
     def check_endpoint(self, endpoint: str) -> None:

@@ -146,6 +146,7 @@ def _table() -> dict[str, Described]:
             "true_delta", r"\delta", "rad",
             "angle of the converter's frame ahead of the grid's", _TRUE,
         ),
+        Described("true_i_dc", "i_{dc}", "p.u. (S_n/V_dcref)", "current of the DC source", _TRUE),
         Described(
             "true_trip", "", "", "what has tripped", _TRUE, tuple(TRIP_REASONS.items())
         ),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.roles import OUR_CONTROLLER
 from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
 from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
@@ -197,12 +198,19 @@ class RecordedRun:
 
     def __repr__(self) -> str:
         reason = f" ({self.summary['reason']})" if self.summary["reason"] else ""
-        laws = " → ".join(self.summary["laws"])
         where = f", {self.folder}" if self.folder is not None else ""
         return (
-            f"<Run {self.scenario.title!r}: {laws}, {self.status}{reason}, "
+            f"<Run {self.scenario.title!r}: {controlled_by(self.summary)}, {self.status}{reason}, "
             f"{self.summary['duration_s']:g} s in {self.summary['ticks']} ticks{where}>"
         )
+
+
+def controlled_by(summary: Mapping[str, Any]) -> str:
+    """The laws of a run, or what a controller that is not ours calls itself."""
+    name = summary.get("controller", OUR_CONTROLLER)
+    if name == OUR_CONTROLLER:
+        return " → ".join(summary["laws"])
+    return name or "a controller that gave no name"
 
 
 def nominal_frequency(scenario: Scenario) -> float:

@@ -1,7 +1,8 @@
-"""The folder of a run: whether it may be used, and what is in it in the end.
+"""The folder of a run: whether it may be used, and how its files are made.
 
-``summary.json`` is written last. While it is not there, the folder still holds all that the other
-files are made of, and ``recover`` can make them again.
+``summary.json`` is written last. While it is missing, the folder still holds all that the other
+files are made of, and ``recover`` can make them again. ``merge_sides`` makes one folder of the two
+that the sides of a run leave if they were started apart.
 """
 
 from __future__ import annotations
@@ -16,17 +17,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.columns import BYTES_PER_TICK
-from gfm_hil.recording.log import Outcome, read_events, worst
+from gfm_hil.recording.columns import BYTES_PER_TICK, Columns
+from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
+from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.parts import remove_parts
 from gfm_hil.recording.run import read_recording
 from gfm_hil.results.run import Run
-from gfm_hil.results.summary import summarise
+from gfm_hil.results.summary import origin, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
@@ -184,27 +190,116 @@ def _complete(
     signals, timing, labels = read_recording(folder)
     log = read_events(folder)
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
-    outcome = worst(log, outside)
-    summary = summarise(scenario, signals, timing, log, outcome, _link_ends(folder), wall_s)
-    if figures and len(signals["tick"]):
+    links = _link_ends(folder)
+    summary = summarise(scenario, signals, timing, log, worst(log, outside), links, wall_s)
+    summary |= origin(scenario, (folder / "scenario.toml").stat().st_mtime)
+    summary["run"] = next((end["run"] for end in links.values() if "run" in end), None)
+    run = Run(scenario, summary, signals, labels, log, folder, timing)
+    _conclude(run, figures)
+    return run
+
+
+def _link_ends(folder: Path) -> dict[Side, dict[str, Any]]:
+    """What each side wrote about its end of the link: the faults that it counted, the state of the
+    end-to-end protection, whether both sides share a clock, the number of the run, what the
+    controller calls itself, and the faults injected on purpose."""
+    ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
+    return {end["side"]: end for end in ends}
+
+
+def merge_sides(first: Path, second: Path, folder: Path) -> Run:
+    """Put what the two sides of a run left, each in a folder of its own, into one run folder.
+
+    Rows end where the plant's recording does, as in a run whose sides were started together.
+
+    Args:
+        first, second: the finished folders of controller and plant, in any order; they stay.
+        folder: new or empty.
+
+    Raises:
+        UserError: a folder is not that of one side, they are not of the same run, or ``folder``
+            is in use or cannot be written.
+    """
+    sides: dict[Side, Run] = {}
+    for run in (Run.load(first), Run.load(second)):
+        recorded = [s for s, one in zip(SIDES, ("ref_P_ref", "true_p"), strict=True)
+                    if one in run.columns]  # fmt: skip
+        if len(recorded) != 1:
+            said = " and ".join(recorded) or "neither side"
+            raise UserError(f"{run.folder}: holds the recording of {said}, not of one side alone")
+        if recorded[0] in sides:
+            raise UserError(f"{first}, {second}: both are of the {recorded[0]}")
+        sides[recorded[0]] = run
+    plant, controller = sides["plant"], sides["controller"]
+    ids = [run.summary.get("run") for run in (plant, controller)]
+    if ids[0] is None or ids[0] != ids[1]:
+        raise UserError(f"{first}, {second}: are not of the same run: run = {ids[0]!r}, {ids[1]!r}")
+    done = plant.summary["ticks"]
+    check_free(folder, done)
+    log = read_log(*(run.file("events.jsonl") for run in sides.values()))
+    links = {
+        side: _link_end(side, sides[side].summary)
+        for side in SIDES
+        if side in sides[side].summary["faults"]
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(plant.file("scenario.toml"), folder)
+        write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
+        own = {k: v for k, v in controller.columns.items() if k not in ("tick", "t")}
+        laws = Table.of(laws=np.array(controller.laws))
+        tables = [_padded(plant.columns, done, np.nan), _padded(own, done, np.nan), laws]
+        write_npz(folder / "signals.npz", tables)
+        times = [_padded(run.timing, done, -1) for run in (plant, controller)]
+        write_npz(folder / "timing.npz", times)
+        signals, timing, labels = read_recording(folder)
+        wall_s = plant.summary["wall_s"]
+        summary = summarise(plant.scenario, signals, timing, log, worst(log, None), links, wall_s)
+        summary |= {key: plant.summary[key] for key in ("date", "version", "run")}
+        summary["machines"] = controller.summary["machines"] | plant.summary["machines"]
+        whole = Run(plant.scenario, summary, signals, labels, log, folder, timing)
+        _conclude(whole, figures=True)
+    except OSError as problem:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise UserError(f"{folder}: {problem.strerror or problem}") from None
+    return whole
+
+
+def _link_end(side: Side, summary: dict[str, Any]) -> dict[str, Any]:
+    """What ``_link_ends`` gives of a side, from the summary of that side alone."""
+    keys = ("faults", "e2e", "injected")
+    kept = {key: summary[key][side] for key in keys if side in summary.get(key, {})}
+    one_clock = "clock_drift_ppm" not in summary
+    return {**kept, "one_clock": one_clock, "controller": summary["controller"]}
+
+
+def _padded(columns: Columns, rows: int, missing: float) -> Table:
+    """Columns of one side, cut or filled up with ``missing`` to ``rows``."""
+
+    def read(first: int, last: int) -> Iterator[NDArray[Any]]:
+        for column in columns.values():
+            found = column[first : min(last, len(column))]
+            rest = np.full(last - first - len(found), missing, found.dtype)
+            yield np.concatenate([found, rest])
+
+    return Table({name: column.dtype for name, column in columns.items()}, rows, read)
+
+
+def _conclude(run: Run, figures: bool) -> None:
+    """Draw a run's figures, write its report and then its summary, and remove what is left over."""
+    assert run.folder is not None
+    folder, scenario, summary = run.folder, run.scenario, run.summary
+    if figures and summary["ticks"]:
         # a second of imports, which the sides' processes do without
         from gfm_hil.results.figures import draw_run
         from gfm_hil.results.report import write_report
 
-        pictures = draw_run(folder, scenario, signals, timing, summary)
+        pictures = draw_run(folder, scenario, run.columns, run.timing, summary)
         write_report(folder, scenario, summary, pictures)
     sync_folder(folder)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     sync_folder(folder)
     _clear(folder)
-    return Run(scenario, summary, signals, labels, log, folder, timing)
-
-
-def _link_ends(folder: Path) -> dict[str, dict[str, Any]]:
-    """What each side wrote about its end of the link: the faults that it counted, the state of the
-    end-to-end protection, whether both sides share a clock, the faults injected on purpose."""
-    ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
-    return {end["side"]: end for end in ends}
 
 
 def _clear(folder: Path) -> None:

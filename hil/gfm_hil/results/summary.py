@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
+import math
+import platform
 from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from gfm_hil.core.roles import OUR_CONTROLLER, Side
 from gfm_hil.recording.columns import Columns
-from gfm_hil.recording.log import Outcome
+from gfm_hil.recording.log import Outcome, cause
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.recording.timing import ROUND_TRIP, count_misses
+from gfm_hil.results.doctor import verdict
 from gfm_hil.results.metrics import event_metrics
-from gfm_hil.scenario.expectation import unmet
+from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
 
 _BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
+_FAULTS = ("tripped", "safe")
+#: metrics of where a response ends, which a response that a trip cuts short does not have
+END_METRICS = ("p_final", "settling_s", "overshoot_pct")
+_STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
+
+
+def origin(scenario: Scenario, began: float) -> dict[str, Any]:
+    """Where a recording comes from: date (UTC), version, this machine and the doctor's verdict.
+
+    Args:
+        scenario: in lockstep nothing depends on the machine, so there is no verdict.
+        began: when the run began, s since 1970.
+    """
+    judged = verdict() if scenario.mode == "realtime" else None
+    return {
+        "date": datetime.fromtimestamp(began, UTC).isoformat(timespec="seconds"),
+        "version": version("gfmhil"),
+        "machines": {platform.node(): judged},
+    }
 
 
 def summarise(
@@ -25,35 +50,49 @@ def summarise(
     timing: Columns,
     log: list[dict[str, Any]],
     outcome: Outcome,
-    links: Mapping[str, dict[str, Any]],
+    links: Mapping[Side, dict[str, Any]],
     wall_s: float,
 ) -> dict[str, Any]:
-    """The summary of one run as plain data.
+    """The summary of one run as plain data; None where the recording does not say.
 
     Args:
-        scenario: of the run.
-        signals, timing: the columns of the files of these names, read piece by piece.
-        log: lines of events.jsonl.
-        outcome: how the run ended.
+        scenario, outcome, log: of the run.
+        signals, timing: the columns of the files of these names, read piece by piece. A side that
+            recorded nothing has no columns.
         links: what each side wrote about its end of the link (``link_<side>.json``), by side;
             empty for a run in one process.
-        wall_s: how long it took, s.
+        wall_s: how long the run took, s.
     """
     done = len(signals["tick"])
+    controller: str | None = OUR_CONTROLLER
+    for end in links.values():
+        controller = end.get("controller", OUR_CONTROLLER)
+    plant, ours = "true_p" in signals, "ref_P_ref" in signals
+    trips = _trips(log, outcome, done, scenario.T_s)
     changes = [e for e in log if e["event"] == "law-active"]
     happened = [e for e in log if "label" in e]
     bumps = {e["tick"]: e["bump_pu"] for e in changes}
     starts = np.array([e["tick"] for e in happened])  # in order, as the log is
     ends = [*np.searchsorted(starts, starts, side="right").tolist()]
     f_n = nominal_frequency(scenario)
+    laws = [scenario.law, *[e["law"] for e in changes]]
     events = []
     for k, e in enumerate(happened):
         stop = int(starts[ends[k]]) if ends[k] < len(starts) else done
         entry = {"t": e["t"], "tick": e["tick"], "type": e["event"], "label": e["label"]}
         if e["event"] == "law":
             entry["bump_pu"] = bumps.get(e["tick"])
-        if "true_p" in signals:
-            entry.update(event_metrics(signals, e["tick"], min(stop, done), scenario.T_s, f_n))
+        if plant:
+            stop = min(stop, done)
+            trip = next((x for x in trips if x["until"] > e["tick"]), None)
+            if trip is not None and (trip["tick"] < stop or stop == done):
+                stop = min(stop, trip["tick"])
+                entry["cut_short"] = f"{reason_name(trip['reason'])} at {trip['t']:g} s"
+            entry.update(event_metrics(signals, e["tick"], stop, scenario.T_s, f_n))
+            if "cut_short" in entry:
+                entry.update(dict.fromkeys(END_METRICS))
+            if e["event"] not in _STEPS:
+                entry["overshoot_pct"] = None
         events.append(entry)
     summary = {
         "title": scenario.title,
@@ -61,20 +100,22 @@ def summarise(
         "reason": outcome.reason,
         "expected": scenario.expect,
         "unmet": unmet(scenario, outcome, log, done),
-        "laws": [scenario.law, *[e["law"] for e in changes]],
+        "controller": controller,
+        "laws": laws if controller == OUR_CONTROLLER else [],
         "link": scenario.link.type,
         "mode": scenario.mode,
         "T_s": scenario.T_s,
         "ticks": done,
         "duration_s": done * scenario.T_s,
         "wall_s": wall_s,
-        "misses": count_misses(timing, done),
+        "misses": count_misses(timing, done) if plant else None,
         "round_trip_us": _round_trip(timing, scenario.T_s),
         "faults": {
             side: {k: n for k, n in end["faults"].items() if n} for side, end in links.items()
         },
         "e2e": {side: end["e2e"] for side, end in links.items()},
-        "bump_pu": [e["bump_pu"] for e in changes],
+        "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
+        "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
         "events": events,
     }
     injected = {side: end["injected"] for side, end in links.items() if "injected" in end}
@@ -91,6 +132,35 @@ def _round_trip(timing: Columns, T_s: float) -> dict[str, float] | None:
     if not timing.keys() >= {*ROUND_TRIP.needs}:
         return None
     return ROUND_TRIP.spread(timing, T_s).percentiles_us() or None
+
+
+def _trips(
+    log: list[dict[str, Any]], outcome: Outcome, done: int, T_s: float
+) -> list[dict[str, Any]]:
+    """Every trip and safe state of a run: tick, t in s, reason, and the tick ``until`` which it
+    lasted. The reason is that of the side to which it happened."""
+    found: list[dict[str, Any]] = []
+    open_sides: set[str] = set()
+    for e in log:
+        begins = e["event"] in _FAULTS or (e["event"] == "end" and e["status"] in _FAULTS)
+        if begins and open_sides:
+            found[-1]["reason"] = cause([found[-1]["reason"], e["reason"]])
+        elif begins:
+            found.append({"tick": e["tick"], "reason": e["reason"], "until": math.inf})
+        if begins:
+            open_sides.add(e.get("side", ""))
+        elif e["event"] == "recovered":
+            open_sides.discard(e.get("side", ""))
+            if not open_sides:
+                found[-1]["until"] = e["tick"]
+    if outcome.status in _FAULTS:
+        if not open_sides:  # no side lived to write it down
+            found.append({"tick": done, "until": math.inf})
+        found[-1]["reason"] = outcome.reason
+    for trip in found:
+        trip["tick"] = min(trip["tick"], done)
+        trip["t"] = round(trip["tick"] * T_s, 9)
+    return found
 
 
 def clock_drift(timing: Columns, T_s: float) -> float | None:

@@ -72,10 +72,7 @@ def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
     for start, stop in ((0, _BEFORE), (_BEFORE, ticks)):
         if start:
             c.set("P_ref", STEP[1])
-        done = run_ticks(
-            bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u,
-            signals, references, start, stop, False,
-        )  # fmt: skip
+        done = run_ticks(bench, signals, references, start, stop)
         if bench.st["trip"][0] or c.ctl["state"][0] == SAFE:
             tripped = bool(bench.st["trip"][0])
             why = trip_reason(bench.st, bench.par) if tripped else safe_reason(c.ctl)

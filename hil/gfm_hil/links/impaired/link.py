@@ -25,6 +25,7 @@ from gfm_hil.links.impaired.stage import (
     waiting,
 )
 from gfm_hil.links.port import Port, port_function
+from gfm_hil.links.pump import PumpedLink, ported
 
 
 class ImpairedLink:
@@ -37,10 +38,11 @@ class ImpairedLink:
     """
 
     def __init__(self, link: Link, settings: Impairment, side: Side) -> None:
-        self._link = link
+        self._link = ported(link)
         self._stage = make_stage(settings, SIDES.index(side))
         self._message = np.zeros(LONGEST, np.uint8)
-        self.port = None if link.port is None else _port(link.port, self._stage)
+        assert self._link.port is not None
+        self.port = _port(self._link.port, self._stage)
 
     @property
     def injected(self) -> dict[str, int]:
@@ -68,9 +70,28 @@ class ImpairedLink:
         """Sleep until a message arrives underneath, shortly at most: one may be due by itself."""
         return self._link.wait(min(seconds, 0.001))
 
+    def start(self) -> None:
+        """Start the thread of a link underneath that needs one."""
+        if isinstance(self._link, PumpedLink):
+            self._link.start()
+
+    def stop(self) -> None:
+        """Stop it."""
+        if isinstance(self._link, PumpedLink):
+            self._link.stop()
+
     def close(self) -> None:
         """As the link underneath."""
         self._link.close()
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) the stage; the functions around it are compiled anew in
+    every process."""
+    stage, message = make_stage(Impairment(delay=1e-6), 0), np.zeros(LONGEST, np.uint8)
+    admit(stage, message, 1)
+    release(stage, message)
+    waiting(stage)
 
 
 @intrinsic
@@ -89,7 +110,7 @@ _as_pointer: Any = _pointer
 def _port(inner: Port, stage: np.ndarray) -> Port:
     """The port of an impaired link: the stage as its handle, with the one underneath in it."""
     stage[INNER], stage[INNER_WORDS] = inner.handle.ctypes.data, len(inner.handle)
-    return Port(stage, *_functions(inner.send, inner.receive), inner.spins, None, inner.looks)
+    return Port(stage, *_functions(inner.send, inner.receive), inner.spins, None, inner.spin_limit)
 
 
 @cache

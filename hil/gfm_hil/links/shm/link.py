@@ -8,9 +8,10 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Side
+from gfm_hil.links import ring
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
-from gfm_hil.links.shm import ring, segment
+from gfm_hil.links.shm import segment
 
 _SPINS = 200  # looks, about 10 µs; on one processor the peer then needs it
 _FIRST_S, _LONGEST_S = 50e-6, 1e-3  # sleeps of a wait, from the first to the longest
@@ -36,6 +37,7 @@ class ShmLink:
         self._handle = np.zeros(ring.HANDLE, np.int64)
         self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
+        ring.warm_up()
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 

@@ -19,13 +19,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gfm_hil.core import temporary as scratch
-from gfm_hil.links.shm.ring import RING
+from gfm_hil.links.ring import RING
 
 FOLDER = Path("/dev/shm")  # of shm_open(3) on Linux
 PREFIX = "gfmhil-link-"
 
 MAGIC = b"GFMHILSM"
-VERSION = 1  # of everything below and of ring.py
+VERSION = 1  # of everything below and of links/ring.py
 
 # Header, int64: magic, version, the owner's identity; the plant's; then each ring's head. All that
 # one side writes in a run is 128 bytes from what the other does: processors fetch lines in pairs.
