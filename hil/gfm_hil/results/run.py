@@ -22,7 +22,7 @@ _NOT_METRICS = ("t", "tick", "type", "label")
 
 
 class Run(RecordedRun):
-    """A finished run, in memory or in a folder, see ``RecordedRun``."""
+    __doc__ = RecordedRun.__doc__
 
     @property
     def metrics(self) -> dict[str, dict[str, Any]]:
