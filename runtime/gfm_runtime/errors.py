@@ -7,7 +7,7 @@ class LawError(ValueError):
     """A law, one of its elements or one of its parameters is not usable.
 
     Args:
-        where: what is wrong, e.g. ``"phi_22"``, ``"parameter H"``, ``"law file x.toml"``.
+        where: the faulty item, e.g. ``"phi_22"``, ``"parameter H"``, ``"law file x.toml"``.
         why: the value found and what is allowed.
     """
 

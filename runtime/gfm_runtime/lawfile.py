@@ -80,7 +80,7 @@ class ParameterSpec(_Model):
 
 
 class ErrorMapSpec(_Model):
-    """What Phi(s) acts on; R and X (p.u.) only for hybrid-angle."""
+    """The errors on which Phi(s) acts; R and X (p.u.) only for hybrid-angle."""
 
     type: str = "linear"
     R: Number | None = None
@@ -204,10 +204,10 @@ def _cells(
 
 
 def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
-    """The law of a file, with some of its parameters changed if wanted.
+    """The law of a file, with other values for some of its parameters if given.
 
     Raises:
-        LawError: an element, parameter, set-point or limit that cannot be; it is named.
+        LawError: an invalid element, parameter, set-point or limit, by its name.
     """
     numbers = {name: spec.value for name, spec in file.parameters.items()}
     for name, value in (changed or {}).items():
@@ -272,7 +272,7 @@ def read_law_file(path: str | Path) -> LawFile:
 
 
 def _lines(errors: list[Any]) -> list[str]:
-    """One part a mistake, of at most ``_SHOWN`` of them."""
+    """One part for each mistake, at most ``_SHOWN`` of them."""
     shown = [
         f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r:.200})"
         for e in errors[:_SHOWN]
