@@ -100,7 +100,7 @@ def stored(folder: Path) -> list[str]:
     return [head, *sorted(lines, key=lambda s: (json.loads(s)["run"], json.loads(s)["law"]))]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
     arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "one")]
     assert main([*arguments, "--workers", "1", "--quiet"]) == 0
@@ -109,7 +109,7 @@ def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
     assert stored(whole / "one") == lines
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_resumed_campaign_equals_an_uninterrupted_one(whole: Path, tmp_path: Path) -> None:
     folder = tmp_path / "resumed"
     shutil.copytree(whole / "two", folder)
@@ -170,7 +170,7 @@ def test_folder_of_a_campaign(whole: Path) -> None:
         assert len(found["worst"]) == 5
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> None:
     arguments = ["campaign", str(whole / "small.toml"), "--only", "5"]
     assert main([*arguments, "--out", str(tmp_path / "alone")]) == 0
@@ -184,7 +184,7 @@ def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> Non
         assert result["status"] == record["status"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_dask_gives_the_same_bits(whole: Path) -> None:
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
@@ -208,7 +208,7 @@ def test_dask_without_the_package_says_so(
     assert not out.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]) -> None:
     campaign = load_campaign(str(file(**{"runs = 10": "runs = 2000"})))
     jobs = [(run, "mimo-gfm") for run in range(2000)]
@@ -240,7 +240,7 @@ def test_an_error_in_a_run_names_the_run(
         execute(campaign, [(7, "vsg-2")], pool, 1, lambda records: None, lambda: False)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_ctrl_c_keeps_what_is_there(file: Callable[..., Path], tmp_path: Path) -> None:
     path, out = file(**{"runs = 10": "runs = 2000"}), tmp_path / "out"
     command = [sys.executable, "-m", "gfm_hil", "campaign", str(path), "--out", str(out)]

@@ -1,4 +1,4 @@
-"""Which desks there are in a run folder; a killed side leaves its announcement behind."""
+"""Which command servers a run folder announces; a killed process leaves its file behind."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LARGEST = 65536  # bytes of a command, and of its answer
 
 
 class _Law(BaseModel):
-    """A law that the recording's indices mean."""
+    """A law to which the recording's law indices refer."""
 
     label: str
     name: str
@@ -33,15 +33,15 @@ class Announcement(BaseModel):
 
 
 def announcement(folder: Path, side: Side) -> Path:
-    """Where a side's desk says how it is reached."""
+    """The file in which a role's command server says how to reach it."""
     return folder / f"desk_{side}.json"
 
 
 def announced(folder: Path, side: Side) -> dict[str, Any] | None:
-    """What a side's desk announces, or None if there is none that lives.
+    """What a role's command server announces, or None if no living process has one.
 
     Raises:
-        UserError: it cannot be told whether there is one; that says nothing about the run.
+        UserError: the file or process cannot be examined; the run itself may be fine.
     """
     file = announcement(folder, side)
     try:
@@ -57,9 +57,9 @@ def announced(folder: Path, side: Side) -> dict[str, Any] | None:
 
 
 def present(folder: Path) -> list[Side]:
-    """The sides that have a desk that lives.
+    """The roles whose command server is alive.
 
     Raises:
-        UserError: it cannot be told whether a side has one.
+        UserError: a file or process cannot be examined.
     """
     return [side for side in SIDES if announced(folder, side) is not None]

@@ -1,8 +1,8 @@
-"""Where an operator's commands reach a side that is running: a socket of its own, off the loop.
+"""Takes an operator's commands for a running process on a socket of its own, off the loop.
 
-A command is an event of a scenario without its time. It is checked here, in a thread that the
-loop never waits for; a good one is put into the timeline and the loop's bell is rung, so that it
-is carried out between two ticks. The answer names that tick. ``by`` in the command says who gives
+A command is an event of a scenario without its time. A thread that the loop never waits for checks
+it, puts a good one into the timeline and wakes the loop, which carries it out between two ticks.
+The answer names that tick. ``by`` in the command says who gives
 it (see ``Identity``), and the log of the run records that. The socket is a ZeroMQ REP on a Unix
 path in a folder that only this user can read; ``desk_<side>.json`` in the run folder names it.
 """
@@ -40,22 +40,22 @@ from gfm_hil.scenario.events import (
 )
 
 _LOOK_MS = 100
-_TAKEN_OVER_S = 5.0  # in lockstep a tick may take as long as the other side likes
+_TAKEN_OVER_S = 5.0  # in lockstep a tick lasts until the other side answers
 _ROOM = 16  # commands that wait, of one operator
 _PER_S, _BURST = 100.0, 200  # commands to one side, of all operators together
 
 _EVENT: TypeAdapter[Any] = TypeAdapter(Event)
-_UNKNOWN = {"through": "socket"}  # a program that does not say who it is
+_UNKNOWN = {"through": "socket"}  # for a program that does not identify itself
 _LOG = logging.getLogger(__name__)
 
 
-class Desk:
-    """One side's desk; use as a context manager around the run.
+class CommandServer:
+    """One role's command server; use it as a context manager around the run.
 
     Args:
         side, bench, timeline: of the run.
         folder: the run folder, to announce the socket in.
-        ring: tells the loop that the timeline has something new.
+        wake: tells the loop that the timeline has something new.
         stop: ends the run as Ctrl-C would.
     """
 
@@ -65,16 +65,16 @@ class Desk:
         bench: Bench,
         timeline: Timeline,
         folder: Path,
-        ring: Callable[[], None],
+        wake: Callable[[], None],
         stop: Callable[[], None],
     ) -> None:
         self._side, self._bench, self._timeline = side, bench, timeline
         self._announcement = announcement(folder, side)
-        self._ring, self._stop = ring, stop
+        self._wake, self._stop = wake, stop
         self._rate = Rate("all operators together", _PER_S, _BURST)
         self._over = threading.Event()
 
-    def __enter__(self) -> Desk:
+    def __enter__(self) -> CommandServer:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.REP)
         self._socket.set(zmq.MAXMSGSIZE, LARGEST)
@@ -103,7 +103,7 @@ class Desk:
         self._resources.close()
 
     def _announce(self) -> None:
-        """Write down where we are to be found, and which laws the recording's indices mean."""
+        """Write down where the socket is, and to which laws the recording's law indices refer."""
         c = self._bench.controller
         content = {"endpoint": self._endpoint, "T_s": c.T_s, "names": list(c.sets)}
         content["laws"] = [
@@ -117,7 +117,7 @@ class Desk:
     def _serve(self) -> None:
         while not self._over.is_set():
             if self._socket.poll(_LOOK_MS):
-                with contextlib.suppress(zmq.ZMQError):  # a client that is gone again
+                with contextlib.suppress(zmq.ZMQError):  # the client has closed its connection
                     self._socket.send_json(self._answer(self._socket.recv()))
 
     def _answer(self, message: bytes) -> dict[str, Any]:
@@ -139,15 +139,15 @@ class Desk:
             return {"ok": False, "error": "; ".join(lines(problem))}
         except (UserError, ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
-        except Exception as problem:  # a mistake of ours; the next command must find a desk
+        except Exception as problem:  # our own mistake must not end the server
             _LOG.exception("the %s's desk: %r", self._side, message[:200])
             return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
 
     def _checked(self, content: Any) -> Any:
-        """The event, with everything tried out that might fail in the loop.
+        """The checked event; whatever could fail in the loop is tried here first.
 
         Raises:
-            ValueError: it is none, not for this side, or cannot be carried out.
+            ValueError: it is no event, belongs to the other role, or cannot be carried out.
         """
         event = _EVENT.validate_python(content)
         ours = "controller" if isinstance(event, CONTROLLER_EVENTS) else "plant"
@@ -169,7 +169,7 @@ class Desk:
 
     def _carry_out(self, event: Any, by: Identity) -> dict[str, Any]:
         ticket = self._timeline.insert(event, by.plain())
-        self._ring()
+        self._wake()
         until = time.monotonic() + _TAKEN_OVER_S
         while not ticket.done.wait(_LOOK_MS * 1e-3):
             over = self._over.is_set()

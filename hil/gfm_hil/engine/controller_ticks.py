@@ -1,4 +1,4 @@
-"""The controller's ticks over a link: take y, compute, send u, until something is to be said.
+"""The controller's ticks over a link: take y, compute, send u, until Python has to act.
 
 The plant's frames drive it. In real time it also watches the clock: it counts ticks that pass
 without a newer frame, and more than ``late_policy.hold`` of them lead to the safe state. It sleeps
@@ -19,7 +19,7 @@ from gfm_runtime.states import SAFE, STOPPED
 
 _Y_ID = 1
 _LOOKED_NS = 20_000
-_LEAK = 2e-4  # of a tick, in each: how much slower than ours the plant's clock may run
+_LEAK = 2e-4  # of a tick, per tick: by how much the plant's clock may run slower than ours
 _EARLIER = 0.05  # of a tick
 
 
@@ -96,7 +96,7 @@ def _next_frame(end, records, r, ctl, sent):
         if wake > before:
             sleep_until(wake)
             slept = True
-            before = wake  # what it sleeps beyond that is a gap like any other
+            before = wake  # oversleeping counts as a gap
     awake = now_ns()
     looks = 0
     while True:
@@ -112,7 +112,7 @@ def _next_frame(end, records, r, ctl, sent):
             before = now
             if size > 0:
                 k = unpack(reader, _Y_ID, got, got_bytes, size, y)
-                if k > r.tick:  # nothing else is a sign of life
+                if k > r.tick:  # only a newer tick is a sign of life
                     r.heard = now
                 if k >= 0:
                     break

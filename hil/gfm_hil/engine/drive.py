@@ -36,7 +36,7 @@ from gfm_hil.scenario.expectation import CONTROLLER_GONE
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
-_FAR = 2**62  # as of a timeline without events
+_FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
 
 
@@ -71,7 +71,7 @@ class _Loop:
         self._call = plant_ticks if plant else controller_ticks
 
     def go(self, until: int) -> Why:
-        """Run until that tick or until there is something to say.
+        """Run until that tick, or until the loop returns for another reason.
 
         Raises:
             PeerLost: the link is gone.
@@ -88,7 +88,7 @@ class _Loop:
         return int(self.loop["tick"][0])
 
     def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
-        """Tell the other side how this one ends."""
+        """Tell the other side how this side ends."""
         tick = max(self.tick, 0)
         part_from(self.link, self.writer, self.reader, tick, state, reason, values)
 
@@ -136,7 +136,7 @@ def drive_controller(
     loop.loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running:
         event = timeline.next_tick()
-        if loop.loop["pending"][0]:  # frames were lost on the way to the event
+        if loop.loop["pending"][0]:  # the frame of the event's own tick was lost
             timeline.carry_out(loop.tick)
             event = timeline.next_tick()
         elif event <= loop.tick + 1 or why == Why.WOKEN:
@@ -174,7 +174,7 @@ def compile_loops(side: Side, bench: Bench, part: Part) -> None:
 
 @port_function
 def _rest(handle, message):
-    """What a loop without deadlines does where the link cannot sleep until a message comes."""
+    """Sleep for 100 µs: lockstep on a link that cannot sleep until a message comes."""
     sleep_until(now_ns() + _NAP_NS)
     return 0
 
@@ -185,6 +185,6 @@ def _nothing(handle, message):
 
 
 class _Nowhere:
-    """A link to nobody: the loops are the same for all links."""
+    """A link without a peer; enough to compile a loop, which is the same for all links."""
 
     port = Port(np.zeros(1, np.int64), _nothing, _nothing, 0)

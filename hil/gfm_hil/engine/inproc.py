@@ -1,7 +1,7 @@
 """Both sides in one process: the same tick functions in one compiled loop, in lockstep.
 
-Bit for bit the result of two processes over a link, since a frame carries float64 and each tick
-calls the same functions in the same order.
+The result is bit for bit that of two processes over a link, because a frame carries float64 and
+each tick calls the same functions in the same order.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
 
 @compiled
 def _run_ticks(plant, controller, y, u, plant_rows, controller_rows, start, stop, waits):
-    """``run_ticks`` itself."""
+    """The compiled part of ``run_ticks``."""
     par, st = plant
     ctl, laws, states, est = controller
     changes, delayed = ctl[0].changes, plant_is_delayed(par)
@@ -43,7 +43,7 @@ def _run_ticks(plant, controller, y, u, plant_rows, controller_rows, start, stop
         answer(ctl, laws, states, est, y, u, tripped != 0)
         record_controller(controller_rows[k], ctl, est)
         record_command(plant_rows[k], u)
-        if delayed:  # as a plant does that need not wait for u[k]
+        if delayed:  # as over a link, where u[k] may come meanwhile
             plant_step(par, st)
         state = ctl[0].state
         if obey(st, waits, state) != Why.GO_ON:
@@ -88,7 +88,7 @@ def run_inproc(
     timeline: Timeline,
     go_on: Callable[[int], bool],
 ) -> None:
-    """Run a whole scenario; ``go_on`` is told the ticks done and says whether to go on."""
+    """Run a whole scenario; ``go_on`` gets the ticks done and returns whether to go on."""
     ticks = bench.scenario.ticks
     k = 0
     while k < ticks and timeline.running:

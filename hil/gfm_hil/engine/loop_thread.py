@@ -1,4 +1,4 @@
-"""A compiled loop in a thread of its own, watched by the main thread, which hears Ctrl-C."""
+"""A compiled loop in a thread of its own, watched by the main thread, which receives Ctrl-C."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def run_loop(
         try:
             drive = drive_plant if side == "plant" else drive_controller
             found.append(drive(bench, link, part, timeline, t0_ns, flags))
-        except BaseException as problem:  # to be raised where somebody sees it
+        except BaseException as problem:  # the caller's thread raises it
             failed.append(problem)
 
     timeline.put_off = True
@@ -67,7 +67,7 @@ def run_loop(
             thread.join(_LOOK_S)
             timeline.flush()
             flags[STOP] = stopped() or bool(timeline.failed)
-    finally:  # a second Ctrl-C: the thread must not outlive what it writes to
+    finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
         while thread.is_alive():
             with contextlib.suppress(KeyboardInterrupt):
@@ -80,4 +80,4 @@ def run_loop(
 
 
 def _nothing() -> None:
-    """What a link does at the start and the end of a run unless it says more."""
+    """The start and the stop of a link that has neither method."""

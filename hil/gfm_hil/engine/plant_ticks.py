@@ -1,4 +1,4 @@
-"""The plant's ticks over a link: sample, send, wait for u, advance, until something is to be said.
+"""The plant's ticks over a link: sample, send, wait for u, advance, until Python has to act.
 
 Lockstep: the plant waits for u[k], and sends y[k] again if nothing comes. Real time: the plant
 samples tick k at its deadline t_0 + k T_s on CLOCK_MONOTONIC, and u[k] has until the next deadline.
@@ -47,8 +47,8 @@ def plant_ticks(end, records, plant, last):
     reader, r = end.reader, loop[0]
     sequence, frame, message = end.out
     delayed = plant_is_delayed(par)
-    # Then in lockstep the next frame leaves right after an answer, and one look at the clock does
-    # for both. The processor goes nowhere until a look is done, so two took a tenth of the tick.
+    # In lockstep a delayed plant sends its next frame right after an answer, so one reading of the
+    # clock serves both. A reading stalls the processor: two of them took a tenth of the tick.
     hurried, unseen, why = delayed and not r.realtime, -1, Why.DONE
     while r.tick < last:
         if flags[STOP] != 0:
@@ -72,13 +72,13 @@ def plant_ticks(end, records, plant, last):
         sent = now_ns()
         times[k, 2] = sent
         if r.realtime and end.spins == 0:
-            give_way()  # to the link's own thread, before a look in vain
+            give_way()  # to the link's own thread, before the first look
         if unseen >= 0:
             times[unseen, 3] = sent
             unseen = -1
         if delayed:  # u[k] does not act in this period: it can come meanwhile
             plant_step(par, st)
-        if r.unrested > _UNRESTED:  # or the kernel would have the whole loop rest, for 50 ms
+        if r.unrested > _UNRESTED:  # else the kernel throttles the whole loop for 50 ms
             sleep_until(sent + _REST_NS)
             r.unrested = 0
         until = due + r.T if r.realtime else sent + r.patience

@@ -1,4 +1,4 @@
-"""One side as a process of its own: ready the bench, meet the other side, run, keep everything."""
+"""One role as a process of its own: set up the bench, shake hands, run, record."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import Side
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.command_server import Desk
+from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.drive import compile_loops
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
@@ -54,7 +54,7 @@ def run_side(
         (frame counters) are in ``folder``.
 
     Raises:
-        UserError: the endpoint is not to be had, or the scenario has no operating point.
+        UserError: the endpoint cannot be opened, or the scenario has no operating point.
     """
     assert scenario.link.endpoint is not None
     with Interrupt() as interrupt:
@@ -71,7 +71,7 @@ def _run(
 ) -> Outcome:
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "scenario.toml").exists():  # a side alone; observers want to know what it runs
+    if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
         write_text(folder / "scenario.toml", scenario_toml(scenario))
     if scenario.mode == "realtime":
         keep_in_memory(folder, scenario.ticks, notice)
@@ -83,11 +83,11 @@ def _run(
     def wake() -> None:
         flags[WAKE] += 1
 
-    # the desk comes first: its threads must not inherit the rights that the loop asks for
-    with Desk(side, bench, timeline, folder, wake, interrupt.ask):
+    # the command server first: its threads must not inherit the loop's priority
+    with CommandServer(side, bench, timeline, folder, wake, interrupt.ask):
         try:
             seen = _meet_and_run(side, bench, endpoint, part, timeline, flags, interrupt, notice)
-            with contextlib.suppress(OSError):  # on a full disk these counts are lost, no more
+            with contextlib.suppress(OSError):  # a full disk costs these counts and nothing else
                 write_text(folder / f"link_{side}.json", json.dumps({"side": side, **seen}))
         except PeerLost as problem:
             timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
@@ -107,11 +107,11 @@ def _meet_and_run(
     interrupt: Interrupt,
     notice: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Open the link, meet the other side, run; returns what the link saw.
+    """Open the link, meet the other side, run; returns what the link counted.
 
     Raises:
-        PeerLost: there was nobody to run with.
-        UserError: the endpoint is not to be had.
+        PeerLost: the other side did not come.
+        UserError: the endpoint cannot be opened.
     """
     scenario = bench.scenario
     rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
@@ -124,7 +124,7 @@ def _meet_and_run(
     resources = ExitStack()
     try:
         if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
-            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: not after START
+            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: before START
         if rights is not None:
             if good.port is None:  # a thread in Python pumps its messages, and hardly ever sleeps
                 rights["policy"] = ordinary_priority()
@@ -141,7 +141,7 @@ def _meet_and_run(
         resources.close()
         link.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
-    counted = getattr(good, "counters", {})  # of a link that sees more than whole messages
+    counted = getattr(good, "counters", {})  # of a link in several frames a message
     faults = {**reader.faults, **counted, "refused_greetings": start.refused}
     met = {"one_clock": start.one_clock, "run": start.run, "controller": start.controller}
     return {"faults": faults, "e2e": reader.e2e, **met, **injected}

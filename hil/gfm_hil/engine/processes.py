@@ -1,4 +1,4 @@
-"""Both sides as processes of their own: started, watched to their end, never left behind."""
+"""Starts controller and plant as processes, watches them to their end, and leaves none behind."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from gfm_hil.scenario.model import Scenario
 Progress = Callable[[int, int], None]
 
 _LOOK_S = 0.05
-_GRACE_S = 2.0  # how long a side may take to end once it should, beyond link.peer_timeout_s
+_GRACE_S = 2.0  # time that a side gets to end, beyond link.peer_timeout_s
 
 
 @dataclass
@@ -55,11 +55,11 @@ class Processes:
         """Start both, watch them to their end.
 
         Returns:
-            When the first tick was run (``time.monotonic``), and how it ended for a side that did
-            not live to say so itself.
+            When the first tick ran (``time.monotonic``), and how a killed side ended that could not
+            say so itself.
 
         Raises:
-            UserError: a side refused to start, as for an endpoint that is occupied.
+            UserError: a side refused to start, for example because the endpoint is occupied.
         """
         self._compile_once()
         if self.interrupt.came:
@@ -88,7 +88,7 @@ class Processes:
         return Outcome("interrupted", "stopped by the operator", 0)
 
     def _compile_once(self) -> None:
-        """Fill numba's cache here, so that two processes do not compile the same at a time."""
+        """Fill numba's cache first, so that the two processes do not compile the same code."""
         self.notice("compiling the kernels (once a machine) …")
         bench = make_bench(self.scenario)
         with scratch.temporary("gfmhil-run-") as place:
@@ -109,7 +109,7 @@ class Processes:
             ]
         with self._log(side).open("wb") as log:
             try:
-                # own session: Ctrl-C reaches the sides through us, once
+                # a session of its own: Ctrl-C reaches the process through us, once
                 return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
             except OSError as problem:
                 raise UserError(f"{command[0]}: cannot be started: {problem.strerror}") from None
@@ -118,7 +118,7 @@ class Processes:
         return self.folder / f"{side}.log"
 
     def _watch(self) -> float:
-        """Wait until both have ended; a side that outlives its time is told to stop, then killed.
+        """Wait until both have ended; stop and then kill a side that takes too long.
 
         A side ends by itself when the other one says goodbye or falls silent, but not while it
         still waits for its handshake.
@@ -156,7 +156,7 @@ class Processes:
                 process.send_signal(number)
 
     def _crash(self, side: Side) -> str:
-        """How a side ended if not by itself."""
+        """How a side ended that did not end by itself."""
         code = self._sides[side].returncode
         if code < 0:
             return f"the {side} was ended by {signal.Signals(-code).name}"

@@ -1,4 +1,4 @@
-"""A law with other gains while it runs: made ready off the loop, taken over in one tick."""
+"""Changes the gains of a running law: prepared off the loop, swapped in one tick."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Gains = tuple[tuple[str, float], ...]
 def retuned(name: str, gains: Gains, T_s: float) -> tuple[DiscreteLaw, NDArray[Any]]:
     """A law with some gains changed, discretised, and packed for the kernel.
 
-    What is tied to a changed gain follows it, unless it is given itself. The last ones are kept,
-    so that who checks a change off the loop has it ready for the loop.
+    A gain that the law file ties to a changed one follows it unless it is given too. The newest
+    results are cached: the command server's check prepares what the loop then uses.
 
     Raises:
         ValueError: a scheduled law, a name that its file does not have, or no such law.
@@ -40,7 +40,7 @@ def retuned(name: str, gains: Gains, T_s: float) -> tuple[DiscreteLaw, NDArray[A
 
 
 def change_gains(controller: Controller, values: Mapping[str, float]) -> int:
-    """Ask for other gains of the law last asked for, on top of those changed before.
+    """Change gains of the law selected last, on top of earlier changes.
 
     Returns:
         The index of the law from now on.

@@ -1,7 +1,7 @@
-"""Telling systemd how a side is, by sd_notify(3); without ``NOTIFY_SOCKET`` nothing is said.
+"""Tells systemd how a process fares, by sd_notify(3), if ``NOTIFY_SOCKET`` is set.
 
-READY when the other side has been met, WATCHDOG only as long as ticks go on, STATUS for
-``systemctl status``, STOPPING when the loop has ended and its data are yet to be written.
+READY after the handshake, WATCHDOG only while ticks go on, STATUS for ``systemctl status``,
+STOPPING when the loop has ended and the data are still to be written.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gfm_hil.realtime.priority import stand_back
 from gfm_hil.scenario.model import Scenario
 
-_PATIENCE_S = 1.0  # with a service manager that does not read; what was not said is said again
+_PATIENCE_S = 1.0  # the service manager does not read; the next message says it again
 _STATUS_S = 1.0
 
 
@@ -33,18 +33,18 @@ def notify(*lines: str) -> None:
 
 
 def watchdog_s() -> float | None:
-    """The time without WATCHDOG=1 after which systemd ends this process, if it is to, s."""
+    """Seconds without WATCHDOG=1 after which systemd ends this process; None if it does not."""
     ours = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
     given = os.environ.get("WATCHDOG_USEC", "")
     return int(given) / 1e6 if ours and given.isdecimal() and int(given) else None
 
 
 class Watched:
-    """Context of a loop that has met its other side: a thread of ordinary priority looks after it.
+    """Context around a loop after the handshake: a thread of ordinary priority feeds the watchdog.
 
-    The thread is not the loop's: it sees whether the count of ticks grows. A side that waits for a
-    silent peer makes none, and ends by itself after ``link.peer_timeout_s``; where the watchdog
-    would come before that, it is put off.
+    The thread watches whether the count of ticks grows. A side that waits for a silent peer does
+    no ticks and ends by itself after ``link.peer_timeout_s``; the thread feeds a shorter watchdog
+    until then.
 
     Args:
         scenario: of the run.
@@ -80,7 +80,7 @@ class Watched:
         return int(self._progress[0])
 
     def _look(self) -> None:
-        stand_back()  # it has inherited the loop's priority and processor
+        stand_back()  # the thread inherited the loop's priority and processor
         seen = 0
         every = min(_STATUS_S, (self._limit_s or 4 * _STATUS_S) / 4)
         while not self._over.wait(every):

@@ -1,7 +1,7 @@
 """A scenario made ready: the plant's and the controller's records at the operating point.
 
-Both sides build the same bench from the same scenario, each on its own machine if need be, so
-that nothing but frames has to cross the link.
+Both sides build the same bench from the same scenario, possibly on two machines, so that only
+frames have to cross the link.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ class Bench:
         self._asked = c.asked
 
     def restore_plant(self, tick: int) -> None:
-        """Put the plant back to its start at a tick, trip forgotten and grid included."""
+        """Put the plant and its grid back to their start at a tick, and clear the trip."""
         self.par[:], self.st[:] = self._plant
         self.st["tick"], self.u[:] = tick, self.start.u
 
     def reset_controller(self) -> None:
-        """Take the controller out of SAFE to its start: first law and references, READY.
+        """Take the controller from SAFE to READY, with its first law and references.
 
         Raises:
             ValueError: it is not in SAFE.
@@ -83,7 +83,7 @@ def make_bench(scenario: Scenario) -> Bench:
         )
     par, st = make_plant(plant, scenario.T_s)
     references = scenario.references.vector()
-    # under the name that events use: a law file has a name of its own, or another law's
+    # under the name that events use: the name inside a law file may differ
     sets = [replace(load_law(name), name=name) for name in scenario.laws()]
     controller = Controller(sets, scenario.T_s, references, hold=scenario.late_policy.hold)
     try:
@@ -105,10 +105,10 @@ def make_bench(scenario: Scenario) -> Bench:
 
 
 def _ready_gains(scenario: Scenario) -> None:
-    """Have every change of gains that the scenario names ready before it runs.
+    """Prepare every change of gains that the scenario names before it runs.
 
     Raises:
-        UserError: one that cannot be.
+        UserError: a change that is not possible.
     """
     name, gains = scenario.law, dict[str, float]()
     for event in scenario.sorted_events():

@@ -1,7 +1,7 @@
-"""What happens when: carries out a scenario's events tick by tick and writes down what came of it.
+"""Carries out a scenario's events tick by tick and logs what happens.
 
-The log is one JSON object a line, written at once, so that it is there however a run ends. A log
-that cannot be written, as on a full disk, ends the run; its last lines go where room was kept.
+The log has one JSON object a line and is written at once, so that it survives any end of a run. If
+it cannot be written, as on a full disk, the run ends; a file reserves room for the last lines.
 """
 
 from __future__ import annotations
@@ -33,13 +33,12 @@ from gfm_plant.names import CONTROLLER
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 
-#: the other side knows why
 _ROOM = 1 << 16  # bytes kept beside the log for its last lines
 
 
 @dataclass
 class Ticket:
-    """What became of an event that an operator put in: its tick once ``done``, or an error."""
+    """The outcome of an operator's event: its tick once ``done``, or an error."""
 
     operator: dict[str, Any]
     done: threading.Event = field(default_factory=threading.Event)
@@ -48,7 +47,7 @@ class Ticket:
     _owner: threading.Lock = field(default_factory=threading.Lock)
 
     def claim(self) -> bool:
-        """True for the first who asks: the loop to carry it out, or who put it in to withdraw."""
+        """True for the first caller: the loop to carry it out, or the sender to withdraw it."""
         return self._owner.acquire(blocking=False)
 
 
@@ -75,7 +74,7 @@ class Timeline:
         except OSError as problem:
             raise UserError(f"{log}: {problem.strerror}") from None
         self._unwritten = b""
-        self.failed = ""  # why the log cannot be written, if so
+        self.failed = ""  # why the log cannot be written; empty if it can
         scenario = bench.scenario
         self._todo = [
             (e.at(scenario.T_s), e)
@@ -85,10 +84,10 @@ class Timeline:
         self._inbox: deque[tuple[Any, Ticket]] = deque()
         self._changes = 0
         self._lines: deque[dict[str, Any]] = deque()
-        self.put_off = False  # a disk may keep the writer waiting for longer than a tick
+        self.put_off = False  # a write may take longer than a tick
         self.outcome: Outcome | None = None
-        self._fault: tuple[Status, str] | None = None  # what a run that waits is waiting for
-        self.stopped_by: dict[str, Any] | None = None  # the operator, if one has said stop
+        self._fault: tuple[Status, str] | None = None  # the run waits for its reset
+        self.stopped_by: dict[str, Any] | None = None  # the operator who stopped the run
 
     @property
     def running(self) -> bool:
@@ -100,18 +99,18 @@ class Timeline:
         return self._todo[0][0] if self._todo else 2**62
 
     def insert(self, event: Any, operator: dict[str, Any]) -> Ticket:
-        """Have an event of ours carried out at the next tick; may be called from any thread.
+        """Queue an event for the next tick; any thread may call this.
 
         Args:
             event: a checked one.
-            operator: who gives the command, for the log.
+            operator: identity of the sender, for the log.
         """
         ticket = Ticket(operator)
         self._inbox.append((event, ticket))
         return ticket
 
     def carry_out(self, tick: int) -> None:
-        """Carry out every event due at this tick, and what was put in."""
+        """Carry out every event due at this tick, and the queued ones."""
         while self._todo and self._todo[0][0] <= tick:
             event = self._todo.pop(0)[1]
             try:
@@ -125,7 +124,7 @@ class Timeline:
             try:
                 self._carry_out(event, tick, by="operator", operator=ticket.operator)
                 ticket.tick = tick
-            except ValueError as problem:  # of a plant that has changed since it was checked
+            except ValueError as problem:  # the plant changed after the check
                 ticket.error = str(problem)
             ticket.done.set()
 
@@ -145,7 +144,7 @@ class Timeline:
         self.write(tick, event.type, label=event.label(), **more)
 
     def look(self, tick: int) -> None:
-        """Write down what the tick just done brought: a change of law, a safe state, a trip."""
+        """Log what the last tick brought: a change of law, a safe state, a trip."""
         ctl, st = self._bench.controller.ctl, self._bench.st
         if "controller" in self._sides and int(ctl["changes"][0]) != self._changes:
             self._changes = int(ctl["changes"][0])
@@ -166,7 +165,7 @@ class Timeline:
         self._fault = found
 
     def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
-        """What keeps our side from running, if anything does: the cause rather than hearsay."""
+        """The fault that keeps our side from running, if any; the cause before its consequences."""
         trip = int(st["trip"][0]) if "plant" in self._sides else 0
         if trip not in (0, CONTROLLER):
             return "tripped", trip_reason(st, self._bench.par)
@@ -176,11 +175,11 @@ class Timeline:
         return ("safe", trip_reason(st, self._bench.par)) if trip else None
 
     def finish(self, tick: int) -> None:
-        """The scenario is over: the run is complete, unless it waits for a reset in vain."""
+        """The scenario is over: the run is complete unless it still waits for a reset."""
         self.end(*(self._fault or ("completed", "")), tick)
 
     def end(self, status: Status, reason: str, tick: int) -> None:
-        """The run is over; the first reason stays."""
+        """End the run; the first reason stays."""
         if self.outcome is None:
             if self.failed and status == "interrupted":
                 status, reason = "safe", self.failed
@@ -192,14 +191,14 @@ class Timeline:
             self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now, **more)
 
     def write(self, tick: int, kind: str, **more: Any) -> None:
-        """One line of the log; on disk at once, or at the next ``flush`` if that is put off."""
+        """Add a line to the log; on disk at once, or at the next ``flush`` if ``put_off``."""
         t = round(tick * self._bench.scenario.T_s, 9)
         self._lines.append({"tick": tick, "t": t, "event": kind, **more})
         if not self.put_off:
             self.flush()
 
     def flush(self) -> None:
-        """Put on disk what is not there yet; may be called from another thread."""
+        """Write what is not on disk yet; another thread may call this."""
         tick = 0
         while self._lines:
             line = self._lines.popleft()
@@ -209,11 +208,11 @@ class Timeline:
             while self._unwritten:
                 self._unwritten = self._unwritten[self._log.write(self._unwritten) :]
         except OSError as problem:
-            if self.failed:  # there is no room left at all: ``close`` tries again
+            if self.failed:  # no room at all: ``close`` tries again
                 return
             self.failed = f"{self._path.name} cannot be written: {problem.strerror}"
             self._room.unlink(missing_ok=True)
-            if not self.put_off:  # else who flushes stops the loop, which then ends the run
+            if not self.put_off:  # else the flushing thread stops the loop, which ends the run
                 self.end("interrupted", "", tick)
             self.flush()
 

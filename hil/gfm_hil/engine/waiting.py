@@ -1,4 +1,4 @@
-"""Waiting for the other side: spin with a yield while an answer is near, then sleep."""
+"""Waits for messages during the handshake, and says goodbye at the end of a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gfm_hil.links.frame import LAST_TIMES, FrameError, FrameReader, FrameWriter
 from gfm_runtime.signals import names
 from gfm_runtime.states import SAFE, STOPPED
 
-_SPIN_NS = 50_000  # longer takes processor time from the very threads that bring the answer
+_SPIN_NS = 50_000  # longer would starve the threads that bring the answer
 
 _LAST_NS = 500_000_000
 
@@ -24,7 +24,7 @@ _LAST_NS = 500_000_000
 def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
     """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
 
-    A pure spin would starve libzmq's own thread on two cores; every look is followed by a yield.
+    It yields after every poll, because a pure spin would starve libzmq's own thread on two cores.
     """
     spin_until = time.monotonic_ns() + _SPIN_NS
     while True:
@@ -43,10 +43,9 @@ def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> 
 def send_last(
     link: Link, writer: FrameWriter, tick: int, state: int, reason: int, values: NDArray[np.float64]
 ) -> None:
-    """Send the frame that ends a run, which the other side waits for, and some more like it.
+    """Send the frame that ends a run several times, because one alone might be lost.
 
-    One alone might be lost. Where there is no room, because the other side is behind, it gets a
-    while to make some.
+    If the link is full because the other side is behind, retry for a while.
     """
     give_up = time.monotonic_ns() + _LAST_NS
     for _ in range(LAST_TIMES):
@@ -66,8 +65,8 @@ def part_from(
 ) -> None:
     """Send the frames that end a run and wait a moment for the other side's.
 
-    Whoever closes at once may take with it what is still on its way: libzmq drops what a socket
-    has sent and a peer that is 64 frames behind has not read yet.
+    A side that closed at once could lose its last frames: libzmq drops what a peer that is 64
+    frames behind has not read yet.
     """
     send_last(link, writer, tick, state, reason, values)
     give_up = time.monotonic_ns() + _LAST_NS
