@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gfm_runtime.elements import INTEGRATOR, ZERO, Element
-from gfm_runtime.errors import LawError
+from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
 
 Cell = tuple[int, int]  # (i, j), zero-based row of u and column of y
@@ -42,12 +42,16 @@ class Limits:
     T_off: float = 0.2
 
     def __post_init__(self) -> None:
+        mistakes = Mistakes()
         for name, low, high in zip(U_NAMES, self.low, self.high, strict=True):
-            if not low < high:
-                raise LawError(f"limits.{name}", f"[{low:g}, {high:g}] must be ascending")
+            with mistakes.noting():
+                if not low < high:
+                    raise LawError(f"limits.{name}", f"[{low:g}, {high:g}] must be ascending")
         for name in ("T_t", "T_off"):
-            if not getattr(self, name) > 0.0:
-                raise LawError(f"limits.{name}", f"{getattr(self, name):g} s must be > 0")
+            with mistakes.noting():
+                if not getattr(self, name) > 0.0:
+                    raise LawError(f"limits.{name}", f"{getattr(self, name):g} s must be > 0")
+        mistakes.check()
 
 
 @dataclass(frozen=True)
@@ -98,17 +102,22 @@ class Law:
     home_grid: HomeGrid = HomeGrid()
 
     def __post_init__(self) -> None:
+        mistakes = Mistakes()
         for matrix, cells in (("phi", self.phi), ("psi", self.psi)):
             for cell, element in cells.items():
-                if not (0 <= cell[0] < NU and 0 <= cell[1] < NY):
-                    raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
-                _check(cell_name(matrix, cell), element)
+                with mistakes.noting():
+                    if not (0 <= cell[0] < NU and 0 <= cell[1] < NY):
+                        raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
+                    _check(cell_name(matrix, cell), element)
         for name, value in zip(U_NAMES, self.u_0, strict=True):
-            if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):
-                raise LawError(
-                    f"u_0.{name}",
-                    f"{value!r} is neither a finite number nor one of {list(REF_NAMES)}",
-                )
+            with mistakes.noting():
+                if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):
+                    raise LawError(
+                        f"u_0.{name}",
+                        f"{value!r} is neither a finite number nor one of {list(REF_NAMES)}"
+                        + meant(value, REF_NAMES),
+                    )
+        mistakes.check()
 
     def element(self, matrix: str, cell: Cell) -> Element:
         """The element of ``"phi"`` or ``"psi"`` at a cell, ZERO where there is none."""

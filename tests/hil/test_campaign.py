@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 
+import gfmhil
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.studies.campaign import worker
@@ -24,7 +26,7 @@ from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, execute, processes
 from gfm_hil.studies.campaign.figure import draw_map
 from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_hil.studies.campaign.result import summary
+from gfm_hil.studies.campaign.result import summary, verdict
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.worker import Record, run_chunk
@@ -156,6 +158,42 @@ def test_more_runs_go_on_with_the_same_draws(file: Callable[..., Path], whole: P
     more = load_campaign(str(file(**{"runs = 10": "runs = 11"})))
     store = Store(whole / "two", more, resume=True)
     assert store.missing(more) == [(10, "mimo-gfm"), (10, "vsg-2")]
+
+
+def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(
+    whole: Path, tmp_path: Path
+) -> None:
+    found = gfmhil.campaign(whole / "small.toml")
+    assert [json.dumps(r) for r in found.records] == stored(whole / "two")[1:]
+    table = found.to_pandas()
+    assert list(table["verdict"]) == [verdict(r, 0.2) for r in found.records]
+    assert list(table["plant.factors.L_g"]) == [
+        r["drawn"]["plant.factors.L_g"] for r in found.records
+    ]
+    peaks = [r["events"][0]["p_peak"] if r["events"] else None for r in found.records]
+    assert (
+        list(table["events.0.p_peak"].astype(object).where(table["events.0.p_peak"].notna(), None))
+        == peaks
+    )
+    assert len(found.plot(y="plant.factors.R_f")) == 2
+    assert "CampaignResult 'a small one', 20 runs" in repr(found)
+    law = gfmhil.Law.load("vsg-2").with_gains("mine", D_p=0.02)
+    content = tomllib.loads(TEXT)
+    again = gfmhil.campaign(content, tmp_path / "out", laws=[law, "vsg-2"], runs=2)
+    assert [(r["run"], r["law"]) for r in again.records] == [
+        (run, name) for run in range(2) for name in ("mine", "vsg-2")
+    ]
+    assert again.records[1::2] == found.records[1:4:2]
+    assert again.records[0] != again.records[1]
+    kept = tomllib.loads((tmp_path / "out" / "campaign.toml").read_text(encoding="utf-8"))
+    assert kept == content | {"laws": ["mine", "vsg-2"], "runs": 2}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "campaign.toml", "campaign.json", "runs.jsonl", "map.png",
+    }  # fmt: skip
+    with pytest.raises(UserError, match="in use"):
+        gfmhil.campaign(content, tmp_path / "out")
+    with pytest.raises(UserError, match="workers = 0"):
+        gfmhil.campaign(content, workers=0)
 
 
 def test_folder_of_a_campaign(whole: Path) -> None:
@@ -300,14 +338,14 @@ def pickle_size(campaign: Campaign) -> int:
         ({"low = 0.5": "low = 0.0"}, "must be > 0 for a logarithm"),
         ({"high = 1.0": "high = nan"}, "draw.1.uniform.high"),
         ({"low = 0.0\nhigh = 1.0": "low = -1.0\nhigh = 1.0"}, "draw.1, plant.factors.R_f = -1.0"),
-        ({"sigma = 1e-3": "sigma = -1e-3"}, "sigma = -0.001"),
+        ({"sigma = 1e-3": "sigma = -1e-3"}, "sigma: Input should be greater than 0, not -0.001"),
         ({"mean = 1e-3": "mean = 1.0"}, "holds next to nothing of mean = 1"),
         ({"values = [1, 2]": "values = []"}, "draw.3.choice.values"),
         ({"values = [1, 2]": "values = [1, 9999]"}, "draw.3, plant.delay.samples = 9999"),
         ({'type = "uniform"': 'type = "gamma"'}, "'gamma'"),
-        ({"runs = 10": "runs = 0"}, "runs = 0"),
-        ({"runs = 10": 'runs = "10"'}, "runs = '10'"),
-        ({"runs = 10": "runs = 10\nworker = 3"}, "worker: unknown key"),
+        ({"runs = 10": "runs = 0"}, "runs: Input should be greater than 0, not 0"),
+        ({"runs = 10": 'runs = "10"'}, "runs: Input should be a valid integer, not '10'"),
+        ({"runs = 10": "runs = 10\nworker = 3"}, "worker = 3: unknown key"),
         ({'title = "a small one"\n': ""}, "title: missing"),
         ({'"vsg-2"]': '"vsg-2000"]'}, "vsg-2000"),
         ({'"vsg-2"]': '"mimo-gfm"]'}, "each once"),

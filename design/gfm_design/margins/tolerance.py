@@ -76,7 +76,7 @@ def element_ranges(loop: ClosedLoop) -> dict[Element, Range | None]:
 
 def factor(loop: ClosedLoop, element: Element) -> float:
     """Real over nominal value of an element in a loop."""
-    return loop.made_of.plant.factors.get(element, 1.0)
+    return loop.made_of.plant.real_factors().get(element, 1.0)
 
 
 def element_range(loop: ClosedLoop, names: Sequence[Element]) -> Range:

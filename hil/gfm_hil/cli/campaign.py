@@ -11,17 +11,17 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.runner import Notice
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
-from gfm_hil.studies.campaign.figure import draw_map
 from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_hil.studies.campaign.result import VERDICTS, summary, verdict
+from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult, verdict, write_result
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.tables import print_campaign, print_record
@@ -67,9 +67,9 @@ def call(options: argparse.Namespace) -> int:
         store = Store(store_at, campaign, options.resume)
         jobs = store.missing(campaign)
         began, lost = time.monotonic(), None
-        with Interrupt() as interrupt, _bar(campaign, store, options.quiet) as tell:
+        with Interrupt() as interrupt, _bar(campaign, store, options.quiet) as (tell, notice):
             if jobs and executor is None:
-                compile_once(campaign)
+                compile_once(campaign, notice)
                 executor = stack.enter_context(processes(workers))
 
             def keep(records: list[Record]) -> None:
@@ -81,13 +81,8 @@ def call(options: argparse.Namespace) -> int:
                     execute(campaign, jobs, executor, workers, keep, lambda: interrupt.came)
                 except WorkerLost as problem:
                     lost = problem
-    records = store.sorted(campaign)
-    result = summary(campaign, records)
-    result["workers"] = options.dask or workers
-    result["wall_s"] = time.monotonic() - began
-    if records:
-        draw_map(store_at / "map.png", campaign, records, *axes)
-    (store_at / "campaign.json").write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+    found = CampaignResult(campaign, store.sorted(campaign), store_at)
+    result = write_result(found, store_at, axes, options.dask or workers, time.monotonic() - began)
     if options.json:
         print(json.dumps(result, indent=2))
     else:
@@ -121,16 +116,16 @@ def _only(options: argparse.Namespace, campaign: Campaign) -> int:
 def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar for the checks, which appears once they take long; one line where there is no
     terminal. Yields what tells it of them."""
-    console, began = Console(stderr=True, quiet=quiet), time.monotonic()
+    console, began = terminal(stderr=True, quiet=quiet), time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-    terminal = console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=not terminal) as bar:
+    shown = console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=not shown) as bar:
         task = bar.add_task("checking the runs", visible=False)
 
         def tell(done: int, of: int) -> None:
             if time.monotonic() - began < _PATIENCE_S:
                 return
-            if not terminal and not bar.tasks[0].visible:
+            if not shown and not bar.tasks[0].visible:
                 console.print(f"checking the runs: {done} of {of} done …", highlight=False)
             bar.update(task, completed=done, total=of, visible=True)
 
@@ -138,8 +133,9 @@ def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextlib.contextmanager
-def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
-    """A bar with what became of the runs, and the time left; yields what tells it of records."""
+def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[tuple[Any, Notice]]:
+    """A bar with what became of the runs, and the time left; yields what tells it of records, and
+    what prints a line above it."""
     counts = dict.fromkeys(VERDICTS, 0)
     with Progress(
         TextColumn("{task.description}"),
@@ -147,7 +143,7 @@ def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
         TaskProgressColumn(),
         TextColumn("{task.fields[found]}"),
         TimeRemainingColumn(),
-        console=Console(stderr=True, quiet=quiet),
+        console=terminal(stderr=True, quiet=quiet),
         transient=True,
         refresh_per_second=4,
     ) as bar:
@@ -162,4 +158,4 @@ def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
 
         if store.records:
             tell(store.sorted(campaign))
-        yield tell
+        yield tell, above(bar)

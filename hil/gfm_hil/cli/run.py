@@ -18,7 +18,6 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.cli.companion import companion
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
-from gfm_hil.cli.modbus import need_pysunspec2
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
@@ -65,7 +64,6 @@ def call(options: argparse.Namespace) -> int:
         if options.modbus is not None:
             if scenario.link.type == INPROC:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
-            need_pysunspec2()
             stack.enter_context(companion("modbus", folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
             run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)

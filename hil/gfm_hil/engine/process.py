@@ -24,7 +24,7 @@ from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.links import Link, open_link
+from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.realtime.prevent_idle import kept_awake
@@ -160,6 +160,7 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
         reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
         reader.judge(False, False)
     compile_loops(side, bench, part)
+    pump.warm_up()
     if side == "plant":
         record_sample(part.signals[0].copy(), y, par, st)
         record_command(part.signals[0].copy(), u)

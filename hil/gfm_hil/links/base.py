@@ -59,6 +59,10 @@ def _may(endpoint: str | None, options: Any) -> None:
     """Any endpoint with any options."""
 
 
+def _nothing(options: Any) -> None:
+    """A link that compiles nothing."""
+
+
 @dataclass(frozen=True)
 class LinkKind:
     """What the bench knows of a link before it opens one.
@@ -74,6 +78,7 @@ class LinkKind:
         check: sees that options fit the sampling time in s; raises ValueError in one line.
         check_both: sees that an endpoint (None: a fresh one) may be used with options; raises
             ValueError likewise.
+        warm_up: compiles, or loads from numba's cache, what an end with these options calls.
         exact: float64 arrives as sent, so that results are those of a run in process.
     """
 
@@ -86,6 +91,7 @@ class LinkKind:
     options: type[LinkOptions] = LinkOptions
     check: Callable[[Any, float], None] = _fits
     check_both: Callable[[str | None, Any], None] = _may
+    warm_up: Callable[[Any], None] = _nothing
     exact: bool = True
 
     def check_endpoint(self, endpoint: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -48,13 +49,42 @@ class Port:
     patient: Any = None
     spin_limit: int = 5000
 
+    def __post_init__(self) -> None:
+        """Have the functions compiled before a loop calls them."""
+        for function in (self.send, self.receive, self.patient):
+            if isinstance(function, PortFunction):
+                function.__wrapper_address__()
 
-def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> Any:
-    """Compile a function of (handle, message) for a ``Port``; kept on disk unless told not to."""
-    return cfunc(PORT_CALL, cache=cached)(function)
+
+class PortFunction(types.WrapperAddressProtocol):
+    """A function of (handle, message) that compiled loops call by its address.
+
+    numba compiles it, or loads it from its cache, when its first ``Port`` is made: importing a
+    link compiles nothing.
+    """
+
+    def __init__(self, function: Callable[[Any, Any], int], **options: Any) -> None:
+        self._function, self._options = function, options
+
+    @cached_property
+    def _compiled(self) -> Any:
+        return cfunc(PORT_CALL, **self._options)(self._function)
+
+    def __wrapper_address__(self) -> int:
+        return int(self._compiled.address)
+
+    def signature(self) -> Any:
+        """As numba asks for it."""
+        return PORT_CALL
 
 
-def free_port_function(function: Callable[[Any, Any], int]) -> Any:
-    """The same for one that does without numba's runtime, see ``gfm_runtime.compiled``: quicker,
-    and all that it calls has to do without as well."""
-    return cfunc(PORT_CALL, **FREE)(function)
+def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> PortFunction:
+    """Make a function of (handle, message) one of a ``Port``; numba keeps what it compiles on disk
+    unless ``cached`` is False."""
+    return PortFunction(function, cache=cached)
+
+
+def free_port_function(function: Callable[[Any, Any], int]) -> PortFunction:
+    """The same for a function that does without numba's runtime, see ``gfm_runtime.compiled``:
+    quicker, and all that it calls has to do without as well."""
+    return PortFunction(function, **FREE)

@@ -115,6 +115,12 @@ class PumpedLink:
                 give_up = min(give_up, time.monotonic() + _FAREWELL_S)
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) what the loop and the thread call."""
+    ring.warm_up()
+    Port(np.zeros(_LOST + 1, np.int64), ring.port_send, _receive, 0)
+
+
 def ported(link: Link) -> Link:
     """The link itself, or a pumped one around it if it has no port."""
     return link if link.port is not None else PumpedLink(link)

@@ -10,12 +10,12 @@ whole state: whoever takes an end over goes on from them.
 
 from __future__ import annotations
 
-from numba import njit
+import numpy as np
 
 from gfm_hil.links.base import LONGEST
-from gfm_hil.links.port import PORT_CALL, free_port_function
+from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.realtime.atomics import copy, load_acquire, pause, store_release
-from gfm_runtime.compiled import FREE
+from gfm_runtime.compiled import compiled
 
 SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
 WORD = 8  # bytes
@@ -31,7 +31,7 @@ _LENGTH = (1 << LENGTH_BITS) - 1
 OUT, OUT_HEAD, SENT, SEEN, IN, IN_HEAD, TAKEN, HANDLE = range(8)
 
 
-@njit(PORT_CALL, **FREE)
+@compiled
 def put(handle, message):
     """Write a message to the ring: 1, or 0 if it is full, closed, or the message does not fit."""
     size = message.size
@@ -49,7 +49,7 @@ def put(handle, message):
     return 1
 
 
-@njit(PORT_CALL, **FREE)
+@compiled
 def take(handle, message):
     """Read the next message: its bytes, or 0 if none has come. A longer one is gone."""
     room, to = message.size, message.ctypes.data  # here: in a branch numba would count references
@@ -69,7 +69,7 @@ def take(handle, message):
     return size
 
 
-@njit("boolean(int64[::1])", **FREE)
+@compiled
 def waiting(handle):
     """Whether a message has come."""
     taken = handle[TAKEN]
@@ -86,3 +86,12 @@ def port_send(handle, message):
 @free_port_function
 def port_receive(handle, message):
     return take(handle, message)
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) all functions, on a handle that is not open."""
+    handle, message = np.zeros(HANDLE, np.int64), np.zeros(1, np.uint8)
+    put(handle, message)
+    take(handle, message)
+    waiting(handle)
+    Port(handle, port_send, port_receive, 0)

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 
 from gfm_hil.realtime.atomics import intrinsic, load_acquire, pause
 from gfm_hil.realtime.environment import virtual_machine
-from gfm_runtime.compiled import FREE
+from gfm_runtime.compiled import compiled
 
 _STOP, _BEGUN = range(2)
 _OTHER, _IDLE = 0, 5  # SCHED_OTHER, SCHED_IDLE of sched.h on Linux
@@ -45,7 +45,7 @@ def _become(typingctx, policy):
     return types.int32(types.int64), make
 
 
-@njit("void(int64[::1])", **FREE)
+@compiled
 def _never_rest(flags):
     """Spin at idle priority until told to stop. Here and not in Python: a thread of idle priority
     that waits for its turn must not hold the interpreter's lock."""
@@ -55,6 +55,11 @@ def _never_rest(flags):
             for _ in range(_BETWEEN_LOOKS):
                 pause()
         _become(_OTHER)
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) the loop of the thread without running it."""
+    _never_rest.compile("void(int64[::1])")
 
 
 @contextmanager
@@ -71,6 +76,8 @@ def kept_awake(processor: int | None, wanted: str) -> Iterator[bool]:
     ):
         yield False
         return
+
+    warm_up()  # the thread has no time for it: it is waited for
 
     def work() -> None:
         os.sched_setaffinity(0, {processor})  # of this thread

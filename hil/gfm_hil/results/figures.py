@@ -60,13 +60,8 @@ def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
     )
 
 
-def draw_panel(
-    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
-) -> None:
-    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
-    for k, (t, x, colour, label) in enumerate(curves):
-        style = _STYLES[k % len(_STYLES)]
-        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, ls=style, label=label)
+def dress(axes: Axes, title: str = "") -> None:
+    """What every panel has: a title at the left, a faint grid, no box."""
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.tick_params(labelsize=8.5, color=_GREY)
@@ -74,6 +69,16 @@ def draw_panel(
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(_GREY)
+
+
+def draw_panel(
+    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
+) -> None:
+    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
+    for k, (t, x, colour, label) in enumerate(curves):
+        style = _STYLES[k % len(_STYLES)]
+        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, ls=style, label=label)
+    dress(axes, title)
     axes.ticklabel_format(useOffset=False)
     low, high = axes.get_ylim()
     least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise

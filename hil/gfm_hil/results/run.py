@@ -119,8 +119,8 @@ class Run:
 
     @property
     def metrics(self) -> dict[str, dict[str, Any]]:
-        """What each event brought, by ``label @ t s``: overshoot, settling, nadir and more, with
-        the units of their names."""
+        """What each event brought, by ``label @ t s`` (overshoot, settling, nadir and more, with
+        the units of their names)."""
         return {
             f"{event['label']} @ {event['t']:g} s": {
                 key: value for key, value in event.items() if key not in _NOT_METRICS

@@ -6,11 +6,11 @@ what follows the name's colon (quantity, value, threshold, time) is for people.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gfm_plant.names import CONTROLLER, CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS
+from gfm_runtime.errors import meant
 from gfm_runtime.states import OK, OPERATOR, PLANT_TRIP, REASONS
 
 if TYPE_CHECKING:
@@ -52,11 +52,9 @@ def check_expectation(scenario: Scenario) -> list[str]:
             if value is not None
         ]
     elif reason is not None and reason not in names:
-        close = difflib.get_close_matches(reason, names, n=1)
-        meant = f"did you mean {close[0]!r}? " if close else ""
         problems.append(
-            f"expect_reason = {reason!r:.80}: {meant}expect = {scenario.expect!r} takes "
-            f"one of {list(names)}"
+            f"expect_reason = {reason!r:.80}: expect = {scenario.expect!r} takes "
+            f"one of {list(names)}{meant(reason, names)}"
         )
     if scenario.expect_after is not None and scenario.expect_after >= scenario.duration:
         problems.append(

@@ -40,7 +40,7 @@ class Plan:
             event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
         except ValidationError as problem:
             raise UserError(
-                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem))
+                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, Event))
             ) from None
         self._steps.append(event)
         try:

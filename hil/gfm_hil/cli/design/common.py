@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 import functools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
-from gfm_design.norms.weights import read_weights
+from gfm_design.norms.performance import Channel
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
 from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
 
@@ -47,20 +45,6 @@ def read_gains(text: str | None, option: str = "--gains") -> dict[str, float]:
     return found
 
 
-def weights_of(options: argparse.Namespace) -> tuple[Weight, ...]:
-    """The weights asked for.
-
-    Raises:
-        UserError: the file cannot be read or a weight in it cannot be.
-    """
-    if options.weights is None:
-        return PAPER_WEIGHTS
-    try:
-        return read_weights(Path(options.weights))
-    except ValueError as problem:
-        raise UserError(f"--weights {options.weights}: {problem}") from None
-
-
 def singular_is_users(
     call: Callable[[argparse.Namespace], int],
 ) -> Callable[[argparse.Namespace], int]:
@@ -84,6 +68,6 @@ def print_channels(name: str, channels: Sequence[Channel]) -> None:
     table = Table("channel", "‖W T‖∞", "at \\[rad/s]", box=None, pad_edge=False, title=None)
     for c in channels:
         table.add_row(f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", cell(c.omega))
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}")
     console.print(table)

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
@@ -19,6 +18,7 @@ from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.campaign.execute import WorkerLost
 from gfm_hil.studies.law_comparison.execute import kept, run
 from gfm_hil.studies.law_comparison.figures import draw
@@ -79,7 +79,7 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(result, indent=1))
     else:
         print_comparison(order, left_out)
-        Console(highlight=False, soft_wrap=True).print(f"folder: {folder}")
+        terminal(highlight=False, soft_wrap=True).print(f"folder: {folder}")
     if len(rows) < len(jobs):
         why = f"{lost}; " if lost else "interrupted; "
         again = f"the same command with --out {folder} goes on"
@@ -116,7 +116,7 @@ def _make(folder: Path) -> None:
 @contextlib.contextmanager
 def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     """A bar of laws and one of each search; yields what tells them of evaluations and of rows."""
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = terminal(stderr=True, quiet=options.quiet, highlight=False)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import socket
-from importlib.util import find_spec
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
@@ -15,20 +14,20 @@ from gfm_hil.links.can.options import LOOPBACK, CanOptions
 _PLACES = 4  # of a loopback bus, UDP ports in a row
 
 
-_NEEDS = "link.type = 'can' needs cantools: pip install 'gfmhil[can]'"
-
-
 def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
-    if find_spec("cantools") is None:
-        raise UserError(_NEEDS)
     from gfm_hil.links.can.link import CanLink
 
     return CanLink(side, endpoint, options)
 
 
+def _warm_up(options: CanOptions) -> None:
+    from gfm_hil.links.can.layout import load_plan
+    from gfm_hil.links.can.link import warm_up
+
+    warm_up(load_plan(options))
+
+
 def _check(options: CanOptions, T_s: float) -> None:
-    if find_spec("cantools") is None:
-        raise ValueError(_NEEDS)
     from gfm_hil.links.can.bus_budget import check_budget
 
     check_budget(options, T_s)
@@ -79,5 +78,6 @@ KIND = LinkKind(
     options=CanOptions,
     check=_check,
     check_both=_refuse_unused,
+    warm_up=_warm_up,
     exact=False,
 )

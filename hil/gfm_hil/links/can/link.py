@@ -79,7 +79,7 @@ class CanLink:
         self._node = Node(plan, side, options)
         self._cut = SegmentSender(plan, side)
         self._message, self._frame = np.zeros(LONGEST, np.uint8), np.zeros(1, frame_dtype)
-        _compile(plan)
+        warm_up(plan)
         self._bus = _open_bus(side, endpoint, options)
         if not options.portable:
             self._reach(self._bus, options)
@@ -215,8 +215,8 @@ class CanLink:
             self._bus.shutdown()
 
 
-def _compile(plan: Plan) -> None:
-    """Compile (or load from cache) what a tick calls, before the other side waits for it."""
+def warm_up(plan: Plan) -> None:
+    """Compile (or load from the cache) what a tick calls, before the other side waits for it."""
     ends = {side: Node(plan, side, CanOptions(fd=plan.fd)) for side in SIDES}
     message = np.zeros(LONGEST, np.uint8)
     groups: tuple[tuple[Side, Group], ...] = (("plant", "y"), ("controller", "u"))
@@ -229,6 +229,7 @@ def _compile(plan: Plan) -> None:
         fetch(theirs)
         receive(theirs, message)
         room_to_send(mine)
+        can_port(ends[side])
 
 
 def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:

@@ -85,6 +85,15 @@ class ImpairedLink:
         self._link.close()
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) the stage; the functions around it are compiled anew in
+    every process."""
+    stage, message = make_stage(Impairment(delay=1e-6), 0), np.zeros(LONGEST, np.uint8)
+    admit(stage, message, 1)
+    release(stage, message)
+    waiting(stage)
+
+
 @intrinsic
 def _pointer(typingctx: Any, address: Any) -> Any:
     """An int64 address as a pointer that ``carray`` takes."""

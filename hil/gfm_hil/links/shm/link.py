@@ -37,6 +37,7 @@ class ShmLink:
         self._handle = np.zeros(ring.HANDLE, np.int64)
         self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
+        ring.warm_up()
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 

@@ -36,6 +36,11 @@ def native_port(socket: zmq.Socket[bytes]) -> Port | None:
     return Port(handle, _send, _receive, 0, _await, _LOOKS)  # its own thread needs the processor
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) the functions of a port."""
+    Port(np.zeros(3, np.int64), _send, _receive, 0, _await)
+
+
 def _functions() -> tuple[int, int] | None:
     """Addresses of zmq_send and zmq_recv.
 

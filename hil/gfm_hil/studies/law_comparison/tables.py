@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gfm_design.margins.delays import longest
 from gfm_design.model.closed_loop import T_S
+from gfm_hil.core.terminal import terminal
 
 Row = dict[str, Any]
 Column = tuple[str, Callable[[Row], str]]
@@ -172,9 +172,11 @@ def markdown(name: str, rows: Sequence[Row]) -> str:
 
 def print_comparison(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
     """Print the ranking, then the laws that have no place in it, and why."""
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     heads = ("law", "γ own", "γ ideal", "γ late", "worst channel", "delay µs", "overshoot %")
-    table = Table(*heads, box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    for head in heads:
+        table.add_column(head, no_wrap=head == "law")
     for row in (r for r in rows if r["gamma"] is not None):
         table.add_row(
             row["law"],
