@@ -78,7 +78,7 @@ def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
     before = cached(root)
     assert before
     for link in link_names():
-        scenario = make(link={"type": link}, duration=0.01)
+        scenario = make(link={"type": link, "peer_timeout_s": 60.0}, duration=0.01)
         run = run_scenario(scenario, tmp_path / link, notice=said.append, figures=False)
         assert run.summary["status"] == "completed"
     assert said == ["starting controller and plant …"] * len(link_names())
