@@ -1,7 +1,21 @@
-"""Settings for the whole suite."""
+"""Settings for the whole suite, and its tiers.
+
+``python -m pytest`` runs the fast tier: what needs no process of its own, in parallel. The other
+tiers are marked and run one test at a time, because they measure out processors and ports:
+
+* ``full``: every law where the fast tier takes one of each structure, and long computations,
+* ``processes``: real processes, sockets, real time,
+* ``systems``: a browser, user-mode Linux, systemd, a C compiler, kills, soaks.
+
+``--tier`` chooses tiers; a path, ``-k`` or ``-m`` on the command line chooses from all of them.
+"""
+
+from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 
+import pytest
 from hypothesis import settings
 
 pytest_plugins = ["tests.attacks"]
@@ -17,3 +31,46 @@ settings.register_profile("gfmhil", deadline=None)
 settings.load_profile("gfmhil")
 # Fuzzing for as long as wanted, see CONTRIBUTING.md. An input that takes that long is a fault.
 settings.register_profile("fuzz", deadline=60_000, max_examples=20_000)
+
+_SYSTEMS = ("apt", "soak", "uml")
+FAST, TIERS = "fast", ("full", "processes", "systems")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--tier",
+        action="append",
+        choices=[FAST, *TIERS, "all"],
+        help="run the tests of this tier; may be repeated (default: fast)",
+    )
+
+
+def chosen(config: pytest.Config) -> set[str]:
+    """The tiers that the command line asks for."""
+    tiers = set(config.option.tier or ())
+    if not tiers:
+        narrowed = config.option.keyword or config.option.markexpr
+        whole = config.args_source == pytest.Config.ArgsSource.TESTPATHS
+        tiers = {FAST} if whole and not narrowed else {"all"}
+    return {FAST, *TIERS} if "all" in tiers else tiers
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Run the fast tier on all processors, a file at a time, unless told how many (``-n``)."""
+    if chosen(config) <= {FAST, "full"} and getattr(config.option, "numprocesses", 0) is None:
+        config.option.numprocesses, config.option.dist = "logical", "loadfile"
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    tiers = chosen(config)
+    left = [item for item in items if tier(item.iter_markers()) not in tiers]
+    if left:
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if tier(item.iter_markers()) in tiers]
+
+
+def tier(markers: Iterable[pytest.Mark]) -> str:
+    """The last of ``TIERS`` that a test is marked with; fast if it is marked with none."""
+    names = {"systems" if mark.name in _SYSTEMS else mark.name for mark in markers}
+    return max((t for t in TIERS if t in names), key=TIERS.index, default=FAST)

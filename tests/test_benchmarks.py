@@ -27,7 +27,7 @@ def test_versus_motulator() -> None:
     assert found["gfmhil"]["median"] > found["motulator"]["median"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_observers() -> None:
     words = ["--clients", "3", "--turns", "1", "--seconds", "0.3"]
     bare, none, many = rows_of("observers", *words)["rows"]
@@ -36,7 +36,7 @@ def test_observers() -> None:
     assert none["answers_per_s"] == 0 < many["answers_per_s"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_keep_awake() -> None:
     rows = rows_of("keep_awake", "--links", "shm", "--turns", "1", "--seconds", "0.3")
     assert [(row["keep_awake"], row["ticks"]) for row in rows] == [

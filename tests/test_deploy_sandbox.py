@@ -39,7 +39,7 @@ LIMITS = {
 
 pytestmark = [
     pytest.mark.apt,
-    pytest.mark.slow,
+    pytest.mark.full,
     pytest.mark.timeout(600),
     pytest.mark.skipif(
         shutil.which("systemd-analyze") is None or os.geteuid() != 0,

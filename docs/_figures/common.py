@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
-
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
+from gfm_hil.results.figures import dress as dress
 from gfm_hil.results.runner import Run, run_scenario
 from gfm_hil.scenario.model import Scenario, check_scenario, find_scenario
 from gfm_plant import Plant
@@ -58,17 +57,6 @@ def modes(law: str, plant: dict[str, Any], ideal: bool = False, **gains: float) 
 def within(found: Sequence[Mode], low: float, high: float) -> Mode:
     """The longest lasting mode of a band, Hz."""
     return next(m for m in found if low < m.frequency_hz < high)
-
-
-def dress(axes: Axes, title: str) -> None:
-    """What every panel has: a title at the left, a faint grid, no box."""
-    axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
-    axes.grid(True, color="#e4e4e4", lw=0.6)
-    axes.tick_params(labelsize=8.5, color=GREY)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(GREY)
 
 
 def number(value: float | None, digits: int = 3) -> str:

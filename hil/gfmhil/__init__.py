@@ -1,4 +1,4 @@
-"""The public API: run scenarios, compare laws, change gains, load runs, from Python.
+"""The public API: run scenarios, compare laws, change gains, load runs, from Python::
 
     import gfmhil
 
@@ -19,19 +19,24 @@ _HOMES = {
     "Run": "gfm_hil.results.run",
     "load_scenario": "gfm_hil.scenario.model",
     "Scenario": "gfm_hil.scenario.model",
+    "CampaignResult": "gfm_hil.studies.campaign.result",
     "Law": "gfm_hil.studies.law",
     "laws": "gfm_hil.studies.law",
+    "Loop": "gfm_hil.studies.loop",
     "run": "gfm_hil.studies.notebook",
+    "campaign": "gfm_hil.studies.notebook",
     "compare": "gfm_hil.studies.notebook",
     "Comparison": "gfm_hil.studies.notebook",
     "LawError": "gfm_runtime.errors",
 }
 
-__all__ = sorted(_HOMES)
+__all__ = sorted([*_HOMES, "design"])
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for, when it is."""
+    if name == "design":
+        return import_module("gfmhil.design")
     if name not in _HOMES:
         raise AttributeError(f"module 'gfmhil' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

@@ -124,8 +124,8 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
 
 @compiled
 def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> None:
-    """Write the true values at this tick to out (10,), in the order of `TRUTH`."""
-    s = st[0]
+    """Write the true values at this tick to out (11,), in the order of `TRUTH`."""
+    r, s = par[0], st[0]
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
     out[2] = s.u_now[1]
@@ -134,6 +134,9 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[7] = s.omega_g
     out[8] = s.V_g
     out[9] = s.trip
+    i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
+    i_max = r.i_max if s.trip == 0 else 0.0
+    out[10] = min(max(i_dc, -i_max), i_max)
 
 
 @compiled

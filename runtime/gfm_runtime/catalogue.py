@@ -1,7 +1,7 @@
 """The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``.
 
-``laws/tuned`` holds the same laws with the gains that the league found for the paper's converter.
-They load by name like the others, but are listed apart.
+``laws/tuned`` holds the same laws with the gains that the law comparison found for the paper's
+converter. They load by name like the others, but ``law_names`` does not list them.
 """
 
 from __future__ import annotations

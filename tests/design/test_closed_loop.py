@@ -9,6 +9,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from gfm_design.margins.locus import locus_at_u, locus_at_y
 from gfm_design.model.box import Point
@@ -21,6 +22,7 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant
+from gfm_plant.model import f, g
 from gfm_runtime import discretise, get_law, law_file
 
 from .support import reference_loop
@@ -58,7 +60,7 @@ def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
     signals = np.full((ticks, len(PLANT_COLUMNS)), np.nan)
     run_ticks(bench, signals, np.empty((ticks, len(CONTROLLER_COLUMNS))), 0, ticks)
     p = signals[:, PLANT_COLUMNS.index("true_p")] - REFERENCES[1]
-    t, y = ClosedLoop.of(law, bench.scenario.plant).step("P_ref", seconds=ticks * 1e-4)
+    t, y = ClosedLoop.of(law, bench.scenario.plant).step_response("P_ref", seconds=ticks * 1e-4)
     assert t[1] == pytest.approx(1e-4) and y.shape == (ticks + 1, 5)
     assert np.abs(p / size - y[:ticks, 1]).max() < 2e-3 * np.abs(y[:, 1]).max()
 
@@ -67,7 +69,7 @@ def test_step_settles_where_the_response_at_rest_says() -> None:
     for of in (loop("mimo-gfm-deployable", RIG), loop("mimo-gfm-deployable", ideal=True)):
         rest = of.frequency_response([0.0])[0].real
         for k, name in enumerate(INPUTS):
-            _, y = of.step(name, seconds=8.0, every=1e-3)
+            _, y = of.step_response(name, seconds=8.0, every=1e-3)
             np.testing.assert_allclose(
                 y[-1], rest[:, k], atol=2e-3 * max(1.0, abs(rest[:, k]).max())
             )
@@ -92,6 +94,101 @@ def test_loop_transfer_gives_the_sensitivity_that_the_margins_use() -> None:
         S = np.linalg.inv(np.eye(L.shape[-1]) + L)
         H = (S - 0.5 * np.eye(L.shape[-1]))[:, list(channels)][:, :, list(channels)]
         np.testing.assert_allclose(locus(omega), H, atol=1e-8)
+
+
+@pytest.mark.parametrize("ideal", [True, False])
+def test_gain_of_one_loop_is_that_of_python_control_with_the_others_closed(ideal: bool) -> None:
+    of, omega = loop("mimo-gfm", {} if ideal else RIG, ideal=ideal), np.geomspace(1.0, 2e4, 20)
+    p, c, step = of.held, of.law, [] if ideal else [of.T_s]
+    plant = control.ss(p.A, p.B, p.C, np.zeros((5, 3)), *step)
+    law = control.ss(c.A, c.B, c.C, c.D, *step)
+    for whole, names in (
+        (control.series(plant, law), {"i_u": 0, "omega_u": 1, "E_u": 2}),
+        (control.series(law, plant), {"v_dc": 0, "p": 1, "q": 3, "V": 4}),
+    ):
+        for name, k in names.items():
+            others = np.eye(whole.ninputs)
+            others[k, k] = 0.0
+            closed = control.feedback(whole, control.ss([], [], [], others, *step), sign=1)
+            expected = -closed.frequency_response(omega).frdata[k, k]
+            np.testing.assert_allclose(of.loop_gain(name, omega), expected, rtol=1e-5)
+    with pytest.raises(ValueError, match="'omega_g' is no channel of the loop; use one of"):
+        of.loop_gain("omega_g", omega)
+
+
+@pytest.mark.parametrize("law", ["mimo-gfm", "vsg-5", "hybrid-angle"])
+@pytest.mark.parametrize("plant", [{}, RIG, {"dc_source": {"mode": "regulated"}}])
+def test_output_impedance_and_line_make_the_loop(law: str, plant: dict[str, Any]) -> None:
+    # a step of V_g through the line onto the impedance, against the loop's own response
+    of, omega = loop(law, plant, ideal=True), np.geomspace(0.5, 2e4, 25)
+    r, x = of.made_of.par[0], of.made_of.op.x
+    i, v, delta = x[4:6], x[2:4], x[6]
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    s = (1j * omega)[:, None, None]
+    line = (r["R_g"] + s * r["L_g"] / r["omega_b"]) * np.eye(2) + r["L_g"] * turn
+    Z, v_g = of.output_impedance(omega), np.array([np.cos(delta), -np.sin(delta)])
+    by_i = -np.linalg.solve(Z + line, np.broadcast_to(v_g[:, None], (len(omega), 2, 1)))
+    by_v = -Z @ by_i
+    i_by, v_by = by_i[..., 0], by_v[..., 0]
+    expected = {
+        "p": v_by @ i + i_by @ v,
+        "q": v_by @ turn @ i + i_by @ turn.T @ v,
+        "V": v_by @ v / np.hypot(*v),
+    }
+    response = of.frequency_response(omega)[:, :, INPUTS.index("grid.V_g")]
+    for name, row in (("p", 1), ("q", 3), ("V", 4)):
+        size = np.abs(response[:, row]).max()
+        np.testing.assert_allclose(response[:, row], expected[name], atol=1e-7 * size, rtol=1e-6)
+
+
+def test_output_impedance_of_a_sampled_loop_is_that_of_its_periodic_motion() -> None:
+    # A current e^(j omega t) into the plant's own equations, and u held, 1.25 samples late. The
+    # motion over one tick from (x at its end) = z (x at its start); then v's part at omega.
+    of = loop("vsg-2", {"delay": {"samples": 1, "fraction": 0.25}, "factors": {"R_f": 3.0}})
+    op, law, T, steps = of.made_of.op, of.law, 1e-4, 200
+    keep, d, h = [0, 1, 2, 3, 6, 7], np.ones(2, complex), 1e-4 / 200
+
+    def converter(z: Any) -> Any:
+        """Rates (6), y (5) and the steady frame's v (2) of states (6), u (3) and its i_o (2)."""
+        c, s = np.cos(z[4] - op.x[6]), np.sin(z[4] - op.x[6])
+        i_d, i_q = c * z[9] + s * z[10], c * z[10] - s * z[9]
+        x, u = np.concatenate([z[:4], [i_d, i_q], z[4:6]]), z[6:9]
+        v = [c * x[2] - s * x[3], s * x[2] + c * x[3]]
+        return np.concatenate([f(x, u, d, of.made_of.par)[keep], g(x, u), v])
+
+    at = np.concatenate([op.x[keep], op.u, op.x[4:6]])
+    S = np.column_stack([converter(at + 1e-30j * e).imag / 1e-30 for e in np.eye(11)])
+    S[8] = 0.0  # the law is fed its own omega_u
+    C_y, n, m = S[6:11, :6], 6, len(law.A)
+    for omega in (3.0, 300.0, 9000.0):
+        z, Z = np.exp(1j * omega * T), np.empty((2, 2), complex)
+        for k in range(2):
+            D_y, system = S[6:11, 9 + k], np.zeros((n + 4, n + 4), complex)
+            system[:n] = np.column_stack([S[:6, :9], S[:6, 9 + k]])  # by x, u, the current
+            system[-1, -1] = 1j * omega
+            over, early, middle = expm(system * h), expm(system * T / 4), expm(system * h / 2)
+            late = expm(system * 3 * T / 4)
+            # x at the end by x, u[k-2] in the first quarter and u[k-1] then, the current
+            by_x, by_i = late[:n, :n] @ early[:n, :n], (late @ early)[:n, -1]
+            by_u = late[:n, :n] @ early[:n, n:-1] / z**2 + late[:n, n:-1] / z
+            F = np.block([
+                [by_x - z * np.eye(n), np.zeros((n, m)), by_u],
+                [law.B @ C_y, law.A - z * np.eye(m), np.zeros((m, 3))],
+                [law.D @ C_y, law.C, -np.eye(3)],
+            ])  # fmt: skip
+            found = -np.linalg.solve(F, np.concatenate([by_i, law.B @ D_y, law.D @ D_y]))
+            x, u, values = found[:n], found[-3:], []
+            for j in range(steps):
+                acting = u / (z**2 if j < steps // 4 else z)
+                state = np.concatenate([x, acting, [np.exp(1j * omega * j * h)]])
+                values.append(
+                    S[11:, :6] @ (middle @ state)[:n] * np.exp(-1j * omega * (j + 0.5) * h)
+                )
+                x = (over @ state)[:n]
+            np.testing.assert_allclose(x, z * found[:n], rtol=1e-6)
+            Z[:, k] = -np.mean(values, axis=0)
+        # the mean over 200 midpoints is exact to some (omega_0 h)^2 of the filter
+        np.testing.assert_allclose(of.output_impedance([omega])[0], Z, rtol=1e-4, atol=1e-5)
 
 
 def test_many_plants_in_one_loop_are_each_of_them() -> None:
@@ -156,7 +253,7 @@ def test_what_cannot_be() -> None:
     with pytest.raises(ValueError, match="sample it first"):
         ideal.margins()
     with pytest.raises(ValueError, match="'P_reff' is no input"):
-        ideal.step("P_reff")
+        ideal.step_response("P_reff")
     with pytest.raises(ValueError, match="made of matrices"):
         ClosedLoop(ideal.plant, ideal.law).changed({"L_g": 2.0})
     with pytest.raises(Unstable):

@@ -8,8 +8,10 @@ import pytest
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains, tied
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_runtime import LawError, law_file, law_names
+from gfm_runtime import LawError, law_file
 from gfm_runtime.lawfile import parse_law
+
+from ..runtime.support import every_law
 
 
 def test_ties_follow() -> None:
@@ -33,14 +35,14 @@ def test_gains_that_cannot_be(
         free_gains(law_file("mimo-gfm"), start, only)
 
 
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_every_law_declares_its_gains(law: str) -> None:
     file = law_file(law)
     assert free_gains(file)  # its defaults lie within its own bounds
     assert not {"D_p", "D_q", "R", "X"} & {n for n, p in file.parameters.items() if p.free}
 
 
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_a_law_as_a_function_of_its_gains(law: str) -> None:
     """Many at once against one by one from the file, by T(s)."""
     gains = free_gains(law_file(law))

@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 
 from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.announcement import announcement
-from gfm_hil.engine.command_server import Desk
+from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.modbus.connection import Server
@@ -238,7 +238,7 @@ def _loop(place: Path, side: Any) -> Iterator[tuple[str, list[bool]]]:
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        with Desk(side, bench, timeline, place, bell.set, lambda: stopped.append(True)):
+        with CommandServer(side, bench, timeline, place, bell.set, lambda: stopped.append(True)):
             found = json.loads(announcement(place, side).read_text())
             yield found["endpoint"], stopped
         assert thread.is_alive()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_design.model.closed_loop import REFERENCES
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import load_scenario
 
@@ -69,9 +70,57 @@ def test_the_transfer_matrix_is_that_of_the_law(name):
         assert np.allclose(matrix(1j * omega), built(1j * omega), rtol=1e-9, atol=1e-12)
 
 
-def test_a_closed_loop_of_a_law():
-    loop = gfmhil.Law.load("vsg-2").closed_loop()
-    assert max(mode.sigma for mode in loop.modes()) < 0
+def test_a_package_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(gfmhil.UserError, match=r"needs python-control: pip install 'gfmhil\[desig"):
+        gfmhil.Law.load("vsg-2").to_control()
+
+
+def test_a_closed_loop_of_a_law_draws_what_it_says():
+    law = gfmhil.Law.load("mimo-gfm")
+    loop = law.closed_loop("rig_pref_step")
+    rig = load_scenario("rig_pref_step")
+    assert np.array_equal(loop.A, law.closed_loop(rig).A)
+    assert np.array_equal(loop.A, law.closed_loop(rig.plant, references=REFERENCES).A)
+    assert loop.T_s == 1e-4 and law.closed_loop(ideal=True).T_s is None
+    for curve in loop.bode("E_u", "V")[0].lines[:2]:
+        hz, gain = curve.get_data()
+        expected = loop.loop_gain(curve.get_label(), 2 * np.pi * hz)
+        assert np.allclose(gain, 20 * np.log10(np.abs(expected)))
+    hz, phase = loop.bode("E_u")[1].lines[0].get_data()
+    turned = phase / 360 - np.angle(loop.loop_gain("E_u", 2 * np.pi * hz)) / (2 * np.pi)
+    assert np.allclose(turned, np.round(turned)) and np.abs(np.diff(phase)).max() < 180
+    labels = [line.get_label() for line in loop.nyquist().lines]
+    assert labels[:2] == ["omega_u", "E_u"]  # the regulated source ignores i_u
+    _, y = loop.step_response("grid.V_g", 0.1)
+    for axes, column in zip(loop.step("grid.V_g", 0.1), y.T, strict=True):
+        assert np.array_equal(axes.lines[0].get_ydata(), column)
+    drawn = np.concatenate([line.get_xdata() for line in loop.pole_map().lines[:2]])
+    assert np.array_equal(np.sort(drawn), np.sort(loop.poles().real))
+    hz, size = loop.impedance()[0].lines[1].get_data()
+    assert np.array_equal(size, np.abs(loop.output_impedance(2 * np.pi * hz)[:, 0, 1]))
+    with pytest.raises(gfmhil.UserError, match="'i_u' is no channel of the loop"):
+        loop.bode("i_u")
+    with pytest.raises(gfmhil.UserError, match="'P' is no input of the loop"):
+        loop.step("P")
+
+
+def test_gamma_gains_and_margins_of_a_law():
+    law = gfmhil.Law.load("vsg-2")
+    gamma = gfmhil.design.gamma(law)
+    assert gamma.value == pytest.approx(15.975, rel=5e-5)  # of the printed gains
+    assert gamma.to_pandas()["norm"].max() == gamma.value
+    softer = law.with_gains("softer", k_34=1.0)
+    assert softer.gains["k_35"] == pytest.approx(20.0)  # tied: k_34 / D_q
+    assert law.with_gains(k_34=1.0, k_35=3.0).gains["k_35"] == 3.0
+    found = gfmhil.design.tune(softer, "mine", evaluations=120, starts=1, seed=4)
+    assert found.law.name == "mine" and found.gains == {n: found.law.gains[n] for n in found.gains}
+    assert found.gamma.value < gfmhil.design.gamma(softer).value
+    assert gfmhil.design.gamma(found.law).value == pytest.approx(found.gamma.value, rel=1e-6)
+    with pytest.raises(gfmhil.design.UnstableLoop, match="the mode at 49"):
+        gfmhil.design.margins(law, "rig_pref_step")
+    margins = gfmhil.design.margins("droop-5", "pref_step")
+    assert margins.loop.delay.seconds == pytest.approx(1014e-6, rel=1e-3)  # docs/margins.md
 
 
 def test_tables_of_other_libraries():

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 
+import gfmhil
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.studies.campaign import worker
@@ -24,7 +26,7 @@ from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, execute, processes
 from gfm_hil.studies.campaign.figure import draw_map
 from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_hil.studies.campaign.result import summary
+from gfm_hil.studies.campaign.result import summary, verdict
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.worker import Record, run_chunk
@@ -100,7 +102,7 @@ def stored(folder: Path) -> list[str]:
     return [head, *sorted(lines, key=lambda s: (json.loads(s)["run"], json.loads(s)["law"]))]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
     arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "one")]
     assert main([*arguments, "--workers", "1", "--quiet"]) == 0
@@ -109,7 +111,7 @@ def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
     assert stored(whole / "one") == lines
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_resumed_campaign_equals_an_uninterrupted_one(whole: Path, tmp_path: Path) -> None:
     folder = tmp_path / "resumed"
     shutil.copytree(whole / "two", folder)
@@ -158,6 +160,42 @@ def test_more_runs_go_on_with_the_same_draws(file: Callable[..., Path], whole: P
     assert store.missing(more) == [(10, "mimo-gfm"), (10, "vsg-2")]
 
 
+def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(
+    whole: Path, tmp_path: Path
+) -> None:
+    found = gfmhil.campaign(whole / "small.toml")
+    assert [json.dumps(r) for r in found.records] == stored(whole / "two")[1:]
+    table = found.to_pandas()
+    assert list(table["verdict"]) == [verdict(r, 0.2) for r in found.records]
+    assert list(table["plant.factors.L_g"]) == [
+        r["drawn"]["plant.factors.L_g"] for r in found.records
+    ]
+    peaks = [r["events"][0]["p_peak"] if r["events"] else None for r in found.records]
+    assert (
+        list(table["events.0.p_peak"].astype(object).where(table["events.0.p_peak"].notna(), None))
+        == peaks
+    )
+    assert len(found.plot(y="plant.factors.R_f")) == 2
+    assert "CampaignResult 'a small one', 20 runs" in repr(found)
+    law = gfmhil.Law.load("vsg-2").with_gains("mine", D_p=0.02)
+    content = tomllib.loads(TEXT)
+    again = gfmhil.campaign(content, tmp_path / "out", laws=[law, "vsg-2"], runs=2)
+    assert [(r["run"], r["law"]) for r in again.records] == [
+        (run, name) for run in range(2) for name in ("mine", "vsg-2")
+    ]
+    assert again.records[1::2] == found.records[1:4:2]
+    assert again.records[0] != again.records[1]
+    kept = tomllib.loads((tmp_path / "out" / "campaign.toml").read_text(encoding="utf-8"))
+    assert kept == content | {"laws": ["mine", "vsg-2"], "runs": 2}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "campaign.toml", "campaign.json", "runs.jsonl", "map.png",
+    }  # fmt: skip
+    with pytest.raises(UserError, match="in use"):
+        gfmhil.campaign(content, tmp_path / "out")
+    with pytest.raises(UserError, match="workers = 0"):
+        gfmhil.campaign(content, workers=0)
+
+
 def test_folder_of_a_campaign(whole: Path) -> None:
     names = {path.name for path in (whole / "two").iterdir()}
     assert names == {"campaign.toml", "campaign.json", "runs.jsonl", "map.png"}
@@ -170,7 +208,7 @@ def test_folder_of_a_campaign(whole: Path) -> None:
         assert len(found["worst"]) == 5
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> None:
     arguments = ["campaign", str(whole / "small.toml"), "--only", "5"]
     assert main([*arguments, "--out", str(tmp_path / "alone")]) == 0
@@ -184,7 +222,7 @@ def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> Non
         assert result["status"] == record["status"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_dask_gives_the_same_bits(whole: Path) -> None:
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
@@ -208,7 +246,7 @@ def test_dask_without_the_package_says_so(
     assert not out.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]) -> None:
     campaign = load_campaign(str(file(**{"runs = 10": "runs = 2000"})))
     jobs = [(run, "mimo-gfm") for run in range(2000)]
@@ -240,7 +278,7 @@ def test_an_error_in_a_run_names_the_run(
         execute(campaign, [(7, "vsg-2")], pool, 1, lambda records: None, lambda: False)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_ctrl_c_keeps_what_is_there(file: Callable[..., Path], tmp_path: Path) -> None:
     path, out = file(**{"runs = 10": "runs = 2000"}), tmp_path / "out"
     command = [sys.executable, "-m", "gfm_hil", "campaign", str(path), "--out", str(out)]

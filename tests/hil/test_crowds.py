@@ -87,7 +87,7 @@ class Page(threading.Thread):
         self.socket.send(json.dumps(content))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.attack(
     "4.9",
     f"{PAGES} mute pages and {CONNECTIONS} half-open Modbus connections, {DESCRIPTORS} descriptors",

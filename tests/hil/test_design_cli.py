@@ -75,6 +75,28 @@ def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
     assert "mode at 50.7" in out["reason"]  # the synchronous resonance
 
 
+@pytest.mark.parametrize("kind", ["bode", "nyquist"])
+def test_a_loop_is_drawn_with_its_margins(kind: str, capsys: Capture, tmp_path: Path) -> None:
+    figure = tmp_path / "loop.png"
+    out = said(capsys, kind, "--law", "vsg-2", "--at", "E_u,V", "--out", str(figure))
+    assert list(out["at"]) == ["E_u", "V"]
+    assert out["at"]["E_u"]["gain_high"] == pytest.approx(1.12, abs=0.01)  # docs/margins.md
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    out = said(capsys, kind, "--law", "vsg-2", "--scenario", "rig_pref_step", code=3)
+    assert out["mode"]["frequency_hz"] == pytest.approx(49.5, abs=0.1)
+
+
+def test_poles_and_a_step(capsys: Capture, tmp_path: Path) -> None:
+    out = said(capsys, "poles", "--law", "vsg-2", "--scenario", "rig_pref_step")
+    assert not out["stable"] and out["modes"][0]["frequency_hz"] == pytest.approx(49.5, abs=0.1)
+    figure = tmp_path / "step.svg"
+    out = said(capsys, "step", "--law", "mimo-gfm", "--seconds", "4", "--out", str(figure))
+    assert out["y"]["p"]["end"] == pytest.approx(1.0, abs=0.01)
+    assert figure.read_text("utf-8").startswith("<?xml")
+    assert main(["design", "step", "--law", "mimo-gfm"]) == 0
+    assert "after P_ref" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -94,6 +116,10 @@ def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
         (["tune", "--law", "vsg-2", "--out", "no-such-folder/x.toml"], "no-such-folder"),
         (["tune", "--law", "vsg-2", "--evaluations", "0"], "at least 1"),
         (["tune", "--law", "vsg-2", "--seed", "-1"], "negative"),
+        (["bode", "--at", "omega_g"], "omega_g"),
+        (["nyquist", "--law", "no-such-law"], "no-such-law"),
+        (["step", "--of", "P"], "'P' is no input of the loop"),
+        (["poles", "--out", "poles.none"], "poles.none"),
     ],
 )
 def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:

@@ -12,8 +12,8 @@ from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
 from gfm_hil.results.runner import run_scenario
-from gfm_runtime import law_names
 
+from ..runtime.support import every_law
 from .conftest import home_plant
 
 LOAD = {"load_R": 36.1, "load_L": 1e-3}  # about 1 p.u.
@@ -25,7 +25,7 @@ def at(t: float, **content):
     return {"t": t, **content}
 
 
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_every_law_starts_in_an_equilibrium_on_its_home_grid(law, run):
     done = run(law=law, duration=0.2, plant=home_plant(law))
     assert done.summary["status"] == "completed"

@@ -25,10 +25,10 @@ from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.recorder import Part
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime import law_names
 from gfm_runtime.signals import names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
+from ..runtime.support import every_law
 from .conftest import home_plant
 from .pairs import PATIENT, run_pair
 from .test_frames import resealed
@@ -55,7 +55,7 @@ def three_ways(content: dict[str, Any], link: str, make: Any, run: Any, place: P
 
 
 @pytest.mark.parametrize("link", PORTS)
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_every_law_in_lockstep(law, link, make, run, place):
     content = {
         "law": law,

@@ -12,8 +12,8 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gfm_hil.modbus.connection import Server
 from gfm_hil.modbus.image import BASE, VENDOR
-from gfm_runtime import law_names
 
+from ..runtime.support import every_law
 from .test_modbus_device import S_N, Bench
 
 
@@ -28,7 +28,7 @@ def test_the_image_is_a_sunspec_map():
     assert at + 2 == len(registers)
 
 
-@pytest.mark.parametrize("law", law_names())
+@pytest.mark.parametrize("law", every_law())
 def test_the_droops_of_every_law_are_those_of_its_file_or_none(law):
     from gfm_hil.modbus.gains import Gains
 

@@ -15,7 +15,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.rate import Rate
 from gfm_hil.engine.announcement import announced, present
-from gfm_hil.engine.command_server import Desk
+from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.operator import Operator
@@ -30,7 +30,7 @@ class Ends:
     def __init__(self, folder: Path, bench: Any) -> None:
         self.timeline = Timeline(bench, folder / "events_controller.jsonl", ("controller",))
         self.stops, self.tick = 0, 0
-        self.desk = Desk("controller", bench, self.timeline, folder, self.ring, self.stop)
+        self.desk = CommandServer("controller", bench, self.timeline, folder, self.ring, self.stop)
 
     def ring(self) -> None:
         self.tick += 1
@@ -97,7 +97,7 @@ def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, a
         raise KeyError("a mistake of ours")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Desk, "_checked", fails)
+        patch.setattr(CommandServer, "_checked", fails)
         answer = ask(tmp_path, json.dumps(P_REF).encode())[0]
     assert not answer["ok"] and "a mistake of ours" in answer["error"] + caplog.text
     assert ask(tmp_path, json.dumps(P_REF).encode())[0]["ok"]

@@ -335,7 +335,7 @@ def test_a_disk_without_room_is_said_before_the_run(small_disk, make):
 # long runs
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.timeout(600)
 @pytest.mark.attack("7.5", "8,000 events in a run", "more than 8 minutes, nearly all of it drawing")
 def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, attack_now):
@@ -398,7 +398,7 @@ def test_finishing_takes_the_memory_of_pieces(make, tmp_path):
     assert peak < whole / 2
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.timeout(600)
 @pytest.mark.attack(
     "7.6", "a recording of 5·10⁶ ticks, with times, is put together", "2.6 GB of memory"

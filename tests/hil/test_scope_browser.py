@@ -13,7 +13,7 @@ from .scope_pages import HAS_BROWSER, Browser, Rig, rig, wait_for
 
 pytestmark = [
     pytest.mark.apt,
-    pytest.mark.slow,
+    pytest.mark.full,
     pytest.mark.timeout(300),
     pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium and chromium-driver"),
 ]

@@ -8,7 +8,7 @@ import pytest
 from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
-from gfm_plant import plant_advance, plant_sample, plant_truth
+from gfm_plant import TRUTH, plant_advance, plant_sample, plant_truth
 
 
 def commands(n: int, u0: Any) -> Any:
@@ -106,7 +106,7 @@ def test_no_allocation_in_a_tick(rest: Callable[..., Any]) -> None:
         dac="DS2101",
         delay={"samples": 1, "fraction": 0.5},
     )
-    arguments = plant.par, plant.st, plant.u, np.empty(5), np.empty(10)
+    arguments = plant.par, plant.st, plant.u, np.empty(5), np.empty(len(TRUTH))
     run(*arguments, 1)
     _nrt_python.memsys_enable_stats()
     before = rtsys.get_allocation_stats().alloc

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import settings
 from numba import njit
 from numpy.typing import NDArray
@@ -27,6 +28,24 @@ LAWS = {
     for s in map(load_law, law_names())
     for k, law in enumerate(s.laws)
 }
+
+
+def structure(name: str) -> tuple[object, ...]:
+    """What makes two laws run the same code: error map, schedule, states of each row of Φ."""
+    laws = load_law(name).laws
+    orders = [sum(e.order for (i, _), e in laws[0].phi.items() if i == row) for row in range(NU)]
+    return laws[0].error_map, len(laws) > 1, *(min(order, 3) for order in orders)
+
+
+def every_law() -> list[Any]:
+    """All laws as parameters of a test: one of each structure is fast, the others are ``full``."""
+    first: dict[tuple[object, ...], str] = {}
+    for name in law_names():
+        first.setdefault(structure(name), name)
+    return [
+        pytest.param(name, marks=() if name in first.values() else pytest.mark.full)
+        for name in law_names()
+    ]
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
-_ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
 _LOWEST = 1e-3  # rad/s; below it a loop is what it is at rest, unless a pole is there
 _STRAIGHT = 0.01
 _ROUNDS = 12
@@ -52,8 +51,7 @@ class Locus:
         top = np.pi / self.T_s
         poles = np.linalg.eigvals(self.A)
         s = np.log(poles[np.abs(poles) > _GONE].astype(complex)) / self.T_s
-        near = np.abs(s.imag[:, None] + _ACROSS * s.real[:, None]).ravel()
-        base = np.geomspace(_LOWEST, top, 200)
+        near, base = frequencies_near(s), np.geomspace(_LOWEST, top, 200)
         omega = np.unique(np.concatenate([[0.0, top], base, near[near < top]]))
         H = self(omega)
         for _ in range(_ROUNDS):

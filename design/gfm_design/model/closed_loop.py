@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,12 +38,13 @@ from gfm_design.norms.performance import (
     channel_norms,
 )
 from gfm_plant import Plant, load_converter, make_plant
+from gfm_plant.model import DELTA
 from gfm_plant.parameters import Element
 from gfm_plant.records import PlantRecord
 from gfm_runtime.catalogue import get_law
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import realise
-from gfm_runtime.signals import NU, NY, REF_NAMES, Y_NAMES
+from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
 from gfm_runtime.tustin import OMEGA_ROW, DiscreteLaw, discretise
 
 if TYPE_CHECKING:
@@ -57,8 +58,10 @@ REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # (V_dcref, P_ref, omega_g, Q_ref, V_ref
 #: the loop's inputs w: the references, and the grid as Eq. (15) has it
 INPUTS = (*REF_NAMES, "grid.omega_g", "grid.V_g")
 
+_ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
 _GONE = 1e-9  # |z| below this is gone within a tick: an emptied delay line, no mode
 _P_REF, _OMEGA_G = INPUTS.index("P_ref"), INPUTS.index("grid.omega_g")
+_V_C, _I_O = 2, 4  # where v_d and i_od are in the plant's state; v_q and i_oq follow
 _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
 
 
@@ -123,7 +126,7 @@ class ClosedLoop:
         *,
         T_s: float = T_S,
         ideal: bool = False,
-    ) -> ClosedLoop:
+    ) -> Self:
         """The loop of a law on a plant, around the point where both rest.
 
         Args:
@@ -148,7 +151,7 @@ class ClosedLoop:
     @classmethod
     def _made(
         cls, plant: Plant, law: DiscreteLaw, ideal: bool, ref: Matrix, par: PlantRecord
-    ) -> ClosedLoop:
+    ) -> Self:
         grid, delay = plant.grid, plant.delay
         op = operating_point(par, law, ref, grid.omega_g, grid.V_g)
         linear = linearise_plant(par, op, grid.omega_g, grid.V_g)
@@ -162,7 +165,7 @@ class ClosedLoop:
         return cls(linear, reaction, law.T_s, seconds, origin=origin)
 
     @classmethod
-    def stacked(cls, loops: Sequence[ClosedLoop]) -> ClosedLoop:
+    def stacked(cls, loops: Sequence[ClosedLoop]) -> Self:
         """Single loops of one sampling time, whose sampled plants have one size, as many plants.
 
         The law is that of the first; ``with_law`` gives all of them another.
@@ -178,32 +181,32 @@ class ClosedLoop:
     def __repr__(self) -> str:
         kind = "continuous" if self.T_s is None else f"T_s = {self.T_s:g} s"
         name = f"{self.origin.law.law.name}, " if self.origin else ""
-        return f"<ClosedLoop {name}{kind}, A {self.A.shape}>"
+        return f"<{type(self).__name__} {name}{kind}, A {self.A.shape}>"
 
     # other loops
 
-    def with_law(self, law: LinearLaw) -> ClosedLoop:
+    def with_law(self, law: LinearLaw) -> Self:
         """The same plant under another law, or several; the sampled plant is kept."""
-        out = ClosedLoop(self.plant, law, self.T_s, self.u_delay, self.y_delay)
+        out = type(self)(self.plant, law, self.T_s, self.u_delay, self.y_delay)
         out.__dict__["held"] = self.held
         return out
 
-    def sampled(self, T_s: float, delay: float = 0.0) -> ClosedLoop:
+    def sampled(self, T_s: float, delay: float = 0.0) -> Self:
         """A continuous loop with its law by Tustin at T_s and u held ``delay`` later, s."""
-        return ClosedLoop(self.plant, self.law.sampled(T_s), T_s, delay)
+        return type(self)(self.plant, self.law.sampled(T_s), T_s, delay)
 
-    def later(self, u: ArrayLike = 0.0, y: ArrayLike = 0.0) -> ClosedLoop:
+    def later(self, u: ArrayLike = 0.0, y: ArrayLike = 0.0) -> Self:
         """The sampled loop with more delay of u (3,) and y (5,), s; one number is for all."""
         u_delay, y_delay = self.u_delay + np.asarray(u), self.y_delay + np.asarray(y)
-        return ClosedLoop(self.plant, self.law, self.T_s, u_delay, y_delay, self.origin)
+        return type(self)(self.plant, self.law, self.T_s, u_delay, y_delay, self.origin)
 
-    def scaled(self, u: ArrayLike = 1.0, y: ArrayLike = 1.0) -> ClosedLoop:
+    def scaled(self, u: ArrayLike = 1.0, y: ArrayLike = 1.0) -> Self:
         """The loop with u (3,) and y (5,) multiplied on their way, by complex numbers too."""
         by_u, by_y, c = np.broadcast_to(u, NU)[:, None], np.broadcast_to(y, NY), self.law
         parts = (c.A, c.B * by_y, by_u * c.C, by_u * c.D * by_y, c.B_r, by_u * c.D_r)
         return self.with_law(LinearLaw(*parts, rows=c.rows))
 
-    def changed(self, factors: Mapping[Element, float]) -> ClosedLoop:
+    def changed(self, factors: Mapping[Element, float]) -> Self:
         """The loop anew, at its own operating point, with elements at factors of their values.
 
         Raises:
@@ -345,7 +348,7 @@ class ClosedLoop:
 
         return loop_margins(self)
 
-    def step(
+    def step_response(
         self, of: str = "P_ref", seconds: float = 1.0, every: float = T_S
     ) -> tuple[Matrix, Matrix]:
         """(t, y) after a unit step of one of ``INPUTS``: shapes (K,) in s and (K,5), p.u.
@@ -384,10 +387,80 @@ class ClosedLoop:
         plant, law = _response((p.A, p.B, p.C, zero), s), _response((c.A, c.B, c.C, c.D), s)
         return -plant @ law if at_y else -law @ plant
 
+    def loop_gain(self, at: str, omega: ArrayLike) -> Response:
+        """L of one loop, cut at a channel of u or y while all others are closed, shape (K,).
+
+        The loop is on the verge of stability where L = -1. Gain and phase margins are those of
+        this L, see ``margins.locus``.
+
+        Args:
+            at: i_u, omega_u or E_u, or one of v_dc, p, q and V; see ``commands`` and
+                ``measurements``.
+            omega: frequencies, rad/s, shape (K,).
+
+        Raises:
+            ValueError: the loop does not use such a channel.
+        """
+        used = {U_NAMES[j]: (j, False) for j in self.commands}
+        used |= {Y_NAMES[i]: (i, True) for i in self.measurements}
+        if at not in used:
+            raise ValueError(f"{at!r} is no channel of the loop; use one of {list(used)}")
+        k, at_y = used[at]
+        L = self.loop_transfer(omega, at_y)
+        return np.asarray(1.0 / np.linalg.inv(np.eye(L.shape[-1]) + L)[:, k, k] - 1.0)
+
+    def output_impedance(self, omega: ArrayLike) -> Response:
+        """Z of the converter at its capacitor, as the grid sees it: shape (K, 2, 2), p.u. of Z_b.
+
+        (-v_d, -v_q) = Z (i_od, i_oq) for small deviations, in the dq frame that turns steadily at
+        the grid's frequency and lies on the converter's own frame at rest, so that the
+        synchronisation is part of Z (Wen et al., "Analysis of D-Q Small-Signal Impedance of
+        Grid-Tied Inverters", IEEE Trans. Power Electron. 31(1), 2016). The line is not part of it.
+        Of a sampled loop this is the answer at the frequency itself: sampling also excites its
+        images at multiples of the sampling frequency.
+
+        Args:
+            omega: frequencies in the dq frame, rad/s, > 0, shape (K,).
+
+        Raises:
+            ValueError: the loop was made of matrices.
+        """
+        x, omega = self.made_of.op.x, np.asarray(omega, float)
+        whole, s = self.plant, 1j * omega
+        io = np.array([_I_O, _I_O + 1])
+        rest = np.delete(np.arange(len(whole.A)), io)
+        delta = int(np.flatnonzero(rest == DELTA)[0])
+        turn = np.array([x[_I_O + 1], -x[_I_O]])  # of i_o in the converter's frame, by delta
+        A, C = whole.A[np.ix_(rest, rest)], whole.C[:, rest]
+        by_i, y_by_i = whole.A[np.ix_(rest, io)], whole.C[:, io]
+        A[:, delta] += by_i @ turn
+        C[:, delta] += y_by_i @ turn
+        v = np.zeros((2, len(rest)))
+        v[0, _V_C], v[1, _V_C + 1] = 1.0, 1.0  # these come before i_o: the same places in rest
+        v[:, delta] = -x[_V_C + 1], x[_V_C]  # v in the steady frame, by delta
+        alone = LinearPlant(A, whole.B[rest], whole.B_d[rest], C, whole.C_true[:, rest])
+        p = ClosedLoop(alone, self.law, self.T_s, self.u_delay, self.y_delay).held
+        c, at = self.law, self._at(omega)
+        G = _response((p.A, p.B, p.C, np.zeros((NY, NU))), at)
+        K = _response((c.A, c.B, c.C, c.D), at)
+        y = _response((A, by_i, C, y_by_i), s) * np.exp(-s[:, None] * self.y_delay)[:, :, None]
+        u = np.linalg.solve(np.eye(NU) - K @ G, K @ y)
+        if self.T_s is not None:  # u acts late, and is held over the tick
+            hold_at = (1.0 - np.exp(-s * self.T_s)) / (s * self.T_s)
+            u = u * (hold_at[:, None] * np.exp(-s[:, None] * self.u_delay))[:, :, None]
+        zero = np.zeros((2, NU + 2))
+        v_by = _response((A, np.hstack([alone.B, by_i]), v, zero), s)
+        return -(v_by[..., NU:] + v_by[..., :NU] @ u)
+
     def _at(self, omega: ArrayLike) -> Response:
         """s, or z = e^(s T_s), on the imaginary axis."""
         s = 1j * np.asarray(omega, float)
         return s if self.T_s is None else np.exp(s * self.T_s)
+
+
+def frequencies_near(poles: Response) -> Matrix:
+    """Frequencies [rad/s] across the resonance of each pole [1/s], in no order."""
+    return np.asarray(np.abs(poles.imag[:, None] + _ACROSS * poles.real[:, None]).ravel())
 
 
 def _response(of: StateSpace, s: Response) -> Response:

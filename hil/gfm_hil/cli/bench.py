@@ -94,8 +94,8 @@ def _add_modes(command: argparse.ArgumentParser) -> None:
 
 def _add_load(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--load", default="idle,hogs",
-        help="idle, or beside a busy process on each processor (default: %(default)s)",
+        "--load", default="idle,busy",
+        help="idle, or busy: with a CPU load on each processor (default: %(default)s)",
     )  # fmt: skip
 
 

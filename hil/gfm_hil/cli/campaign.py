@@ -20,9 +20,8 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.results.runner import Notice
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
-from gfm_hil.studies.campaign.figure import draw_map
 from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_hil.studies.campaign.result import VERDICTS, summary, verdict
+from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult, verdict, write_result
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.tables import print_campaign, print_record
@@ -82,13 +81,8 @@ def call(options: argparse.Namespace) -> int:
                     execute(campaign, jobs, executor, workers, keep, lambda: interrupt.came)
                 except WorkerLost as problem:
                     lost = problem
-    records = store.sorted(campaign)
-    result = summary(campaign, records)
-    result["workers"] = options.dask or workers
-    result["wall_s"] = time.monotonic() - began
-    if records:
-        draw_map(store_at / "map.png", campaign, records, *axes)
-    (store_at / "campaign.json").write_text(json.dumps(result, indent=2) + "\n", "utf-8")
+    found = CampaignResult(campaign, store.sorted(campaign), store_at)
+    result = write_result(found, store_at, axes, options.dask or workers, time.monotonic() - began)
     if options.json:
         print(json.dumps(result, indent=2))
     else:

@@ -16,9 +16,10 @@ from rich.table import Table
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import fitting, terminal
-from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.results.report import as_expected, cell, event_rows
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
+from gfm_hil.results.summary import controlled_by
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
@@ -134,13 +135,14 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console = terminal()
     colour = "red" if summary["unmet"] else "green"
     reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
-    console.print(f"[bold {colour}]{summary['status']}[/]{reason}", highlight=False)
+    expected = ", as expected" if as_expected(summary) else ""
+    console.print(f"[bold {colour}]{summary['status']}[/]{expected}{reason}", highlight=False)
     for part in summary["unmet"]:
         console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
-    console.print(escape(" → ".join(summary["laws"])), highlight=False)
+    console.print(escape(controlled_by(summary)), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
-        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {summary['misses']} misses",
+        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {cell(summary['misses'])} misses",
         highlight=False,
     )
     if summary["round_trip_us"]:
@@ -152,15 +154,14 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
 
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:
-    """One row a quantity, one column an event."""
+    """A table with one row a quantity and one column an event."""
     table = Table(box=None, pad_edge=False)
     table.add_column("", no_wrap=True)
     for event in events:
         table.add_column(escape(f"{event['label']} @ {event['t']:g} s"), justify="right")
-    for name, title in EVENT_COLUMNS[2:]:
-        values = [e.get(name) for e in events]
-        if any(v is not None for v in values):
-            table.add_row(escape(title), *[cell(v) for v in values])
+    for name, title in event_rows(events):
+        if name not in ("label", "t"):
+            table.add_row(escape(title), *[cell(e.get(name)) for e in events])
     return table
 
 

@@ -1,4 +1,4 @@
-"""gfmhil compare: one scenario under several laws, side by side."""
+"""gfmhil compare: one scenario under several laws, in one table and one figure."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import fitting, terminal
 from gfm_hil.results.figures import draw_comparison
-from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free
 from gfm_hil.results.runner import run_scenario
@@ -86,10 +86,10 @@ def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -
         table.add_row("status", *[s["status"] for s in some])
         for k, event in enumerate(events):
             table.add_row(f"[bold]{escape(event['label'])} @ {event['t']:g} s[/]")
-            for key, title in EVENT_COLUMNS[2:]:
-                values = [s["events"][k].get(key) if k < len(s["events"]) else None for s in some]
-                if any(v is not None for v in values):
-                    table.add_row("  " + escape(title), *[cell(v) for v in values])
+            same = [s["events"][k] if k < len(s["events"]) else {} for s in some]
+            for key, title in event_rows(same):
+                if key not in ("label", "t"):
+                    table.add_row("  " + escape(title), *[cell(e.get(key)) for e in same])
         return table
 
     console = terminal()

@@ -9,9 +9,9 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from gfm_hil.benchmark.doctor import examine, worst
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.terminal import terminal
+from gfm_hil.results.doctor import examine, worst
 
 
 def add(commands: Any) -> None:

@@ -22,7 +22,9 @@ def add(commands: Any) -> None:
     """Add the command and its sub-command to the parser."""
     command = commands.add_parser("laws")
     command.add_argument("--json", action="store_true", help="as JSON")
-    command.add_argument("--tuned", action="store_true", help="those with the league's gains")
+    command.add_argument(
+        "--tuned", action="store_true", help="those with the gains of the law comparison"
+    )
     command.set_defaults(call=call_list)
     show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
     show.add_argument("name", help="catalogue name or law file")

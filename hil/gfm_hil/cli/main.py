@@ -21,6 +21,7 @@ COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
     "tell": ("tell", "have a run that is going on do something, or show where it is"),
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
+    "merge": ("merge", "put together the two folders of sides that were started apart"),
     "scope": ("scope", "look at a run in the browser while it goes on, or afterwards"),
     "modbus": ("modbus", "serve a run that is going on as a SunSpec device on Modbus/TCP"),
     "export": ("export", "a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF"),

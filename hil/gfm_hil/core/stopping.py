@@ -1,4 +1,4 @@
-"""Being stopped: Ctrl-C and its kin as a flag, and ending together with the process above."""
+"""Being stopped: Ctrl-C and other signals as a flag, and ending with the parent process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 class Interrupt:
     """Context in which Ctrl-C, SIGTERM and a closed terminal set ``came`` and nothing else.
 
-    A second signal raises KeyboardInterrupt: whoever insists need not wait for an orderly end.
+    A second signal raises KeyboardInterrupt, so that the user need not wait for an orderly end.
     """
 
     def __init__(self) -> None:
@@ -46,12 +46,12 @@ class Interrupt:
             signal.signal(number, before)
 
 
-def end_with_parent(parent: int | None = None) -> None:
-    """Have Linux send us SIGTERM when the parent is gone, even if it was killed.
+def end_with_parent(parent: int | None = None, number: signal.Signals = signal.SIGTERM) -> None:
+    """Have Linux send this process a signal when its parent is gone, even if it was killed.
 
     ``parent`` is its process id, to see whether it is gone already.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
+        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, number)
         if parent not in (None, os.getppid()):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), number)

@@ -143,7 +143,8 @@ def _meet_and_run(
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link in several frames a message
     faults = {**reader.faults, **counted, "refused_greetings": start.refused}
-    return {"faults": faults, "e2e": reader.e2e, "one_clock": start.one_clock, **injected}
+    met = {"one_clock": start.one_clock, "run": start.run, "controller": start.controller}
+    return {"faults": faults, "e2e": reader.e2e, **met, **injected}
 
 
 def compile_side(side: Side, bench: Bench, part: Part) -> None:

@@ -23,7 +23,7 @@ from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part, 
 from gfm_hil.results.metrics import Rows
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
-from gfm_hil.results.summary import summarise
+from gfm_hil.results.summary import origin, summarise
 from gfm_hil.scenario.model import INPROC, Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_runtime.assembly import SPARE
@@ -111,7 +111,7 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
     plant, controller = parts or buffers(scenario.ticks)
     plant.signals[:] = np.nan
     timeline = TimelineInMemory(bench)
-    began = time.monotonic()
+    began, date = time.monotonic(), time.time()
     with np.errstate(all="ignore"):  # a diverging run is a result
         run_inproc(bench, plant, controller, timeline, lambda ticks: True)
     timeline.close()
@@ -123,6 +123,7 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
         columns |= {name: np.array(part.signals[:done, j]) for j, name in enumerate(names)}
     outcome = timeline.outcome or Outcome("safe", "ended without a word", done)
     summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
+    summary |= origin(scenario, date)
     return Run(scenario, summary, columns, _known_laws(columns, bench), timeline.lines)
 
 

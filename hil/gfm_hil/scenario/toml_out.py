@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import Any
 
 from gfm_hil.scenario.model import Scenario
@@ -22,16 +23,16 @@ def toml_text(content: dict[str, Any]) -> str:
 def _table(content: dict[str, Any], path: tuple[str, ...]) -> list[str]:
     plain = {k: v for k, v in content.items() if not _is_table(v) and not _is_tables(v)}
     lines = [f"[{'.'.join(path)}]"] if path and (plain or not content) else []
-    lines += [f"{key} = {_value(value)}" for key, value in plain.items()]
+    lines += [f"{_key(key)} = {_value(value)}" for key, value in plain.items()]
     if lines:
         lines.append("")
     for key, value in content.items():
         if _is_table(value):
-            lines += _table(value, (*path, key))
+            lines += _table(value, (*path, _key(key)))
         elif _is_tables(value):
             for entry in value:
-                lines.append(f"[[{'.'.join((*path, key))}]]")
-                lines += [f"{k} = {_value(v)}" for k, v in entry.items()]
+                lines.append(f"[[{'.'.join((*path, _key(key)))}]]")
+                lines += [f"{_key(k)} = {_value(v)}" for k, v in entry.items()]
                 lines.append("")
     return lines
 
@@ -42,6 +43,11 @@ def _is_table(value: Any) -> bool:
 
 def _is_tables(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
+
+
+def _key(name: str) -> str:
+    """A key as it is where TOML allows that, else in quotes, e.g. a dotted path of a campaign."""
+    return name if re.fullmatch("[A-Za-z0-9_-]+", name) else _value(name)
 
 
 def _value(value: Any) -> str:
@@ -57,5 +63,5 @@ def _value(value: Any) -> str:
         case list():
             return "[" + ", ".join(_value(v) for v in value) + "]"
         case dict():
-            return "{" + ", ".join(f"{_value(k)} = {_value(v)}" for k, v in value.items()) + "}"
+            return "{" + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + "}"
     raise TypeError(f"{value!r} has no TOML form here")

@@ -11,14 +11,21 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
+from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.scenario.toml_out import toml_text
+from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import DiscreteLaw, LawError, build_law, discretise, law_file, law_names, parse_law
 from gfm_runtime import Law as BuiltLaw
 from gfm_runtime.lawfile import ElementSpec, LawFile
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
-    from gfm_design.model.closed_loop import ClosedLoop
+    from gfm_hil.studies.loop import Loop
+
+
+def as_law(law: str | Path | Law) -> Law:
+    """A law as it is, or that of a name or file."""
+    return law if isinstance(law, Law) else Law.load(law)
 
 
 def laws() -> tuple[str, ...]:
@@ -88,6 +95,8 @@ class Law:
     def with_gains(self, name: str | None = None, **gains: float) -> Law:
         """The same law with other values of some parameters.
 
+        A parameter that the file ties to others follows them, unless it is given too.
+
         Args:
             name: of the new law; ``<name>-changed`` if None.
             gains: values by parameter, in the unit of the parameter.
@@ -99,8 +108,10 @@ class Law:
             if gain not in self.file.parameters:
                 known = sorted(self.file.parameters)
                 raise LawError(f"parameter {gain}", f"unknown to {self.name}; known: {known}")
+        from gfm_design.tuning.gains import tied
+
         content = self.file.model_dump(mode="json", exclude_none=True)
-        for gain, value in gains.items():
+        for gain, value in (tied(self.file, gains) | gains).items():
             content["parameters"][gain] |= {"value": float(value), "source": "with_gains"}
         content["name"] = name or f"{self.name.removesuffix('-changed')}-changed"
         return Law.from_toml(toml_text(content))
@@ -131,17 +142,34 @@ class Law:
         den = [[_product(e.den) for e in row] for row in cells]
         return control.tf(num, den, inputs=[f"error_{y}" for y in Y_NAMES], outputs=list(U_NAMES))
 
-    def closed_loop(self, plant: Any = None, **more: Any) -> ClosedLoop:
-        """This law around a plant, linearised: modes, margins, gamma, step, frequency response.
+    def closed_loop(
+        self, on: str | Path | Scenario | Plant | None = None, *, ideal: bool = False, **more: Any
+    ) -> Loop:
+        """This law around a plant, linearised where both rest.
 
         Args:
-            plant: a ``gfm_plant.Plant``; the paper's converter with ideal sensors if None.
-            more: as for ``ClosedLoop.of``, e.g. ``T_s`` [s], None for the continuous loop.
-        """
-        from gfm_design.model.closed_loop import ClosedLoop
-        from gfm_plant import Plant
+            on: a scenario (name, file or ``Scenario``), of which plant, references and sampling
+                time count, or a plant alone; the paper's converter without delay and sensors
+                if None.
+            ideal: the continuous loop, neither sampled nor delayed.
+            more: ``references`` (V_dcref, P_ref, omega_g, Q_ref, V_ref) in p.u. and ``T_s`` in s,
+                instead of those of the scenario.
 
-        return ClosedLoop.of(self.built(), plant or Plant(), **more)
+        Raises:
+            UserError: no such scenario, or there is no operating point.
+            LawError: the law cannot be discretised at T_s.
+        """
+        from gfm_hil.studies.loop import Loop
+
+        if isinstance(on, str | Path):
+            on = load_scenario(str(on))
+        if isinstance(on, Scenario):
+            more = {"references": on.references.vector(), "T_s": on.T_s, **more}
+            on = on.plant
+        try:
+            return Loop.of(self.built(), on, ideal=ideal, **more)
+        except NoEquilibrium as problem:
+            raise UserError(str(problem)) from None
 
     def save(self, path: str | Path) -> Path:
         """Write a law file; returns its path.
@@ -162,7 +190,7 @@ class Law:
         return f"<Law {self.name}: {self.file.title}>"
 
     def _repr_html_(self) -> str:
-        """The matrix of elements, for a notebook."""
+        """The matrix of elements and the parameters, for a notebook."""
         head = "".join(f"<th>{y}</th>" for y in Y_NAMES)
         rows = "".join(
             f"<tr><th>{u}</th>"
@@ -174,7 +202,12 @@ class Law:
             for i, u in enumerate(U_NAMES)
         )
         title = f"{html.escape(self.name)}: {html.escape(self.file.title)}"
-        return f"<table><caption>{title}</caption><tr><th>Φ(s)</th>{head}</tr>{rows}</table>"
+        table = f"<table><caption>{title}</caption><tr><th>Φ(s)</th>{head}</tr>{rows}</table>"
+        gains = ", ".join(
+            html.escape(f"{name} = {value:g} {self.units[name]}".removesuffix(" 1"))
+            for name, value in self.gains.items()
+        )
+        return f"{table}<p>{gains}</p>"
 
 
 def _product(factors: Any) -> list[float]:

@@ -1,9 +1,12 @@
-"""What a notebook calls: a run, or several laws side by side, in memory and silent."""
+"""What a notebook calls: a run, several laws side by side or a campaign, in memory and silent."""
 
 from __future__ import annotations
 
+import os
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +15,14 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
+from gfm_hil.studies.campaign.axes import find_axes
+from gfm_hil.studies.campaign.execute import Here, execute, processes
+from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
+from gfm_hil.studies.campaign.result import CampaignResult, write_result
+from gfm_hil.studies.campaign.store import Store
+from gfm_hil.studies.campaign.worker import compile_once
 from gfm_hil.studies.law import Law
+from gfm_runtime.toml_file import read_toml
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,12 +45,23 @@ def run(
         UserError: one line a mistake; or the scenario has no operating point.
         LawError: the law is none.
     """
-    with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
-        if isinstance(law, Law):
-            law = law.save(Path(place) / f"{law.name}.toml")
-        if law is not None:
-            changes = {**changes, "law": str(law)}
+    with _law_files([] if law is None else [law]) as files:
+        for file in files.values():
+            changes = {**changes, "law": file}
         return run_in_memory(_scenario(scenario, changes))
+
+
+@contextmanager
+def _law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
+    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
+        files: dict[str, str] = {}
+        for k, law in enumerate(laws):
+            if isinstance(law, Law):
+                files[law.name] = str(law.save(Path(place) / f"{k}.toml"))
+            else:
+                files[str(law)] = str(law)
+        yield files
 
 
 def _scenario(given: str | Path | Scenario | dict[str, Any], changes: dict[str, Any]) -> Scenario:
@@ -114,3 +135,56 @@ def compare(
     return Comparison(
         {name: run(scenario, law, **changes) for name, law in zip(names, laws, strict=True)}
     )
+
+
+def campaign(
+    given: str | Path | dict[str, Any],
+    folder: str | Path | None = None,
+    *,
+    laws: Sequence[str | Path | Law] | None = None,
+    workers: int = 1,
+    resume: bool = False,
+    **changes: Any,
+) -> CampaignResult:
+    """Run a scenario many times with drawn values, and keep one record a run.
+
+    A record depends on the seed and on the run's number alone, not on ``workers``.
+
+    Args:
+        given: name of a shipped campaign, path of a file, or content of a file.
+        folder: where to write the records as they come, campaign.json and the map; None keeps
+            the campaign in memory.
+        laws: names, law files or ``Law``; those of the campaign if None.
+        workers: processes; 1 runs all in this one. A program that asks for more needs
+            ``if __name__ == "__main__":``, as the module ``multiprocessing`` says.
+        resume: go on with what the folder holds.
+        changes: keys of the campaign file, e.g. ``runs=50``, ``seed=1``.
+
+    Raises:
+        UserError: one line a mistake; the folder is in use.
+        LawError: one of the laws is none.
+    """
+    if not 1 <= workers <= 1024:
+        raise UserError(f"workers = {workers}: must lie in [1, 1024]")
+    if resume and folder is None:
+        raise UserError("resume: goes with the folder to go on with")
+    began, path = time.monotonic(), Path("campaign")
+    if not isinstance(given, dict):
+        path = find_campaign(os.fspath(given))
+        try:
+            given = read_toml(path)
+        except ValueError as problem:
+            raise UserError(f"{path}: {problem}") from None
+    with _law_files(laws or []) as files:
+        content = {**given, **changes} | ({"laws": list(files)} if files else {})
+        made = check_campaign(content, path, laws=files)
+        axes, place = find_axes(made, None, None), None if folder is None else Path(folder)
+        store = Store(place, made, resume)
+        if jobs := store.missing(made):
+            compile_once(made, lambda text: None)  # silent, as all of this module
+            with nullcontext(Here()) if workers == 1 else processes(workers) as pool:
+                execute(made, jobs, pool, workers, store.append, lambda: False)
+        found = CampaignResult(made, store.sorted(made), place)
+    if place is not None:
+        write_result(found, place, axes, workers, time.monotonic() - began)
+    return found

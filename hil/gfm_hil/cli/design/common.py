@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import functools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
-from gfm_design.norms.weights import read_weights
+from gfm_design.norms.performance import Channel
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
@@ -45,20 +43,6 @@ def read_gains(text: str | None, option: str = "--gains") -> dict[str, float]:
             raise UserError(f"{option}: {name} is given twice")
         found[name] = number
     return found
-
-
-def weights_of(options: argparse.Namespace) -> tuple[Weight, ...]:
-    """The weights asked for.
-
-    Raises:
-        UserError: the file cannot be read or a weight in it cannot be.
-    """
-    if options.weights is None:
-        return PAPER_WEIGHTS
-    try:
-        return read_weights(Path(options.weights))
-    except ValueError as problem:
-        raise UserError(f"--weights {options.weights}: {problem}") from None
 
 
 def singular_is_users(

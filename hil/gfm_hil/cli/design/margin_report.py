@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
@@ -25,8 +26,8 @@ def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, A
         "delay_us": _number(1e6 * loop.delay.seconds),
         "delay_hz": _number(loop.delay.frequency_hz),
         "delay_looked_at_us": 1e6 * loop.longest,
-        "u": {c.name: _channel(c) for c in loop.u},
-        "y": {c.name: _channel(c) for c in loop.y},
+        "u": {c.name: channel_as_json(c) for c in loop.u},
+        "y": {c.name: channel_as_json(c) for c in loop.y},
         "disk": {"u": _disk(loop.disk_u), "y": _disk(loop.disk_y)},
         "elements": {name: _range(r) if r else None for name, r in m.elements.items()},
         "grid": _grid(m.grid),
@@ -57,7 +58,8 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _channel(c: ChannelMargins) -> dict[str, Any]:
+def channel_as_json(c: ChannelMargins) -> dict[str, Any]:
+    """The margins of one channel; null where there is no limit."""
     out = {name: _number(value) for name, value in asdict(c.gain_phase).items()}
     out |= {"delay_us": _number(1e6 * c.delay.seconds), "delay_hz": _number(c.delay.frequency_hz)}
     return {**out, "confirmed": c.confirmed}
@@ -109,7 +111,7 @@ def print_margins(
         else f"{1e6 * loop.delay.seconds:.4g} µs, then {loop.delay.frequency_hz:.4g} Hz is lost"
     )
     console.print(f"[bold]delay margin[/] on top of {1e6 * set_s:g} µs: {more}\n")
-    console.print(_loops_table(loop.u, loop.y))
+    console.print(loops_table((*loop.u, *loop.y)))
     for name, disk in (("u", loop.disk_u), ("y", loop.disk_y)):
         low, high = disk.gain
         console.print(
@@ -134,11 +136,12 @@ def print_margins(
             console.print(f"y\\[k] sampled to u\\[k] acting, holds included, µs: {text}")
 
 
-def _loops_table(u: tuple[ChannelMargins, ...], y: tuple[ChannelMargins, ...]) -> Table:
+def loops_table(channels: Iterable[ChannelMargins]) -> Table:
+    """Gain, phase, delay and disk margin, one row a channel."""
     table = Table(box=None, pad_edge=False)
     for head in ("loop at", "gain ↓ @ Hz", "gain ↑ @ Hz", "phase @ Hz", "delay µs @ Hz", "disk α"):
         table.add_column(head, justify="left" if head == "loop at" else "right")
-    for c in (*u, *y):
+    for c in channels:
         g = c.gain_phase
         table.add_row(
             c.name + ("" if c.confirmed else " (not confirmed)"),

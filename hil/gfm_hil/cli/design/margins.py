@@ -11,16 +11,14 @@ from rich.progress import Progress
 
 from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
-from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.cli.design.margin_figures import draw_delay, draw_region
 from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.loop_delay import check_run, read_loop_delay
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_runtime import load_law
-from gfm_runtime.assembly import Controller
+from gfm_hil.scenario.model import load_scenario
+from gfm_hil.studies.loop import Loop, scenario_loop
+from gfm_hil.studies.margin_figures import draw_delay, draw_region
 
 
 def add(kinds: Any) -> None:
@@ -46,7 +44,7 @@ def call(options: argparse.Namespace) -> int:
         scenario = load_scenario(str(options.run / "scenario.toml"), law=options.law)
     else:
         scenario = load_scenario(options.scenario, law=options.law)
-    loop, label = make_loop(scenario)
+    loop, label = scenario_loop(scenario)
     console = terminal(highlight=False)
     try:
         found = margins(loop)
@@ -79,14 +77,7 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def make_loop(scenario: Scenario) -> tuple[ClosedLoop, str]:
-    """The scenario's first law at its start, of a scheduled law the stage in force; its label."""
-    references = scenario.references.vector()
-    controller = Controller([load_law(scenario.law)], scenario.T_s, references)
-    return ClosedLoop.of(controller.active_law, scenario.plant, references), controller.active
-
-
-def _draw(folder: Path, loop: ClosedLoop, label: str, margin: float) -> Region:
+def _draw(folder: Path, loop: Loop, label: str, margin: float) -> Region:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:

@@ -9,12 +9,7 @@ from typing import Any
 
 from rich.progress import BarColumn, Progress, TextColumn
 
-from gfm_design.tuning.full_order import Missing, full_order
-from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.law_comparison_modes import culprit
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
-from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
-from gfm_design.tuning.synthesis import NotStabilised, Tuned
+from gfm_design.tuning.paper_tune import EVALUATIONS
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
@@ -22,12 +17,12 @@ from gfm_hil.cli.design.common import (
     print_channels,
     read_gains,
     singular_is_users,
-    weights_of,
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
+from gfm_hil.studies.design import NotTuned, Tuning, tune
+from gfm_hil.studies.law import Law
 from gfm_hil.studies.tuned_law import write_law
-from gfm_runtime import law_file
 
 
 def add(kinds: Any) -> None:
@@ -53,39 +48,20 @@ def add(kinds: Any) -> None:
 @singular_is_users
 def call(options: argparse.Namespace) -> int:
     """Tune a law's free gains; exit code 3 if no stabilising ones are found."""
-    for name in ("evaluations", "starts"):
-        if getattr(options, name) is not None and getattr(options, name) < 1:
-            raise UserError(f"--{name} {getattr(options, name)}: must be at least 1")
-    if options.seed < 0:
-        raise UserError(f"--seed {options.seed}: must not be negative")
     if options.out and not Path(options.out).parent.is_dir():
         raise UserError(f"--out {options.out}: {Path(options.out).parent} is no folder")
-    file = law_file(options.law)
-    only = None if options.only is None else options.only.split(",")
-    paper = PAPER_START.get(file.name, {})
-    gains = free_gains(
-        file,
-        {n: v for n, v in paper.items() if only is None or n in only} | read_gains(options.gains),
-        only,
-    )
-    problem = PaperProblem(file, gains, weights=weights_of(options))
+    law = Law.load(options.law)
     try:
-        found = _searched(problem, options)
-    except NotStabilised as none:
-        reason = (
-            f"{none}; in the way, on the paper's converter at P_ref = {problem.references[1]:g}: "
-            f"{culprit(problem.closed_loop(none.values)).words()}"
-        )
+        found = _searched(law, options)
+    except NotTuned as none:
         if options.json:
-            print(json.dumps({"law": file.name, "gamma": None, "reason": reason}))
+            print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
         else:
-            terminal(stderr=True).print(f"{file.name}: {reason}", highlight=False, soft_wrap=True)
+            terminal(stderr=True).print(f"{law.name}: {none}", highlight=False, soft_wrap=True)
         return EXIT_OTHERWISE
-    except ModuleNotFoundError as missing:
-        raise UserError(str(missing)) from None
-    named, channels = problem.law.named(found.values), problem.channels(found.values)
+    named, channels = found.gains, found.gamma.channels
     result = {
-        "law": file.name,
+        "law": law.name,
         **channels_as_json(channels),
         "gamma_full_order": None,
         "gains": named,
@@ -93,13 +69,13 @@ def call(options: argparse.Namespace) -> int:
         "evaluations": found.evaluations,
         "seed": found.seed,
     }
-    said = _bound(problem, result) if options.full_order else ""
+    said = _bound(found, result) if options.full_order else ""
     if options.out:
-        write_law(Path(options.out), file, named, result)
+        write_law(Path(options.out), law.file, named, result)
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
-    print_channels(file.name, channels)
+    print_channels(law.name, channels)
     lines = [
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
@@ -110,32 +86,39 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _searched(problem: PaperProblem, options: argparse.Namespace) -> Tuned:
+def _searched(law: Law, options: argparse.Namespace) -> Tuning:
     """The search, with a bar on stderr."""
+    console = terminal(stderr=True, quiet=options.quiet)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("γ {task.fields[best]}"),
-        console=terminal(stderr=True, quiet=options.quiet),
+        console=console,
+        disable=not console.is_terminal,
         transient=True,
     ) as bar:
-        starts = options.starts or starts_for(len(problem.gains))
-        total = options.evaluations * starts
-        task = bar.add_task(f"tuning {problem.file.name}", total=total, best="–")
-        return tune_paper(
-            problem,
-            options.seed,
-            options.evaluations,
-            starts,
-            lambda done, best: bar.update(task, completed=done, best=f"{best:.4g}"),
+        task = bar.add_task(f"tuning {law.name}", best="–")
+
+        def tell(done: int, of: int, best: float) -> None:
+            bar.update(task, completed=done, total=of, best=f"{best:.4g}")
+
+        return tune(
+            law,
+            start=read_gains(options.gains),
+            only=None if options.only is None else options.only.split(","),
+            weights=options.weights,
+            seed=options.seed,
+            evaluations=options.evaluations,
+            starts=options.starts,
+            progress=tell,
         )
 
 
-def _bound(problem: PaperProblem, result: dict[str, Any]) -> str:
+def _bound(tuning: Tuning, result: dict[str, Any]) -> str:
     """The full-order bound into the result; what to say of it."""
     try:
-        found = full_order(problem.linear, problem.weights)
-    except Missing as missing:
+        found = tuning.bound()
+    except UserError as missing:
         terminal(stderr=True).print(str(missing), highlight=False, soft_wrap=True)
         return ""
     if found is None:

@@ -38,12 +38,25 @@ _LEAST = 60  # runs; fewer tell no share
 def draw_map(
     path: Path, campaign: Campaign, records: Sequence[Record], x: Axis, y: Axis | None
 ) -> None:
-    """Draw the map; without a second axis the runs are spread by their number."""
+    """Draw the map into a file, see ``fill_map``."""
+    figure = Figure()
+    FigureCanvasAgg(figure)
+    fill_map(figure, campaign, records, x, y)
+    figure.savefig(path, dpi=130)
+
+
+def fill_map(
+    figure: Figure, campaign: Campaign, records: Sequence[Record], x: Axis, y: Axis | None
+) -> list[Axes]:
+    """Fill a figure with the map, one panel a law; returns the panels.
+
+    Without a second axis the runs are spread by their number.
+    """
     laws = campaign.file.laws
     columns = min(len(laws), 3)
     rows = -(-len(laws) // columns)
-    figure = Figure(figsize=(0.8 + 4.7 * columns, 1.1 + 4.3 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure.set_size_inches(0.8 + 4.7 * columns, 1.1 + 4.3 * rows)
+    figure.set_layout_engine("constrained")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     found: set[str] = set()
     for axes, law in zip(panels.ravel(), laws, strict=False):
@@ -62,7 +75,7 @@ def draw_map(
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     figure.suptitle(campaign.file.title, fontsize=11.5, x=0.01, ha="left")
-    figure.savefig(path, dpi=130)
+    return list(panels.ravel()[: len(laws)])
 
 
 def _panel(

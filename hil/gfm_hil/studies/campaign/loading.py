@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.scenario.model import check_scenario, find_file, load_scenario
+from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies.campaign.draw import Distribution
 from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
 from gfm_plant import make_plant
@@ -24,6 +25,8 @@ _OWN = ("law", "seed", "mode", "link", "compare", "duration", "T_s")
 _SETTABLE = ("duration", "T_s")
 _TRIED = 2000  # runs, about a millisecond each; a later one that cannot be ends the campaign
 
+Tell = Callable[[int, int], None]
+
 
 def find_campaign(name: str) -> Path:
     """The file of a campaign: a path, or the name of a shipped one.
@@ -34,7 +37,11 @@ def find_campaign(name: str) -> Path:
     return find_file("campaign", name, "campaigns/*.toml")
 
 
-def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of: None) -> Campaign:
+def _silent(done: int, of: int) -> None:
+    """Report no progress."""
+
+
+def load_campaign(name: str, tell: Tell = _silent) -> Campaign:
     """Read and check a campaign, its runs included.
 
     Args:
@@ -47,22 +54,50 @@ def load_campaign(name: str, tell: Callable[[int, int], None] = lambda done, of:
     path = find_campaign(name)
     try:
         text = read_text(path)
-        file = CampaignFile.model_validate(parse_toml(text))
+        content = parse_toml(text)
+    except ValueError as problem:
+        raise UserError(f"{path}: {problem}") from None
+    return check_campaign(content, path, text, tell=tell)
+
+
+def check_campaign(
+    content: dict[str, Any],
+    path: Path,
+    text: str | None = None,
+    laws: Mapping[str, str] | None = None,
+    tell: Tell = _silent,
+) -> Campaign:
+    """The campaign of a dict, its runs checked.
+
+    Args:
+        content: what a campaign file holds.
+        path: the file, for messages; its stem is the campaign's name, and the scenario and the
+            law files may lie beside it.
+        text: of the file; written from ``content`` if None.
+        laws: the law file of some of the laws, by the name that ``content`` gives them.
+        tell: as for ``load_campaign``.
+
+    Raises:
+        UserError: as ``load_campaign``.
+    """
+    try:
+        file = CampaignFile.model_validate(content)
     except ValidationError as problem:
         wrong = lines(problem, CampaignFile)
         raise UserError("\n".join(f"{path}: {line}" for line in wrong)) from None
-    except ValueError as problem:
-        raise UserError(f"{path}: {problem}") from None
+    if text is None:
+        text = toml_text(content)
     base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
     content = base.model_dump(mode="json")
     content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
     _check_paths(path, file, content)
     for target, value in file.set.items():
         put(content, target, value)
-    laws = {law: _beside(path, law) for law in file.laws}
-    for label, law in laws.items():
+    given = laws or {}
+    files = {law: given.get(law) or _beside(path, law) for law in file.laws}
+    for label, law in files.items():
         check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
-    campaign = Campaign(path.stem, text, file, content, laws)
+    campaign = Campaign(path.stem, text, file, content, files)
     checks = [*_end_checks(path, campaign), *_run_checks(path, campaign)]
     for k, check in enumerate(checks):
         tell(k, len(checks))

@@ -2,18 +2,125 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gfm_hil.core.errors import UserError, need
 from gfm_hil.results.metrics import METRICS
+from gfm_hil.studies.campaign.axes import Axis, find_axes
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.worker import Record
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.axes import Axes
 
 VERDICTS = ("stable", "oscillating", "tripped", "safe", "no-steady-state")
 QUANTILES = {"p5": 5, "p50": 50, "p95": 95, "max": 100}
 _WORST = 5
+
+
+@dataclass(frozen=True, repr=False)
+class CampaignResult:
+    """What a campaign showed.
+
+    Attributes:
+        campaign: what was run, with its file.
+        records: one a run and law, by run number; the page on campaigns lists their keys.
+        folder: where it is; None for a campaign in memory.
+    """
+
+    campaign: Campaign
+    records: list[Record]
+    folder: Path | None = None
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """Counts, quantiles over the stable runs and the worst runs by law, as campaign.json."""
+        return summary(self.campaign, self.records)
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]:
+        """How many runs of each law were stable, oscillating, tripped and so on."""
+        return {law: found["counts"] for law, found in self.summary["laws"].items()}
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """One row a run and law: run, law, seed, verdict, status, reason, end_s [s], ripple_pu
+        [p.u.], growth_1_s [1/s], the drawn values by their paths, and the metrics of each event
+        as ``events.<k>.<metric>``, with the units of their names.
+
+        Raises:
+            UserError: pandas is not installed.
+        """
+        need("pandas", "pandas", "to_pandas", "notebook")
+        import pandas
+
+        rows = []
+        for record in self.records:
+            row = {k: v for k, v in record.items() if k not in ("drawn", "events")}
+            row["verdict"] = verdict(record, self.campaign.file.ripple_max)
+            row |= record["drawn"]
+            for k, event in enumerate(record["events"]):
+                row |= {f"events.{k}.{name}": event[name] for name in METRICS if name in event}
+            rows.append(row)
+        return pandas.DataFrame(rows)
+
+    def plot(self, x: str | None = None, y: str | None = None) -> list[Axes]:
+        """Draw what became of each run over two drawn paths, one panel a law.
+
+        Args:
+            x, y: drawn paths, or sums of them (``"a + b"``); those of the file if None.
+
+        Raises:
+            UserError: a path that is not drawn; there is no run.
+        """
+        from matplotlib import pyplot
+
+        from gfm_hil.studies.campaign.figure import fill_map
+
+        axes = find_axes(self.campaign, x, y)
+        if not self.records:
+            raise UserError("plot: the campaign has no run yet")
+        return fill_map(pyplot.figure(), self.campaign, self.records, *axes)
+
+    def __repr__(self) -> str:
+        lines = [
+            f"  {law}: " + ", ".join(f"{n} {v}" for v, n in found.items() if n)
+            for law, found in self.counts.items()
+        ]
+        title = self.campaign.file.title
+        return "\n".join([f"<CampaignResult {title!r}, {len(self.records)} runs", *lines, ">"])
+
+
+def write_result(
+    found: CampaignResult,
+    folder: Path,
+    axes: tuple[Axis, Axis | None],
+    workers: int | str,
+    wall_s: float,
+) -> dict[str, Any]:
+    """Write campaign.json and map.png into the folder; returns the content of the former.
+
+    Args:
+        found: what the campaign showed.
+        folder: it is there.
+        axes: of the map.
+        workers: number of processes, or the address of the cluster.
+        wall_s: how long the last call took, s.
+    """
+    from gfm_hil.studies.campaign.figure import draw_map
+
+    if found.records:
+        draw_map(folder / "map.png", found.campaign, found.records, *axes)
+    content = {**found.summary, "workers": workers, "wall_s": wall_s}
+    (folder / "campaign.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    return content
 
 
 def verdict(record: Record, ripple_max: float) -> str:

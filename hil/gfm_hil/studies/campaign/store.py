@@ -18,7 +18,7 @@ class Store:
     """``runs.jsonl`` of a campaign's folder: a line about the campaign, then its records.
 
     Args:
-        folder: of the campaign; made if need be.
+        folder: of the campaign; made if need be. None keeps the records in memory only.
         campaign: whose records these are.
         resume: go on with what is there, if anything.
 
@@ -26,15 +26,17 @@ class Store:
         UserError: the folder is in use, or holds the records of another campaign.
     """
 
-    def __init__(self, folder: Path, campaign: Campaign, resume: bool) -> None:
-        self._path = folder / FILE
+    def __init__(self, folder: Path | None, campaign: Campaign, resume: bool) -> None:
+        self._path = None if folder is None else folder / FILE
         self.records: dict[Job, Record] = {}
+        if folder is None or self._path is None:
+            return
         if self._path.is_file() and resume:
-            self._read(campaign)
+            self._read(self._path, campaign)
             return
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            more = ", or go on with it by --resume" if self._path.is_file() else ""
-            raise UserError(f"{folder}: is in use; choose another --out{more}")
+            more = ", or go on with it: resume" if self._path.is_file() else ""
+            raise UserError(f"{folder}: is in use; choose another folder{more}")
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "campaign.toml").write_text(campaign.text, encoding="utf-8")
@@ -42,35 +44,37 @@ class Store:
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}; choose another --out") from None
 
-    def _read(self, campaign: Campaign) -> None:
-        whole = self._path.read_bytes()
+    def _read(self, path: Path, campaign: Campaign) -> None:
+        whole = path.read_bytes()
         kept = whole[: whole.rfind(b"\n") + 1]  # the last line may have been cut off
         try:
             head, *records = [json.loads(line) for line in kept.splitlines()]
             made_by, digest = head["version"], head["digest"]
             self.records = {(r["run"], r["law"]): r for r in records}
         except (ValueError, KeyError, TypeError) as problem:
-            raise UserError(f"{self._path}: cannot be read: {problem!r}") from None
+            raise UserError(f"{path}: cannot be read: {problem!r}") from None
         if made_by != version("gfmhil"):
             raise UserError(
-                f"{self._path}: made by gfmhil {made_by}, this is {version('gfmhil')}; "
+                f"{path}: made by gfmhil {made_by}, this is {version('gfmhil')}; "
                 "choose another --out"
             )
         if digest != campaign.digest():
             raise UserError(
-                f"{self._path}: belongs to another campaign: the file, its scenario or a law has "
+                f"{path}: belongs to another campaign: the file, its scenario or a law has "
                 f"changed since (see campaign.toml there); choose another --out"
             )
         if len(kept) < len(whole):
-            with self._path.open("r+b") as file:
+            with path.open("r+b") as file:
                 file.truncate(len(kept))
 
     def append(self, records: list[Record]) -> None:
-        """Keep some records; they are on the disk when this returns."""
+        """Keep some records; a store with a folder has them on the disk when this returns."""
         self._write(records)
         self.records.update({(r["run"], r["law"]): r for r in records})
 
     def _write(self, lines: list[Record]) -> None:
+        if self._path is None:
+            return
         with self._path.open("a", encoding="utf-8") as file:
             file.write("".join(json.dumps(line) + "\n" for line in lines))
             file.flush()

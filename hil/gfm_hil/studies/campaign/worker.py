@@ -21,7 +21,7 @@ Job = tuple[int, str]  # run number, law
 Record = dict[str, Any]
 
 _RIPPLE_WINDOW = 0.2  # s, ten periods of 50 Hz
-_EVENT_KEYS = ("t", "tick", "label")  # of a summary's event; the scenario has them
+_EVENT_KEYS = ("t", "tick", "label", "cut_short")  # of a summary's event; the scenario has them
 
 
 class RunFailed(Exception):

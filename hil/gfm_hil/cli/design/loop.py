@@ -1,0 +1,161 @@
+"""gfmhil design bode, nyquist, poles, step: a law's linear loop as a table and a figure."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from gfm_design.margins.all_margins import UnstableLoop
+from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, mode_as_json
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.report import cell
+from gfm_hil.scenario.model import load_scenario
+from gfm_hil.studies.loop import Loop, scenario_loop
+from gfm_runtime.signals import Y_NAMES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: what a command found: as JSON, and as a table
+Found = tuple[dict[str, Any], Table]
+
+
+def add(kinds: Any) -> None:
+    """Add the four commands to the parser."""
+    for name, text, find, draw in (
+        ("bode", "gain and phase of L, one loop cut, and its margins", _margins, _bode),
+        ("nyquist", "L in the complex plane, one loop cut, and its margins", _margins, _nyquist),
+        ("poles", "modes of the closed loop", _modes, _pole_map),
+        ("step", "y after a unit step of one input", _step, _draw_step),
+    ):
+        command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
+        command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
+        command.add_argument(
+            "--scenario", default="pref_step",
+            help="scenario file or shipped name: plant, references, T_s; pref_step by default",
+        )  # fmt: skip
+        if find is _margins:
+            command.add_argument(
+                "--at", help="channels of u or y, separated by commas; all of u by default"
+            )
+        if find is _step:
+            command.add_argument("--of", default="P_ref", help="the input that steps")
+            command.add_argument("--seconds", type=_seconds, default=1.0, help="how long, s")
+        command.add_argument("--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf")
+        command.add_argument("--json", action="store_true", help="as JSON")
+        command.set_defaults(call=call, find=find, draw=draw)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Print the table and draw the figure; exit code 3 where an unstable loop has no margins."""
+    scenario = load_scenario(options.scenario, law=options.law)
+    loop, label = scenario_loop(scenario)
+    if options.out:
+        _save(options.out, lambda: options.draw(loop, options))
+    console = Console(highlight=False)
+    try:
+        content, table = options.find(loop, options)
+    except UnstableLoop as problem:
+        if options.json:
+            reason = {"mode": mode_as_json(problem.mode), "reason": str(problem)}
+            print(json.dumps({"law": label, "scenario": scenario.title, "stable": False} | reason))
+        else:
+            console.print(f"{label}: no margins, {problem}")
+        return EXIT_OTHERWISE
+    if options.json:
+        print(json.dumps({"law": label, "scenario": scenario.title} | content, indent=2))
+    else:
+        console.print(f"[bold]{label}[/] · {scenario.title}")
+        console.print(table)
+        if options.out:
+            console.print(f"figure: {options.out}", soft_wrap=True)
+    return 0
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not 0.0 < value <= 1e4:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a number in (0, 10000]")
+    return value
+
+
+def _save(path: Path, draw: Callable[[], object]) -> None:
+    import matplotlib
+    from matplotlib import pyplot
+
+    matplotlib.use("Agg")
+    draw()
+    try:
+        pyplot.savefig(path, dpi=110)
+    except (OSError, ValueError) as problem:
+        raise UserError(f"--out {path}: {problem}") from None
+    finally:
+        pyplot.close()
+
+
+def _at(options: argparse.Namespace) -> list[str]:
+    return [] if options.at is None else options.at.split(",")
+
+
+def _bode(loop: Loop, options: argparse.Namespace) -> Axes:
+    return loop.bode(*_at(options))[0]
+
+
+def _nyquist(loop: Loop, options: argparse.Namespace) -> Axes:
+    return loop.nyquist(*_at(options))
+
+
+def _pole_map(loop: Loop, options: argparse.Namespace) -> Axes:
+    return loop.pole_map()
+
+
+def _draw_step(loop: Loop, options: argparse.Namespace) -> Axes:
+    return loop.step(options.of, options.seconds)[0]
+
+
+def _margins(loop: Loop, options: argparse.Namespace) -> Found:
+    found = loop.margins()
+    channels = {c.name: c for c in (*found.u, *found.y)}
+    wanted = _at(options) or [c.name for c in found.u]
+    if unknown := [name for name in wanted if name not in channels]:
+        raise UserError(f"--at {unknown[0]}: the loop has {list(channels)}")
+    some = [channels[name] for name in wanted]
+    return {"stable": True, "at": {c.name: channel_as_json(c) for c in some}}, loops_table(some)
+
+
+def _modes(loop: Loop, options: argparse.Namespace) -> Found:
+    modes = loop.modes()
+    table = Table(box=None, pad_edge=False)
+    for head in ("σ \\[1/s]", "frequency \\[Hz]", "damping ratio"):
+        table.add_column(head, justify="right")
+    for mode in modes:
+        table.add_row(f"{mode.sigma:.4g}", f"{mode.frequency_hz:.4g}", f"{mode.ratio:.3g}")
+    return {"stable": modes[0].sigma < 0.0, "modes": [mode_as_json(mode) for mode in modes]}, table
+
+
+def _step(loop: Loop, options: argparse.Namespace) -> Found:
+    try:
+        t, y = loop.step_response(options.of, options.seconds)
+    except ValueError as problem:
+        raise UserError(f"--of: {problem}") from None
+    table = Table(box=None, pad_edge=False)
+    for head in (f"after {options.of}", "peak \\[p.u.]", "at \\[s]", "at the end \\[p.u.]"):
+        table.add_column(head, justify="left" if head.startswith("after") else "right")
+    content = {}
+    for name, column in zip(Y_NAMES, y.T, strict=True):
+        k = int(np.argmax(np.abs(column)))
+        row = {"peak": float(column[k]), "peak_s": float(t[k]), "end": float(column[-1])}
+        content[name] = row
+        table.add_row(name, *(cell(value) for value in row.values()))
+    return {"of": options.of, "seconds": options.seconds, "y": content}, table

@@ -1,0 +1,210 @@
+"""Gamma, gains and margins of a law, as a notebook and the design commands ask for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gfm_design.margins.all_margins import Margins
+from gfm_design.margins.all_margins import margins as _margins
+from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
+from gfm_design.norms.weights import read_weights
+from gfm_design.tuning.full_order import FullOrder, full_order
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.law_comparison_modes import culprit
+from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
+from gfm_design.tuning.synthesis import NotStabilised
+from gfm_hil.core.errors import UserError, need
+from gfm_hil.scenario.model import Scenario
+from gfm_hil.studies.law import Law, as_law
+from gfm_plant import Plant
+
+if TYPE_CHECKING:
+    import pandas
+
+Weights = str | Path | Sequence[Weight] | None
+
+
+@dataclass(frozen=True)
+class Gamma:
+    """The H-infinity norm of diag(W_ij T_ij), by channel; Section III-B of the paper.
+
+    Attributes:
+        law: name of the law.
+        channels: i, j, norm and the frequency omega [rad/s] of its peak, of each weight W_ij.
+    """
+
+    law: str
+    channels: tuple[Channel, ...]
+
+    @property
+    def value(self) -> float:
+        """gamma, the largest of the channels' norms."""
+        return max(channel.norm for channel in self.channels)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """One row a channel: i, j, norm, omega [rad/s].
+
+        Raises:
+            UserError: pandas is not installed.
+        """
+        need("pandas", "pandas", "to_pandas", "notebook")
+        import pandas
+
+        return pandas.DataFrame(list(self.channels))
+
+    def __repr__(self) -> str:
+        return f"<Gamma {self.law}: {self.value:.6g}>"
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What a search of gains found.
+
+    Attributes:
+        law: the law with its new gains; run it, draw its loop, save it.
+        gamma: of that law.
+        gains: those that changed, and those that are tied to them.
+        evaluations, seconds: what the search took.
+        seed: what makes it repeatable.
+        problem: the problem that was solved.
+    """
+
+    law: Law
+    gamma: Gamma
+    gains: dict[str, float]
+    evaluations: int
+    seconds: float
+    seed: int
+    problem: PaperProblem
+
+    def bound(self) -> FullOrder | None:
+        """A gamma below which no controller of any order comes; None if the solver found none.
+
+        Raises:
+            UserError: python-control or slycot is not installed.
+        """
+        try:
+            return full_order(self.problem.linear, self.problem.weights)
+        except ModuleNotFoundError as missing:
+            raise UserError(str(missing)) from None
+
+    def __repr__(self) -> str:
+        return f"<Tuning {self.law.name}: gamma {self.gamma.value:.6g}, seed {self.seed}>"
+
+
+class NotTuned(ArithmeticError):
+    """No gains within their bounds stabilise the loop; the message names the mode in the way."""
+
+
+def gamma(law: str | Path | Law, weights: Weights = None, T_s: float | None = None) -> Gamma:
+    """gamma of a law on the paper's converter at P_ref = 0.5 p.u.
+
+    Args:
+        law: name, law file or ``Law``; ``Law.with_gains`` gives other gains.
+        weights: file of weights or the weights; the paper's six if None.
+        T_s: sampling time [s] of law and weights, by Tustin, without delay; None for the
+            continuous loop of the paper.
+
+    Raises:
+        Unstable: the loop is not stable; it has no gamma.
+        UserError: a weight that cannot be, or there is no operating point.
+        LawError: the law is none.
+    """
+    law = as_law(law)
+    loop = law.closed_loop(ideal=True)
+    if T_s is not None:
+        loop = loop.sampled(T_s)
+    return Gamma(law.name, loop.channels(_weights(weights)))
+
+
+def tune(
+    law: str | Path | Law,
+    name: str | None = None,
+    *,
+    start: Mapping[str, float] | None = None,
+    only: Sequence[str] | None = None,
+    weights: Weights = None,
+    seed: int = 0,
+    evaluations: int = EVALUATIONS,
+    starts: int | None = None,
+    progress: Callable[[int, int, float], None] = lambda done, of, best: None,
+) -> Tuning:
+    """Choose the free gains of a law for the least gamma (Section III-B of the paper).
+
+    Args:
+        law: name, law file or ``Law``; its parameters with ``free`` bounds may move.
+        name: of the new law; ``<name>-tuned`` if None.
+        start: other values to start from; MIMO-GFM starts from the paper's initial K.
+        only: the free gains to move; all if None.
+        weights: file of weights or the weights; the paper's six if None.
+        seed: of the search, >= 0; the same seed gives the same gains.
+        evaluations: of each start, before its polish.
+        starts: the given start and random ones; 6, and one more a gain, if None.
+        progress: told the evaluations done, how many there are to be, and the best gamma.
+
+    Raises:
+        NotTuned: no gains within the bounds stabilise the loop.
+        UserError: a number or a weight that cannot be; the package cma is missing.
+        LawError: the law is none, or declares no such free gain.
+    """
+    for what, value in (("evaluations", evaluations), ("starts", starts)):
+        if value is not None and value < 1:
+            raise UserError(f"{what} = {value}: must be at least 1")
+    if seed < 0:
+        raise UserError(f"seed = {seed}: must not be negative")
+    law = as_law(law)
+    paper = PAPER_START.get(law.name, {})
+    at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
+    problem = PaperProblem(law.file, free_gains(law.file, at, only), weights=_weights(weights))
+    starts = starts or starts_for(len(problem.gains))
+    try:
+        found = tune_paper(
+            problem, seed, evaluations, starts,
+            lambda done, best: progress(done, evaluations * starts, best),
+        )  # fmt: skip
+    except NotStabilised as none:
+        mode = culprit(problem.closed_loop(none.values)).words()
+        raise NotTuned(
+            f"{none}; in the way, on the paper's converter at "
+            f"P_ref = {problem.references[1]:g}: {mode}"
+        ) from None
+    except ModuleNotFoundError as missing:
+        raise UserError(str(missing)) from None
+    gains = problem.law.named(found.values)
+    tuned = law.with_gains(name or f"{law.name}-tuned", **gains)
+    channels = Gamma(tuned.name, problem.channels(found.values))
+    return Tuning(tuned, channels, gains, found.evaluations, found.seconds, found.seed, problem)
+
+
+def margins(
+    law: str | Path | Law, on: str | Path | Scenario | Plant | None = None, **more: Any
+) -> Margins:
+    """What the sampled loop of a law stands: gain, phase, disk and delay margins of each channel
+    in ``loop``, ranges of the circuit's elements in ``elements``, of the grid in ``grid``.
+
+    Takes some seconds; the page on margins says how each is found.
+
+    Args:
+        law: name, law file or ``Law``.
+        on, more: as for ``Law.closed_loop``.
+
+    Raises:
+        UnstableLoop: the loop is unstable and has no margins.
+        UserError: no such scenario, or there is no operating point.
+    """
+    return _margins(as_law(law).closed_loop(on, **more))
+
+
+def _weights(given: Weights) -> tuple[Weight, ...]:
+    if given is None:
+        return PAPER_WEIGHTS
+    if not isinstance(given, str | Path):
+        return tuple(given)
+    try:
+        return read_weights(Path(given))
+    except ValueError as problem:
+        raise UserError(f"weights {given}: {problem}") from None
