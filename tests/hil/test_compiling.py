@@ -14,6 +14,8 @@ from gfm_hil.engine.compiling import compile_everything, compile_sets
 from gfm_hil.links import link_names
 from gfm_hil.results.runner import run_scenario
 
+pytestmark = pytest.mark.processes
+
 _IMPORTS = """
 import importlib, pkgutil, sys
 from numba.core import ccallback, event
