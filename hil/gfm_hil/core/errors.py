@@ -1,4 +1,4 @@
-"""Errors that are the user's to mend: printed as one line, without a traceback."""
+"""Errors that the user can fix: printed as one line, without a traceback."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _SHOWN = 20
 
 
 class UserError(Exception):
-    """Wrong input or a bench that cannot start; the message names the field, value and remedy."""
+    """Wrong input, or a bench that cannot start; the message names field, value and remedy."""
 
 
 class Unfinished(Exception):
-    """A run that is over, but whose folder could not be completed; nothing recorded is lost."""
+    """The run is over, but its folder could not be completed; no recorded data is lost."""
 
 
 class PeerLost(Exception):
-    """The other side never came, stopped answering, or does not fit this side."""
+    """The other side never connected, stopped answering, or is not compatible with this side."""
 
 
 def need(module: str, package: str, what: str, extra: str) -> None:
@@ -31,7 +31,7 @@ def need(module: str, package: str, what: str, extra: str) -> None:
 
 
 def lines(problem: ValidationError) -> list[str]:
-    """What pydantic found, one line a mistake, 20 at most: path, what is wrong, the value."""
+    """pydantic's errors, one line each, 20 at most: path, what is wrong, the value."""
     errors = problem.errors()
     more = [f"and {len(errors) - _SHOWN} more mistakes"] if len(errors) > _SHOWN else []
     return [printable(_line(error)) for error in errors[:_SHOWN]] + more
@@ -57,6 +57,6 @@ def _line(error: Any) -> str:
 
 
 def _cut(value: Any) -> str:
-    """A value as Python writes it, at most 60 characters."""
+    """The repr of a value, at most 60 characters."""
     shown = repr(value)
     return shown if len(shown) < 60 else shown[:57] + "..."
