@@ -1,4 +1,4 @@
-"""From options to records: everything a tick needs is worked out here, once."""
+"""From options to records: computes once all constants that a tick needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plant from tick to tick: take u, go on by one sampling period, tell the truth.
+"""The plant from tick to tick: take u, advance by one sampling period, give the true values.
 
 The functions are compiled and allocate nothing. `par` and `st` are the records of
 `gfm_plant.records`, which `make_plant` builds; quantities are in p.u.
@@ -71,9 +71,9 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
 
 @compiled
 def plant_is_delayed(par: PlantRecord) -> bool:
-    """Whether a plant goes on first and takes the command then: nothing of u[k] acts in period k.
+    """Whether u[k] does not act in period k, so that the plant advances before it takes u[k].
 
-    Whoever waits for u[k] can let the plant go on meanwhile.
+    The caller can then advance the plant while it waits for u[k].
     """
     return bool(par[0].delay > 0)
 
@@ -107,7 +107,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     v, delta = _stretch(r, s, v, delta, newest, r.steps_new, r.h_new)
     s.tick += 1
 
-    size = abs(delta) / _FAR  # an islanded angle may grow, if it stays a number
+    size = abs(delta) / _FAR  # the angle of an island may grow without limit
     for value in v:
         size = max(size, abs(value)) if value == value else math.inf
     if size < _FAR and v[6] > 0.0:
@@ -118,7 +118,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = v[10], v[11], v[12], v[13]
         protect(r, s)
     else:
-        trip(s, DIVERGED, size)  # and keep the last state that was good
+        trip(s, DIVERGED, size)  # the last good state stays
     advance_grid(r, s)
 
 

@@ -1,4 +1,4 @@
-"""What the plant says in words: the names of its true values, its trips and their reasons."""
+"""Names of the plant's true values, of its trips and of their reasons."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The options of one plant, as scenario files embed them; the defaults are the paper's simulation.
 
-Everything is ideal until told otherwise: no sensor filter, noise, quantisation or delay, and all
+Everything is ideal by default: no sensor filter, noise, quantisation or delay, and all
 elements at their nominal values. Channels carry the names of y and u. omega_u is the
 controller's own number and passes the sensors and the A/D untouched.
 """
@@ -88,7 +88,7 @@ class Grid(Options):
 
 
 class Sensors(Options):
-    """What stands between the true quantities and the A/D; errors are applied per channel."""
+    """The sensors between the true quantities and the A/D, with errors for each channel."""
 
     bandwidth_hz: Positive | None = Field(None, description="first-order low-pass; ideal if none")
     gain: dict[Measured, float] = Field({}, description="measured over true value, default 1")

@@ -18,12 +18,12 @@ from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_la
 
 @dataclass(frozen=True)
 class LawSet:
-    """What a name stands for: one law, or the stages of a gain-scheduled one.
+    """The laws of one name: a single law, or the stages of a gain-scheduled one.
 
     Attributes:
         name: the name asked for.
-        laws: one law, or one a stage in ascending order of the stage's reactance.
-        schedule: None, or when which stage is in force.
+        laws: one law, or one for each stage in ascending order of the stage's reactance.
+        schedule: None, or the limits of the stages.
     """
 
     name: str
@@ -37,7 +37,7 @@ def _natural(name: str) -> list[int | str]:
 
 @cache
 def law_names() -> tuple[str, ...]:
-    """Names of all laws that ship but for the tuned ones, in natural order."""
+    """Names of all laws that ship except the tuned ones, in natural order."""
     return _names("")
 
 

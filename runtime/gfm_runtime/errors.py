@@ -11,9 +11,9 @@ class LawError(ValueError):
     """A law, one of its elements or one of its parameters is not usable.
 
     Args:
-        where: what is wrong, e.g. ``"phi_22"``, ``"parameter H"``, ``"law file x.toml"``.
-        why: the value found and what is allowed; one text a mistake.
-        lines: what to print, one line a mistake; ``where`` and ``why`` if empty.
+        where: the faulty item, e.g. ``"phi_22"``, ``"parameter H"``, ``"law file x.toml"``.
+        why: the value found and what is allowed; one text for each mistake.
+        lines: what to print, one line for each mistake; ``where`` and ``why`` if empty.
     """
 
     def __init__(self, where: str, *why: str, lines: Sequence[str] = ()) -> None:

@@ -41,7 +41,7 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
 
 
 def evaluate_each(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
-    """As ``evaluate`` for parameters that are arrays; what is not finite is left in the array."""
+    """As ``evaluate`` for parameters that are arrays; the result may hold values not finite."""
     return _walk(where, _parse(where, value), parameters)
 
 

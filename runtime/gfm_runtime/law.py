@@ -1,4 +1,4 @@
-"""A law: the 3x5 grid of elements Phi(s), what it acts on and what it adds to.
+"""A law: the 3x5 grid of elements Phi(s), its error map, set-points and limits.
 
     u = u_0 + Phi(s) (Y_ref - y) - Psi(s) y                       (Fig. 6 of the paper)
 
@@ -27,7 +27,7 @@ def cell_name(matrix: str, cell: Cell) -> str:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the kernel clamps u to, and how it lets go.
+    """The clamps of u and the anti-windup.
 
     Attributes:
         low, high: shape (3,), p.u., for (i_u, omega_u, E_u).
@@ -56,7 +56,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A named number of a law: value, unit and where it comes from."""
+    """A named number of a law: value, unit and source."""
 
     value: float
     unit: str
@@ -78,7 +78,7 @@ class Law:
 
     Attributes:
         name: e.g. ``"vsg-2"``.
-        title, source: for people; the source names table, equation or paper.
+        title, source: for tables and reports; the source names table, equation or paper.
         phi: elements on the errors, by zero-based (row, column); absent means 0.
         psi: the ``{}`` terms on the measurements alone; u_i is lowered by psi_ij(s) y_j.
         u_0: set-points of u; a number in p.u., or the name of the reference it follows.

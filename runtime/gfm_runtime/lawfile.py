@@ -87,7 +87,7 @@ class ParameterSpec(_Model):
 
 
 class ErrorMapSpec(_Model):
-    """What Phi(s) acts on; R and X (p.u.) only for hybrid-angle."""
+    """The errors on which Phi(s) acts; R and X (p.u.) only for hybrid-angle."""
 
     type: str = Field("linear", description="linear, dc-energy, dvoc or hybrid-angle")
     R: Number | None = Field(None, description="resistance of the line, p.u.; hybrid-angle only")
@@ -253,10 +253,10 @@ def _error_map(file: LawFile, numbers: Mapping[str, float]) -> tuple[str, tuple[
 
 
 def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
-    """The law of a file, with some of its parameters changed if wanted.
+    """The law of a file, with other values for some of its parameters if given.
 
     Raises:
-        LawError: every element, parameter, set-point and limit that cannot be, one line each.
+        LawError: every invalid element, parameter, set-point and limit, one line each.
     """
     numbers = {name: spec.value for name, spec in file.parameters.items()}
     for name, value in (changed or {}).items():

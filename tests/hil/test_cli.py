@@ -205,7 +205,8 @@ def test_an_earlier_run_is_not_written_over(call):
 def test_the_exit_code_tells_whether_the_run_ended_as_expected(content, expect, code, call):
     found, out, _ = call("run", scenario(**content, expect=expect), "--out", "run", "--no-figures")
     assert found == code
-    assert out.startswith("tripped — over-current" if content is TRIP else "completed")
+    tripped = "tripped, as expected — over-current" if code == 0 else "tripped — over-current"
+    assert out.startswith(tripped if content is TRIP else "completed")
 
 
 def test_compare_draws_the_laws_side_by_side(call):

@@ -1,4 +1,4 @@
-"""What a scope can show: recorded columns as people read them, and figures of the loop itself."""
+"""The channels of a scope: recorded columns with names and units, and figures of the loop."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Channel:
 
     Attributes:
         name: in messages between page and server.
-        group: what it belongs to: y, u, ref, grid, plant or loop.
-        symbol, unit, description: for people.
-        least: the smallest range of values worth the full height of a plot, in ``unit``.
-        needs: columns of the recording that it is made of.
-        of: its values in the ticks from first to last-1 of some columns; NaN where there is none.
+        group: y, u, ref, d, plant or loop.
+        symbol, unit, description: for display.
+        least: the smallest range of values that fills the height of a plot, in ``unit``.
+        needs: columns of the recording from which it is computed.
+        of: computes its values of the ticks [first, last) from the columns; NaN if there is none.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Channel:
     of: Callable[[Columns, int, int], NDArray[np.float64]]
 
     def about(self) -> dict[str, Any]:
-        """Plain data for the page."""
+        """The channel as plain data for the page."""
         content = asdict(self)
         del content["needs"], content["of"]
         return content
@@ -56,7 +56,7 @@ def make_channels(T_s: float, f_b: float) -> tuple[Channel, ...]:
 
     Args:
         T_s: sampling time, s.
-        f_b: frequency that 1 p.u. stands for, Hz.
+        f_b: base frequency, Hz.
     """
     return (
         *(_column(n, "y", f"y_{n}", f_b) for n in names("y")),

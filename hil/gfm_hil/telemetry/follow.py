@@ -1,4 +1,4 @@
-"""Following the recording of a run that is going on, row by row, from now on."""
+"""Follows the recording of a run in progress, row by row, from now on."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from gfm_hil.recording.columns import Columns, named
 from gfm_hil.recording.live import LiveRun, begun
 from gfm_hil.recording.timing import count_misses
 
-_LAST = 1  # rows not looked at yet: a tick's last time is written after it counts as done
+_LAST = 1  # newest rows not read yet: a tick's last time is written after it counts as done
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one side, as they are in ``recording.parts.Part``.
+    """Rows of one side, as in ``recording.parts.Part``.
 
     Attributes:
-        side: whose.
-        first: tick of the first one.
+        side: ``"plant"`` or ``"controller"``.
+        first: tick of the first row.
         signals: shape (n, columns), the units of the recording; NaN in ticks never recorded.
         times: shape (n, columns), int64, ns.
     """
@@ -40,7 +40,7 @@ class Rows:
 
 
 class Follower:
-    """What a run records from now on.
+    """Reads what a run records from now on.
 
     Args:
         folder: of a run that has begun.
@@ -50,7 +50,7 @@ class Follower:
         over: nothing will be recorded any more.
 
     Raises:
-        UserError: it is no run folder, or the run is over.
+        UserError: it is not a run folder, or the run is over.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,13 +64,13 @@ class Follower:
         self.over = False
 
     def news(self) -> list[Rows]:
-        """What has been recorded since the last call that returned; ``over`` tells that there will
-        be no more.
+        """Rows recorded since the last call that returned; afterwards ``over`` says whether these
+        were the last.
 
         Raises:
-            OSError: it cannot be told what there is; the next call finds it.
+            OSError: the recording cannot be read now; the next call returns its rows.
         """
-        over = not (self.folder / "parts").is_dir()  # put together, and gone
+        over = not (self.folder / "parts").is_dir()  # the parts were merged and removed
         found = []
         for side, part in self.run.parts.items():
             first, done = self._next[side], self.run.done(side) - (0 if over else _LAST)
@@ -81,5 +81,5 @@ class Follower:
         return found
 
     def misses_before(self) -> int:
-        """Misses in the ticks before those that the next call of ``news`` will find."""
+        """Number of misses before the rows that the next call of ``news`` returns."""
         return count_misses(self.run.columns, self._next["plant"])
