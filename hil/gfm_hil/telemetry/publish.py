@@ -1,4 +1,4 @@
-"""The publisher beside a run: looks what is new, and sends it to whoever listens."""
+"""The publisher of a run: it reads new ticks and sends them to its subscribers."""
 
 from __future__ import annotations
 
