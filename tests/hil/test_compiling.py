@@ -14,6 +14,8 @@ from gfm_hil.engine.compiling import compile_everything, compile_sets
 from gfm_hil.links import link_names
 from gfm_hil.results.runner import run_scenario
 
+pytestmark = pytest.mark.processes
+
 _IMPORTS = """
 import importlib, pkgutil, sys
 from numba.core import ccallback, event
@@ -78,7 +80,7 @@ def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
     before = cached(root)
     assert before
     for link in link_names():
-        scenario = make(link={"type": link}, duration=0.01)
+        scenario = make(link={"type": link, "peer_timeout_s": 60.0}, duration=0.01)
         run = run_scenario(scenario, tmp_path / link, notice=said.append, figures=False)
         assert run.summary["status"] == "completed"
     assert said == ["starting controller and plant …"] * len(link_names())

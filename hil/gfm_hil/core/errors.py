@@ -1,4 +1,4 @@
-"""Errors that are the user's to mend: printed as one line, without a traceback."""
+"""Errors that the user can fix: printed as one line, without a traceback."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from gfm_runtime.mistakes import lines as lines
 
 
 class UserError(Exception):
-    """Wrong input or a bench that cannot start; the message names the field, value and remedy."""
+    """Wrong input, or a bench that cannot start; the message names field, value and remedy."""
 
 
 class Unfinished(Exception):
-    """A run that is over, but whose folder could not be completed; nothing recorded is lost."""
+    """The run is over, but its folder could not be completed; no recorded data is lost."""
 
 
 class PeerLost(Exception):
-    """The other side never came, stopped answering, or does not fit this side."""
+    """The other side never connected, stopped answering, or is not compatible with this side."""
 
 
 def need(module: str, package: str, what: str, extra: str) -> None:

@@ -1,11 +1,11 @@
 """A ring of messages between one writer and one reader, both compiled.
 
-A slot is a word, the stamp, and up to 504 bytes. The writer fills the bytes and then releases the
-stamp: the number of the message and its length in one. The reader looks at the stamp of the slot
-that comes next, and so waits on the very line that brings the message; where the writer stands is
-told by nothing else. The reader releases the number of messages it has taken, the head, which the
-writer looks at only when its last copy of it says that the ring is full. Stamps and head make the
-whole state: whoever takes an end over goes on from them.
+A slot is a stamp (one word) and up to 504 bytes. The writer fills the bytes and then writes the
+stamp with a release store: the number of the message and its length in one word. The reader polls
+the stamp of the next slot, and so waits on the cache line that brings the message; the writer
+publishes no other position. The reader releases the head, the number of messages it has taken. The
+writer loads it only when its last copy says that the ring is full. Stamps and head are the whole
+state: a process that takes over an end continues from them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.realtime.atomics import copy, load_acquire, pause, store_release
 from gfm_runtime.compiled import compiled
 
-SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
+SLOTS = 64  # messages: 6 ms at 10 kHz; a full ring drops frames instead of delivering stale ones
 WORD = 8  # bytes
 SLOT = WORD + LONGEST  # bytes
 RING = SLOTS * SLOT  # bytes
@@ -26,8 +26,8 @@ RING = SLOTS * SLOT  # bytes
 LENGTH_BITS = 16
 _LENGTH = (1 << LENGTH_BITS) - 1
 
-#: the handle: addresses of the ring written to and of its head (0: not open), messages sent, and
-#: the head as last seen; addresses of the ring read from and of its head, messages taken
+#: the handle: addresses of the ring to write and of its head (0: not open), messages sent, and
+#: the last copy of the head; addresses of the ring to read and of its head, messages taken
 OUT, OUT_HEAD, SENT, SEEN, IN, IN_HEAD, TAKEN, HANDLE = range(8)
 
 
@@ -51,8 +51,9 @@ def put(handle, message):
 
 @compiled
 def take(handle, message):
-    """Read the next message: its bytes, or 0 if none has come. A longer one is gone."""
-    room, to = message.size, message.ctypes.data  # here: in a branch numba would count references
+    """Read the next message: returns its length in bytes, or 0 if none has arrived. A message
+    longer than ``message`` is dropped, and its length returned."""
+    room, to = message.size, message.ctypes.data  # in a branch numba would count references
     if handle[IN] == 0:
         return 0
     taken = handle[TAKEN]
@@ -71,7 +72,7 @@ def take(handle, message):
 
 @compiled
 def waiting(handle):
-    """Whether a message has come."""
+    """Whether a message has arrived."""
     taken = handle[TAKEN]
     if handle[IN] == 0:
         return False

@@ -1,7 +1,7 @@
-"""What can happen in a scenario, as one pydantic model an event.
+"""The events of a scenario, one pydantic model per kind.
 
-An event is given at a time ``t`` [s] or at a ``tick``. References and law changes are carried out
-by the controller, everything that begins with ``grid`` by the plant; each side takes its own.
+An event has a time ``t`` [s] or a ``tick``. The controller carries out references and law changes,
+the plant all events of the grid; each side selects its own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
 
 
 class _Event(BaseModel):
-    """When; each kind adds what, and a ``label`` of a few words for figures and reports."""
+    """The time of an event; each kind adds its fields and a short ``label`` for figures and
+    reports."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -78,7 +79,7 @@ def check_reference(name: str, value: float) -> None:
 
 
 class LawChange(_Event):
-    """Change to another law, bumpless."""
+    """Change to another law, without a bump."""
 
     type: Literal["law"] = Field(description="kind of event")
     law: str = Field(description="catalogue name or law file")
@@ -88,7 +89,8 @@ class LawChange(_Event):
 
 
 class Gains(_Event):
-    """Other gains of the active law, by the names in its file; bumpless. What is tied follows."""
+    """New gains of the active law, by the names in its file, without a bump. Tied parameters
+    follow."""
 
     type: Literal["gains"] = Field(description="kind of event")
     values: dict[str, float] = Field(
@@ -100,7 +102,7 @@ class Gains(_Event):
 
 
 class Reset(_Event):
-    """Back to the scenario's start from a trip or the safe state, for runs that wait there."""
+    """Return from a trip or the safe state to the scenario's start, for runs that wait there."""
 
     type: Literal["reset"] = Field(description="kind of event")
 
@@ -185,7 +187,7 @@ CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 
 def apply_grid_event(event: Any, par: Any, st: Any) -> None:
-    """Carry out one of the plant's events on its records, between two ticks."""
+    """Apply one of the plant's events to its records, between two ticks."""
     from gfm_plant import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
 
     f_b = float(par[0]["omega_b"]) / (2 * math.pi)

@@ -1,4 +1,4 @@
-"""What a scenario consists of, as pydantic models: all that can be said without trying it out."""
+"""The parts of a scenario as pydantic models, with all checks that need no plant or laws."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Link(_Model):
 
     @model_validator(mode="after")
     def _known(self) -> Link:
-        if self.type == INPROC:  # endpoint and options wait for the day there is a link again
+        if self.type == INPROC:  # ignore endpoint and options: another link may need them
             return self
         if self.type not in link_names():
             known = sorted([INPROC, *link_names()])
@@ -100,12 +100,12 @@ class References(_Model):
         return self
 
     def vector(self) -> list[float]:
-        """In the order of the signal table."""
+        """The references in the order of the signal table."""
         return [getattr(self, name) for name in REF_NAMES]
 
 
 class LatePolicy(_Model):
-    """Real time: what to do about frames that are not there at their deadline."""
+    """Real time: what to do if a frame misses its deadline."""
 
     hold: int = Field(
         200, ge=0, le=10**9, description="ticks in a row to hold the last value, then SAFE"
@@ -182,17 +182,17 @@ class Scenario(_Model):
         return round(self.duration / self.T_s)
 
     def laws(self) -> list[str]:
-        """Names of every law that the run uses, the first one first, each once."""
+        """Names of all laws that the run uses, each once, the initial law first."""
         changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
         return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
 
     def sorted_events(self) -> list[Event]:
-        """Events in order of their tick; those of one tick in the order of the file."""
+        """Events in order of their tick; within a tick in the order of the file."""
         return sorted(self.events, key=lambda e: e.at(self.T_s))
 
     def digest(self) -> str:
-        """Hash over what both sides must agree on: scenario, signal table, and what is in the
-        law and converter files, wherever each machine keeps them."""
+        """Hash of all that both sides must agree on: scenario, signal table, and the content of
+        the law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "compare"}
         about |= {"expect", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
@@ -205,7 +205,7 @@ class Scenario(_Model):
         return _hash([content, events, self.laws_digest(), table_hash()])
 
     def laws_digest(self) -> str:
-        """Hash over the content of every law that the run uses."""
+        """Hash of the content of every law that the run uses."""
         return _hash([law_file(name).model_dump() for name in self.laws()])
 
     @model_validator(mode="after")
@@ -249,8 +249,8 @@ __all__ = [
 ]
 
 SCENARIO_FOLDERS = (
-    Path(__file__).resolve().parents[1] / "scenarios",  # a wheel carries them here
-    Path(__file__).resolve().parents[3] / "scenarios",  # a checkout has them here
+    Path(__file__).resolve().parents[1] / "scenarios",  # in a wheel
+    Path(__file__).resolve().parents[3] / "scenarios",  # in a checkout
 )
 
 
@@ -264,7 +264,7 @@ def find_scenario(name: str) -> Path:
 
 
 def find_file(kind: str, name: str, pattern: str) -> Path:
-    """The file of that path, or the shipped one of that name; ``kind`` is for the message.
+    """The file at that path, or the shipped file of that name; ``kind`` is for the message.
 
     Raises:
         UserError: neither exists.
@@ -272,7 +272,7 @@ def find_file(kind: str, name: str, pattern: str) -> Path:
     given, shipped = Path(name), _shipped(pattern)
     try:
         is_file, exists = given.is_file(), given.exists()
-    except OSError as problem:  # such as a name of 300 characters
+    except OSError as problem:  # for example a name of 300 characters
         raise UserError(printable(f"{kind} {name}: {problem.strerror}")) from None
     if is_file:
         return given
@@ -300,13 +300,13 @@ def load_scenario(
     Args:
         name: path or shipped name.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
-            None leaves the file's value. Another link than the file's forgets its endpoint
+            None leaves the file's value. A link other than the file's drops the file's endpoint
             and options.
         options: what a person calls an override, by its name in ``changed``, e.g.
             ``{"link__type": "--link"}``; messages name it in place of the file.
 
     Raises:
-        UserError: one line a mistake, each with its path, the value and what is allowed.
+        UserError: one line per mistake, each with its path, the value and what is allowed.
     """
     path = find_scenario(name)
     try:
@@ -315,7 +315,7 @@ def load_scenario(
         raise UserError(f"{path}: {problem}") from None
     link, chosen = content.get("link"), changed.get("link__type")
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
-        link.pop("endpoint", None)  # they are of the file's own link
+        link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
     for key, value in changed.items():
         if value is not None:
@@ -323,7 +323,7 @@ def load_scenario(
             *parents, last = key.split("__")
             for parent in parents:
                 table = table.setdefault(parent, {}) if isinstance(table, dict) else None
-            if isinstance(table, dict):  # else the check says what the file has instead
+            if isinstance(table, dict):  # else the check reports what the file has instead
                 table[last] = value
     overrides = {
         tuple(key.split("__")): f"{options.get(key, key.replace('__', '.'))} {value}"
@@ -386,7 +386,7 @@ def _try_law(name: str, stage: Law, T_s: float) -> None:
 
 
 def _try_plant(scenario: Scenario) -> None:
-    """Make the plant and every line that its events give it, which may be too fast to resolve."""
+    """Build the plant with every line of its events; a line may be too fast to simulate."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
     if scenario.plant.converter.endswith(".toml"):
         try:

@@ -1,4 +1,4 @@
-"""Shared memory between two processes of one machine."""
+"""Shared memory between two processes on one machine."""
 
 from __future__ import annotations
 
