@@ -94,7 +94,7 @@ def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[s
 def comparison_table(rows: list[dict[str, Any]]) -> Table:
     """For people."""
     return Table(
-        "B beside A: medians of rounds, p of the rank test corrected for the number of rows",
+        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
         ("", "A", "B", "unit", "B : A", "p", "verdict"),
         [
             (
