@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from pathlib import Path
@@ -278,11 +279,11 @@ def shipped_scenarios() -> list[str]:
     return sorted(_shipped("*.toml"))
 
 
-def load_scenario(name: str, **changed: Any) -> Scenario:
+def load_scenario(given: str | Path | Scenario | dict[str, Any], **changed: Any) -> Scenario:
     """Read, override and check a scenario, its laws and its plant.
 
     Args:
-        name: path or shipped name.
+        given: path or shipped name; content of a file; or a checked scenario.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
             None leaves the file's value. Another link than the file's forgets its endpoint
             and options.
@@ -290,11 +291,17 @@ def load_scenario(name: str, **changed: Any) -> Scenario:
     Raises:
         UserError: one line a mistake, each with its path, the value and what is allowed.
     """
-    path = find_scenario(name)
-    try:
-        content = read_toml(path)
-    except ValueError as problem:
-        raise UserError(f"{path}: {problem}") from None
+    where, content = "scenario", {}
+    if isinstance(given, str | Path):
+        where = str(find_scenario(str(given)))
+        try:
+            content = read_toml(where)
+        except ValueError as problem:
+            raise UserError(f"{where}: {problem}") from None
+    elif isinstance(given, Scenario):
+        content = given.model_dump(mode="json", exclude_none=True)
+    else:
+        content = copy.deepcopy(given)
     link, chosen = content.get("link"), changed.get("link__type")
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
         link.pop("endpoint", None)  # they are of the file's own link
@@ -307,7 +314,7 @@ def load_scenario(name: str, **changed: Any) -> Scenario:
                 table = table.setdefault(parent, {}) if isinstance(table, dict) else None
             if isinstance(table, dict):  # else the check says what the file has instead
                 table[last] = value
-    return check_scenario(content, str(path))
+    return check_scenario(content, where)
 
 
 def check_scenario(content: dict[str, Any], where: str) -> Scenario:
