@@ -1,4 +1,4 @@
-"""Misses in real time with the processors kept awake and left to rest, in turns.
+"""Misses in real time with the processors kept awake and left to rest, in interleaved rounds.
 
 Both are the product over a link, two processes at 10 kHz; see ``keep_awake`` of a scenario.
 """
@@ -32,23 +32,23 @@ def misses(link: str, way: str, seconds: float, folder: Path) -> int:
     return int(run.summary["misses"])
 
 
-def measure(links: list[str], seconds: float, turns: int) -> list[dict[str, object]]:
-    """A row for each link and way: misses of each turn; every second turn runs backwards."""
+def measure(links: list[str], seconds: float, rounds: int) -> list[dict[str, object]]:
+    """A row for each link and way: misses of each round; every second round runs backwards."""
     jobs = [(link, way) for link in links for way in WAYS]
     found: dict[tuple[str, str], list[int]] = {job: [] for job in jobs}
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
-        for turn in range(turns):
-            for link, way in jobs[:: -1 if turn % 2 else 1]:
-                print(f"turn {turn + 1} of {turns}: {link}, {way}", file=sys.stderr)
-                folder = Path(place) / f"{turn}-{link}-{way}"
+        for round_ in range(rounds):
+            for link, way in jobs[:: -1 if round_ % 2 else 1]:
+                print(f"round {round_ + 1} of {rounds}: {link}, {way}", file=sys.stderr)
+                folder = Path(place) / f"{round_}-{link}-{way}"
                 found[link, way].append(misses(link, way, seconds, folder))
     ticks = round(seconds * 1e4)
     return [
         {
             "link": link,
             "keep_awake": way,
-            "ticks": ticks * turns,
-            "missed_pct": round(100 * sum(counts) / (ticks * turns), 4),
+            "ticks": ticks * rounds,
+            "missed_pct": round(100 * sum(counts) / (ticks * rounds), 4),
             "median_of_a_run_pct": round(100 * statistics.median(counts) / ticks, 4),
             "missed": counts,
         }
@@ -61,10 +61,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--links", default="shm,zmq", help="by commas")
     parser.add_argument("--seconds", type=float, default=5.0, help="of a run")
-    parser.add_argument("--turns", type=int, default=6)
+    parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    rows = measure(options.links.split(","), options.seconds, options.turns)
+    rows = measure(options.links.split(","), options.seconds, options.rounds)
     if options.json:
         print(json.dumps(rows, indent=2))
         return

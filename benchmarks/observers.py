@@ -1,6 +1,6 @@
 """Misses of a run in real time without Modbus clients, and with many that poll all they can.
 
-One run over shared memory with its server beside it; turns without a client and with many follow
+One run over shared memory with its server beside it; rounds without a client and with many follow
 each other in that one run, so that what else the machine does meets both. Before and after the run
 both processors only pace, with nothing else to do: those ticks the host loses by itself.
 """
@@ -37,7 +37,7 @@ from gfm_hil.realtime.environment import environment, may_sched_fifo
 from gfm_hil.recording.recorder import CONTROLLER_TIMES, PLANT_TIMES, Part
 
 T_S = 1e-4  # s
-_SETTLE_S = 0.5  # between two turns, not counted: clients come and go
+_SETTLE_S = 0.5  # between two rounds, not counted: clients come and go
 _READ = (40070, 125)  # first register and count: most of model 701
 _NONE, _MANY = "no client", "clients"
 SCENARIO = f"""
@@ -70,10 +70,10 @@ class Turn:
 
 @dataclass
 class Found:
-    """All turns of one kind together."""
+    """All rounds of one kind together."""
 
     ticks: int = 0
-    missed: list[int] = field(default_factory=list)  # a turn
+    missed: list[int] = field(default_factory=list)  # by round
     answers: int = 0
     seconds: float = 0.0
     trips: list[NDArray[np.int64]] = field(default_factory=list)
@@ -106,18 +106,18 @@ def poll(pipe: Connection, port: int, clients: int) -> None:
         pipe.send(answers)
 
 
-def measure(clients: int, seconds: float, turns: int) -> dict[str, Any]:
+def measure(clients: int, seconds: float, rounds: int) -> dict[str, Any]:
     """Everything; plain data."""
     policy = "fifo" if may_sched_fifo() else "other"
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
-        late = [_pace(policy, seconds, turns)]
-        timing, stretches = _run(Path(place), clients, seconds, turns)
-        late.append(_pace(policy, seconds, turns))
+        late = [_pace(policy, seconds, rounds)]
+        timing, stretches = _run(Path(place), clients, seconds, rounds)
+        late.append(_pace(policy, seconds, rounds))
     found = {
         kind: _count(timing, [s for s in stretches if s.kind == kind]) for kind in (_NONE, _MANY)
     }
     trip = float(np.median(np.concatenate(found[_NONE].trips)))
-    pieces = [piece for each in late for piece in np.array_split(each, (turns + 1) // 2, axis=1)]
+    pieces = [piece for each in late for piece in np.array_split(each, (rounds + 1) // 2, axis=1)]
     gone = [len(lost(piece, T_S * 1e9 - trip)) for piece in pieces]
     ticks = sum(piece.shape[1] for piece in pieces)
     rows = [{"what": "bare pacing", "ticks": ticks, "missed": sum(gone),
@@ -133,21 +133,21 @@ def measure(clients: int, seconds: float, turns: int) -> dict[str, Any]:
         })  # fmt: skip
     more = np.subtract(found[_MANY].missed, found[_NONE].missed)
     return {
-        "clients": clients, "seconds": seconds * turns, "policy": policy, "rows": rows,
+        "clients": clients, "seconds": seconds * rounds, "policy": policy, "rows": rows,
         "more_by_turn": more.tolist(), "environment": environment(),
     }  # fmt: skip
 
 
-def _pace(policy: Any, seconds: float, turns: int) -> NDArray[np.int64]:
-    """Lateness of a loop that only paces, half as long as the turns, (2, ticks), ns."""
+def _pace(policy: Any, seconds: float, rounds: int) -> NDArray[np.int64]:
+    """Lateness of a loop that only paces, half as long as the rounds, (2, ticks), ns."""
     with ExitStack() as stack:
         two = stack.enter_context(pair(policy, memory_folder(stack)))
         two.both(pace_here, 0, 1, HYBRID, 1)
-        return pace_both(two, round(T_S * 1e9), HYBRID, seconds * turns / 2)
+        return pace_both(two, round(T_S * 1e9), HYBRID, seconds * rounds / 2)
 
 
-def _run(place: Path, clients: int, seconds: float, turns: int) -> tuple[Timing, list[Turn]]:
-    duration = 2 * turns * (seconds + 2 * _SETTLE_S) + 20.0
+def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing, list[Turn]]:
+    duration = 2 * rounds * (seconds + 2 * _SETTLE_S) + 20.0
     file, folder = place / "observers.toml", place / "run"
     file.write_text(SCENARIO.format(duration=duration), encoding="utf-8")
     with socket.socket() as probe:
@@ -168,8 +168,8 @@ def _run(place: Path, clients: int, seconds: float, turns: int) -> tuple[Timing,
         pollers.start()
         ours.recv()
         stretches = []
-        for turn in range(turns):
-            for kind in (_NONE, _MANY)[:: -1 if turn % 2 else 1]:
+        for round_ in range(rounds):
+            for kind in (_NONE, _MANY)[:: -1 if round_ % 2 else 1]:
                 stretches.append(_turn(kind, seconds, ours))
         timing = _times(folder)
     finally:
@@ -199,19 +199,19 @@ def _turn(kind: str, seconds: float, pipe: Any) -> Turn:
     time.sleep(_SETTLE_S)
     begin = time.monotonic_ns()
     time.sleep(seconds)
-    turn = Turn(kind, begin, time.monotonic_ns())
+    round_ = Turn(kind, begin, time.monotonic_ns())
     if kind == _MANY:
         pipe.send("stop")
-        turn.answers = pipe.recv()
+        round_.answers = pipe.recv()
     time.sleep(_SETTLE_S)
-    return turn
+    return round_
 
 
 def _count(timing: Timing, stretches: list[Turn]) -> Found:
     found = Found()
-    for turn in stretches:
+    for round_ in stretches:
         scheduled = timing["plant_scheduled"]
-        here = (scheduled >= turn.begin) & (scheduled < turn.end)
+        here = (scheduled >= round_.begin) & (scheduled < round_.end)
         part = {name: column[here] for name, column in timing.items()}
         there = part["plant_received"] >= 0
         found.ticks += len(there)
@@ -219,8 +219,8 @@ def _count(timing: Timing, stretches: list[Turn]) -> Found:
         found.trips.append((part["plant_received"] - part["plant_scheduled"])[there])
         causes = attribute(part, round(T_S * 1e9))
         found.causes += np.bincount(causes, minlength=len(CAUSES))
-        found.answers += turn.answers
-        found.seconds += (turn.end - turn.begin) * 1e-9
+        found.answers += round_.answers
+        found.seconds += (round_.end - round_.begin) * 1e-9
     return found
 
 
@@ -235,8 +235,8 @@ def _table(found: dict[str, Any]) -> str:
     line("ticks", [f"{row['ticks']}" for row in kinds])
     line("ticks missed", [f"{row['missed']}" for row in kinds])
     line("%", [f"{row['missed_pct']:.4f}" for row in kinds])
-    line("in the median turn", [f"{statistics.median(row['by_turn']):g}" for row in kinds])
-    line("turn by turn", [", ".join(map(str, row["by_turn"])) for row in kinds])
+    line("in the median round", [f"{statistics.median(row['by_turn']):g}" for row in kinds])
+    line("round by round", [", ".join(map(str, row["by_turn"])) for row in kinds])
     for name, words in (("p50", "50"), ("p1", "99"), ("p01", "99.9")):
         cells = [f"{row['slack_us'][name]:g}" if "slack_us" in row else "–" for row in kinds]
         line(f"slack that {words} % have, µs", cells)
@@ -251,8 +251,8 @@ def _table(found: dict[str, Any]) -> str:
     return "\n".join([
         *lines, "",
         f"{found['clients']} clients for {found['seconds']:g} s, {found['policy']}: "
-        f"{np.mean(by_turn):+.0f} ± {error:.0f} misses a turn (mean and its standard error); "
-        f"turn by turn {more}",
+        f"{np.mean(by_turn):+.0f} ± {error:.0f} misses in a round (mean and its standard error); "
+        f"round by round {more}",
     ])  # fmt: skip
 
 
@@ -260,13 +260,13 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--clients", type=int, default=50, help="(default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of a turn (%(default)s)")
-    parser.add_argument("--turns", type=int, default=6, help="of each kind (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of a round (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=6, help="of each kind (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print JSON and nothing else")
     options = parser.parse_args()
-    if options.clients < 1 or options.turns < 1 or not 0.1 <= options.seconds <= 3600:
-        parser.error("--clients and --turns must be at least 1, --seconds in [0.1, 3600]")
-    found = measure(options.clients, options.seconds, options.turns)
+    if options.clients < 1 or options.rounds < 1 or not 0.1 <= options.seconds <= 3600:
+        parser.error("--clients and --rounds must be at least 1, --seconds in [0.1, 3600]")
+    found = measure(options.clients, options.seconds, options.rounds)
     print(json.dumps(found, indent=1) if options.json else _table(found))
 
 

@@ -83,18 +83,18 @@ class Example:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--turns", type=int, default=5, help="turns of each (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds of each (%(default)s)")
     parser.add_argument("--quick", action="store_true", help="hardly any work: only try it out")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--law", default="psc-2", help="of gfmhil's loop (default: %(default)s)")
     parser.add_argument("--duration", type=float, default=1.5, help="s of each (%(default)s)")
     args = parser.parse_args()
-    duration, turns = (0.01, 1) if args.quick else (args.duration, args.turns)
+    duration, rounds = (0.01, 1) if args.quick else (args.duration, args.rounds)
     theirs = Example(duration)
     with tempfile.TemporaryDirectory() as place:
         loop = Loop("pref_step", args.law, round(duration / T_S), Path(place))
         found = take_turns(
-            {"gfmhil": lambda: loop.T_s * 1e9 / loop.whole(), "motulator": theirs.run}, turns
+            {"gfmhil": lambda: loop.T_s * 1e9 / loop.whole(), "motulator": theirs.run}, rounds
         )
     rates = {name: Spread.of(values) for name, values in found.items()}
     faster = ratio(found["gfmhil"], found["motulator"])
@@ -103,7 +103,7 @@ def main() -> None:
         about = {"motulator_p_pu": theirs.p, "remarks": REMARKS, "environment": environment()}
         print(json.dumps(result | about, indent=2))
         return
-    print(f"simulated seconds per second: median (min-max) of {turns} turns")
+    print(f"simulated seconds per second: median (min-max) of {rounds} rounds")
     print(f"  gfmhil, {args.law}: {rates['gfmhil'].text(1)}")
     print(f"  motulator, its grid-forming example: {rates['motulator'].text(3)}")
     print(f"{faster.text(0)} times as fast (target {TARGET:g})")

@@ -1,8 +1,9 @@
 """What each setting of the ZeroMQ link costs: round trips of the bench's frames.
 
 Two processes on the processors of a run in real time call libzmq from compiled loops, as the link
-does. Every setting is a pair of sockets of its own, open from the start, and they take turns. The
-ratio is that of the median round trip to the link's own setting (PAIR, ipc) in the same turn.
+does. Every setting has a pair of sockets of its own, open from the start, and the settings are
+measured in interleaved rounds. The ratio is that of the median round trip to the link's own setting
+(PAIR, ipc) in the same round.
 """
 
 from __future__ import annotations
@@ -126,12 +127,12 @@ def settings(place: Path) -> list[Setting]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--turns", type=int, default=5, help="turns of each (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=0.3, help="of a turn (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds of each (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=0.3, help="of a round (%(default)s)")
     parser.add_argument("--policy", choices=("fifo", "other"), default="fifo", help="of both loops")
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args()
-    medians, silent = measure(args.policy, args.turns, args.seconds)
+    medians, silent = measure(args.policy, args.rounds, args.seconds)
     ratios = {name: ratio(found, medians[OWN]) for name, found in medians.items() if found}
     if args.json:
         plain = {
@@ -147,8 +148,10 @@ def main() -> None:
     print(*(f"{name}: a side fell silent" for name in silent), sep="\n")
 
 
-def measure(policy: Policy, turns: int, seconds: float) -> tuple[dict[str, list[float]], list[str]]:
-    """Median round trip of each turn in µs, by setting; and the settings that fell silent."""
+def measure(
+    policy: Policy, rounds: int, seconds: float
+) -> tuple[dict[str, list[float]], list[str]]:
+    """Median round trip of each round in µs, by setting; and the settings that fell silent."""
     with ExitStack() as stack:
         place = memory_folder(stack)
         found = settings(place)
@@ -158,8 +161,8 @@ def measure(policy: Policy, turns: int, seconds: float) -> tuple[dict[str, list[
             two.round(setting, 0, seconds)  # to compile and to warm up
         medians: dict[str, list[float]] = {setting.name: [] for setting in found}
         silent = set()
-        for turn in range(turns):
-            for setting in found[:: -1 if turn % 2 else 1]:
+        for round_ in range(rounds):
+            for setting in found[:: -1 if round_ % 2 else 1]:
                 times = two.round(setting, 0, seconds)
                 if len(times):
                     medians[setting.name].append(float(np.median(times)) * 1e-3)

@@ -33,6 +33,7 @@ _MEANING = {
 }
 _EXAMPLES: dict[Group, tuple[float, ...]] = {"y": (1.0, 0.5, 1.0, 0.0, 1.0), "u": (0.5, 1.0, 1.0)}
 _BOOT, _T0 = "b0c1d2e3-0123-4567-89ab-cdef01234567", 81234567890123
+_RUN = "0123456789abcdef"
 
 
 def frame_layout() -> str:
@@ -113,7 +114,7 @@ class _Wire:
 
 
 def handshake() -> str:
-    """The greeting of a scenario as both sides really say it, boot id and time replaced."""
+    """The greeting of a scenario as both sides send it; boot id, run and time are examples."""
     scenario = load_scenario("rig_pref_step", law="droop-5")
     there, back = Queue[bytes](), Queue[bytes]()
     plant, controller = _Wire(back, there), _Wire(there, back)
@@ -137,6 +138,7 @@ def handshake() -> str:
         if "boot" in content:
             text = text.replace(json.dumps(content["boot"]), json.dumps(_BOOT))
         text = re.sub(r'("t0": )\d+', rf"\g<1>{_T0}", text)
+        text = re.sub(r'("run": ")\w+', rf"\g<1>{_RUN}", text)
         text = re.sub(r"(.{1,88})(?: |$)", r"\1\n", text).rstrip()
         parts += [f"{who} ({len(message)} bytes):", "", "```text", text, "```", ""]
     return "\n".join(parts)

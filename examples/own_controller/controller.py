@@ -1,7 +1,7 @@
-"""A controller of one's own: droop with a low-pass on p, in plain Python over ZeroMQ.
+"""A controller of your own: droop with a low-pass on p, in plain Python over ZeroMQ.
 
-It imports nothing of gfmhil. What it has to know is the handshake and the two frames, which
-docs/testing.md describes; whatever the device under test is written in, this is all of it.
+It imports nothing of gfmhil. It knows the handshake and the two frames, which
+docs/own-controller.md describes. A controller in any other language needs no more than that.
 
 Usage: controller.py ENDPOINT SCENARIO
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import zmq
 
+NAME = "droop in Python"
 GREETING = b"GFMHIL "
 HEADER = "<HBBBBHIQ"  # magic, table version, data id, state, reason, spare, sequence, tick
 MAGIC, VERSION, Y_ID, U_ID = 0x4647, 1, 1, 2
@@ -44,7 +45,7 @@ class Droop:
 
 
 def greet(socket):
-    """Answer the plant's greeting until it starts; what it says about its scenario is echoed."""
+    """Answer the plant's greeting until it starts; the answer repeats what the plant runs."""
     while True:
         message = receive(socket)
         if not message.startswith(GREETING):
@@ -53,7 +54,7 @@ def greet(socket):
         if said["kind"] == "start":
             return
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        answer = {**said, "side": "controller", "boot": boot}
+        answer = {**said, "side": "controller", "boot": boot, "name": NAME}
         socket.send(GREETING + json.dumps(answer).encode())
 
 

@@ -1,4 +1,4 @@
-/* A controller of one's own in C: droop with a low-pass on p, against gfmhil's plant.
+/* A controller of your own in C: droop with a low-pass on p, against gfmhil's plant.
 
    It uses nothing of gfmhil; docs/own-controller.md describes all that it has to know.
 
@@ -28,6 +28,7 @@ enum { GREETING_WAIT_MS = 60000, LOCKSTEP_WAIT_MS = 20000, REALTIME_WAIT_MS = 10
 enum { PRIORITY = 50, ANSWER_EVERY_MS = 100, LAST_TIMES = 3 };
 
 #define GREETING "GFMHIL "
+#define NAME "droop in C" /* what the plant's report calls this controller */
 
 /* The signal table that this program was written for; the plant sends its own. */
 #define TABLE "\"3a9e1fff\""
@@ -137,7 +138,8 @@ static double answer_hello(link_t *link, const char *hello) {
     const int size = snprintf(answer, sizeof answer,
                               GREETING "{\"kind\": \"hello\", \"side\": \"controller\", "
                                        "\"boot\": \"%s\", \"version\": %s, \"table\": %s, "
-                                       "\"T_s\": %s, \"laws\": %s, \"digest\": %s}",
+                                       "\"T_s\": %s, \"laws\": %s, \"digest\": %s, "
+                                       "\"name\": \"" NAME "\"}",
                               boot, version, table, T_s, laws, digest);
     link_send(link, answer, (size_t)size);
     return atof(T_s);

@@ -32,6 +32,7 @@ def test_power_follows_its_reference_over_both_links(bench):
         begin(bench, link)
         bench.run(0.3)
         bench.assert_no_trip()
+        assert bench.summary["controller"] == "droop in C"
         found.append(bench.signals["p"])
     assert np.abs(found[0][:500] - 0.5).max() < 0.01
     assert np.abs(found[0][2500:] - 0.7).max() < 0.02

@@ -1,2 +1,3 @@
-"""The pytest plugin, in a package of its own: pytest imports it in every project where gfmhil is
-installed, and importing ``gfm_hil`` would bring numba and set the threads of linear algebra."""
+"""The pytest plugin. It is a separate package because pytest imports it in every project where
+gfmhil is installed, and importing ``gfm_hil`` loads numba and sets the threads of linear algebra.
+"""

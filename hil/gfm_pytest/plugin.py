@@ -1,6 +1,6 @@
 """Fixture ``bench``, marker ``gfmhil``, options ``--gfmhil-link`` and ``--gfmhil-out``.
 
-Nothing but pytest is imported before a test asks for the bench.
+It imports only pytest until a test uses the bench.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import pytest
 if TYPE_CHECKING:
     from gfm_hil.testing import Experiment
 
-_FIGURE = "gfmhil_figure"  # user property of a report, which comes back from pytest-xdist too
-_LINKS = ("inproc", "shm", "zmq", "can")  # those that come with gfmhil; others are registered late
+_FIGURE = "gfmhil_figure"  # user property of a report, which pytest-xdist passes on too
+_LINKS = ("inproc", "shm", "zmq", "can")  # shipped links; others are registered later
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -47,9 +47,9 @@ def _register(config: pytest.Config, link: str) -> None:
     config.addinivalue_line("markers", f"gfmhil_{link}: uses the bench over {link}")
 
 
-@pytest.hookimpl(tryfirst=True)  # before -m looks at the markers
+@pytest.hookimpl(tryfirst=True)  # before -m evaluates the markers
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the tests of the bench by the link they begin with."""
+    """Mark the tests that use the bench with their initial link."""
     known = set(_LINKS)
     for item in items:
         if "bench" not in getattr(item, "fixturenames", ()):
@@ -64,7 +64,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _asked(item: Any) -> dict[str, Any]:
-    """Arguments of the markers, those nearest to the test last."""
+    """Arguments of the markers; those nearest to the test take precedence."""
     asked: dict[str, Any] = {}
     for marker in reversed(list(item.iter_markers("gfmhil"))):
         asked.update(marker.kwargs)
@@ -77,7 +77,7 @@ def _asked(item: Any) -> dict[str, Any]:
 def bench(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Experiment]:
-    """A bench to run experiments on, ``gfm_hil.testing.Experiment``."""
+    """A bench for experiments, ``gfm_hil.testing.Experiment``."""
     from gfm_hil.testing import Experiment
 
     config, node = request.config, request.node
@@ -94,11 +94,11 @@ def bench(
         experiment.start(**asked)
     yield experiment
     if experiment.pending and request.session.testsfailed == failed:
-        experiment.assert_no_trip()  # what nobody has asked about is run all the same
+        experiment.assert_no_trip()  # run the steps after the last assertion too
 
 
 def _folders(out: str | None, nodeid: str, temporary: Any) -> Callable[[], Path]:
-    """Makes a new folder for each run: below ``out``, or among pytest's temporary ones."""
+    """A function that makes a new folder per run, below ``out`` or in pytest's temporary folder."""
     name = re.sub(r"[^\w.-]+", "-", nodeid.replace(".py::", "-"))[-120:].strip("-")
 
     def make() -> Path:
@@ -113,12 +113,12 @@ def _folders(out: str | None, nodeid: str, temporary: Any) -> Callable[[], Path]
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Name the figures that failed assertions have left."""
+    """List the figures that failed assertions have drawn."""
     figures = [
         (report.nodeid, value)
         for outcome in ("failed", "error")
         for report in terminalreporter.stats.get(outcome, ())
-        for name, value in getattr(report, "user_properties", ())  # a collection error has none
+        for name, value in getattr(report, "user_properties", ())  # collection errors have none
         if name == _FIGURE
     ]
     if figures:

@@ -1,4 +1,4 @@
-"""From options to records: everything a tick needs is worked out here, once."""
+"""From options to records: computes once all constants that a tick needs."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _pack_circuit(par: PlantRecord, options: Plant) -> None:
     converter = load_converter(options.converter)
     bases = converter.bases
     par["omega_b"] = bases.omega_b
-    for name, value in converter.pu(options.factors).items():
+    for name, value in converter.pu(options.real_factors()).items():
         par[name] = value
     par["L_line"], par["R_line"] = par["L_g"], par["R_g"]
     nominal = converter.pu()

@@ -1,5 +1,5 @@
-"""How everything that runs in a tick is compiled; see ``gfm_runtime.compiled``, which this repeats
-so that the plant needs nothing of the controller."""
+"""Compilation of the functions of a tick. This repeats ``gfm_runtime.compiled``, so that the plant
+needs nothing of the controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plant from tick to tick: take u, go on by one sampling period, tell the truth.
+"""The plant from tick to tick: take u, advance by one sampling period, give the true values.
 
 The functions are compiled and allocate nothing. `par` and `st` are the records of
 `gfm_plant.records`, which `make_plant` builds; quantities are in p.u.
@@ -71,9 +71,9 @@ def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
 
 @compiled
 def plant_is_delayed(par: PlantRecord) -> bool:
-    """Whether a plant goes on first and takes the command then: nothing of u[k] acts in period k.
+    """Whether u[k] does not act in period k, so that the plant advances before it takes u[k].
 
-    Whoever waits for u[k] can let the plant go on meanwhile.
+    The caller can then advance the plant while it waits for u[k].
     """
     return bool(par[0].delay > 0)
 
@@ -107,7 +107,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     v, delta = _stretch(r, s, v, delta, newest, r.steps_new, r.h_new)
     s.tick += 1
 
-    size = abs(delta) / _FAR  # an islanded angle may grow, if it stays a number
+    size = abs(delta) / _FAR  # the angle of an island may grow without limit
     for value in v:
         size = max(size, abs(value)) if value == value else math.inf
     if size < _FAR and v[6] > 0.0:
@@ -118,14 +118,14 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = v[10], v[11], v[12], v[13]
         protect(r, s)
     else:
-        trip(s, DIVERGED, size)  # and keep the last state that was good
+        trip(s, DIVERGED, size)  # the last good state stays
     advance_grid(r, s)
 
 
 @compiled
 def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> None:
-    """Write the true values at this tick to out (10,), in the order of `TRUTH`."""
-    s = st[0]
+    """Write the true values at this tick to out (11,), in the order of `TRUTH`."""
+    r, s = par[0], st[0]
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
     out[2] = s.u_now[1]
@@ -134,6 +134,9 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[7] = s.omega_g
     out[8] = s.V_g
     out[9] = s.trip
+    i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
+    i_max = r.i_max if s.trip == 0 else 0.0
+    out[10] = min(max(i_dc, -i_max), i_max)
 
 
 @compiled

@@ -1,8 +1,8 @@
 """Fixed-step RK4 over a stretch of time during which the commands are held.
 
-Beside the converter, 14 values are integrated: the DC source's own integral, the local load's
-current and the sensors' filters. Those that a plant does not have stand still because their
-gains are zero: carrying them costs less than a branch, and the state stays in registers.
+The 14 values are those of the converter, the integral of the DC source, the current of the local
+load and the filters of the sensors. Values that a plant does not have stay constant because their
+gains are zero: integrating them costs less than a branch, and the state stays in registers.
 """
 
 from __future__ import annotations

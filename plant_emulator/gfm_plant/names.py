@@ -1,4 +1,4 @@
-"""What the plant says in words: the names of its true values, its trips and their reasons."""
+"""Names of the plant's true values, of its trips and of their reasons."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ CONTROLLER_SAFE = "the controller is in its safe state"
 NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 
 SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
-"""Indices of the y that pass the sensors: omega_u, a command, is known exactly."""
+"""Indices of the y that pass the sensors; omega_u is a command and known exactly."""
 
-TRUTH = (*Y_NAMES, "i", "delta", *D_NAMES, "trip")
-"""What `plant_truth` writes, in this order; i = |i_dq|, delta in rad, trip a reason code."""
+TRUTH = (*Y_NAMES, "i", "delta", *D_NAMES, "trip", "i_dc")
+"""What `plant_truth` writes, in this order, in p.u.: i is |i_dq|, i_dc the current of the DC
+source, delta is in rad, and trip is a key of `TRIP_REASONS`."""

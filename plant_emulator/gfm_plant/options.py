@@ -1,19 +1,20 @@
 """The options of one plant, as scenario files embed them; the defaults are the paper's simulation.
 
-Everything is ideal until told otherwise: no sensor filter, noise, quantisation or delay, and all
+Everything is ideal by default: no sensor filter, noise, quantisation or delay, and all
 elements at their nominal values. Channels carry the names of y and u. omega_u is the
 controller's own number and passes the sensors and the A/D untouched.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from gfm_plant.names import SENSED
-from gfm_plant.parameters import Element, NonNegative, Positive, check_factors
+from gfm_plant.parameters import Element, NonNegative, Positive, check_factors, load_converter
 from gfm_plant.records import MAX_DELAY
 from gfm_runtime.signals import Y_NAMES
 
@@ -44,10 +45,23 @@ class DcSource(Options):
 
 
 class Grid(Options):
-    """The grid simulator at the start, and the local load that its breaker can leave behind."""
+    """The grid simulator at the start, and the local load that its breaker can leave behind.
+
+    ``scr`` is the short-circuit ratio of IEEE Std 1204-1997 at the point of connection, which is
+    the filter capacitor: SCR = S_sc / S_n with S_sc = V_n^2 / abs(Z_g), so that
+    abs(Z_g) = 1 / SCR in p.u. of the converter.
+    """
 
     omega_g: Positive = Field(1.0, description="grid frequency, p.u.")
     V_g: NonNegative = Field(1.0, description="grid voltage, p.u.")
+    scr: Positive | None = Field(
+        None,
+        description="short-circuit ratio S_sc/S_n at the point of connection; with x_over_r it "
+        "sets the line in place of the converter file and of factors.L_g and R_g",
+    )
+    x_over_r: Positive | None = Field(
+        None, description="X/R of the line at nominal frequency; goes with scr"
+    )
     load_R: NonNegative | None = Field(None, description="local series RL load, ohm")
     load_L: Positive | None = Field(None, description="local series RL load, H")
 
@@ -59,9 +73,22 @@ class Grid(Options):
             )
         return self
 
+    @model_validator(mode="after")
+    def _strength_is_whole(self) -> Grid:
+        if (self.scr is None) != (self.x_over_r is None):
+            raise ValueError(f"scr = {self.scr}, x_over_r = {self.x_over_r}: give both or neither")
+        return self
+
+    def line(self) -> dict[Element, float] | None:
+        """L_g and R_g in p.u. by ``scr`` and ``x_over_r``; None if they are not given."""
+        if self.scr is None or self.x_over_r is None:
+            return None
+        R = 1.0 / (self.scr * math.hypot(1.0, self.x_over_r))
+        return {"L_g": self.x_over_r * R, "R_g": R}
+
 
 class Sensors(Options):
-    """What stands between the true quantities and the A/D; errors are applied per channel."""
+    """The sensors between the true quantities and the A/D, with errors for each channel."""
 
     bandwidth_hz: Positive | None = Field(None, description="first-order low-pass; ideal if none")
     gain: dict[Measured, float] = Field({}, description="measured over true value, default 1")
@@ -116,8 +143,9 @@ DS2101 = DigitalToAnalog(bits=12, range={"i_u": (-2.0, 2.0), "E_u": (0.0, 2.0)})
 """The rig's D/A board: 12 bit. omega_u is integrated to the angle before it, so never rounded."""
 
 
-def _preset(boards: dict[str, Any]) -> BeforeValidator:
-    """Let a field take the name of a board in place of a table."""
+def _preset(boards: dict[str, Any], written: Any) -> BeforeValidator:
+    """Let a field take the name of a board in place of a table; ``written`` is the type of what a
+    file may have."""
 
     def look_up(value: Any) -> Any:
         if isinstance(value, str):
@@ -126,22 +154,30 @@ def _preset(boards: dict[str, Any]) -> BeforeValidator:
             return boards[value]
         return value
 
-    return BeforeValidator(look_up)
+    return BeforeValidator(look_up, json_schema_input_type=written)
 
 
 class Delay(Options):
     """Time from the tick that samples y[k] to the moment when u[k] acts, in sampling periods."""
 
-    samples: int = Field(0, ge=0, le=MAX_DELAY)
-    fraction: float = Field(0.0, ge=0, lt=1)
+    samples: int = Field(
+        0, ge=0, le=MAX_DELAY, description="whole samples from y[k] to the effect of u[k]"
+    )
+    fraction: float = Field(0.0, ge=0, lt=1, description="fraction of one more sample")
+
+
+def _part_is_enough(schema: dict[str, Any]) -> None:
+    schema.pop("required")  # ``Protection`` completes it
 
 
 class Trip(Options):
     """One protection: trips when its threshold stays crossed for a time."""
 
+    model_config = ConfigDict(json_schema_extra=_part_is_enough)
+
     threshold: Positive = Field(description="p.u. of the protected quantity")
     delay_s: NonNegative = Field(description="how long the threshold must stay crossed, s")
-    enabled: bool = True
+    enabled: bool = Field(True, description="false takes the protection out of service")
 
 
 _TRIPS = {
@@ -184,16 +220,45 @@ class Plant(Options):
 
     converter: str = Field("paper", description="name of a shipped converter, or a .toml file")
     factors: dict[Element, float] = Field({}, description="real over nominal value of an element")
-    dc_source: DcSource = DcSource()
-    grid: Grid = Grid()
-    sensors: Sensors = Sensors()
-    adc: Annotated[AnalogToDigital, _preset({"DS2004": DS2004})] = AnalogToDigital()
-    dac: Annotated[DigitalToAnalog, _preset({"DS2101": DS2101})] = DigitalToAnalog()
-    delay: Delay = Delay()
-    protection: Protection = Protection()
+    dc_source: DcSource = Field(DcSource(), description="the source that feeds C_dc")
+    grid: Grid = Field(Grid(), description="grid simulator at the start")
+    sensors: Sensors = Field(
+        Sensors(), description="what stands between the true quantities and the A/D"
+    )
+    adc: Annotated[
+        AnalogToDigital, _preset({"DS2004": DS2004}, AnalogToDigital | Literal["DS2004"])
+    ] = Field(AnalogToDigital(), description='"DS2004" (16 bit) or a table; ideal if none')
+    dac: Annotated[
+        DigitalToAnalog, _preset({"DS2101": DS2101}, DigitalToAnalog | Literal["DS2101"])
+    ] = Field(DigitalToAnalog(), description='"DS2101" (12 bit) or a table; ideal if none')
+    delay: Delay = Field(Delay(), description="of the loop")
+    protection: Protection = Field(Protection(), description="trips of the converter")
     substeps: int = Field(10, ge=1, le=1000, description="RK4 steps in one sampling period")
 
     @model_validator(mode="after")
     def _elements_stay_physical(self) -> Plant:
         check_factors(self.factors)
+        given = [f"factors.{name}" for name in ("L_g", "R_g") if name in self.factors]
+        if given and self.grid.scr is not None:
+            raise ValueError(
+                f"grid.scr = {self.grid.scr:g}: sets the line; leave out {' and '.join(given)}"
+            )
         return self
+
+    def real_factors(self) -> dict[Element, float]:
+        """Real over nominal value of the elements that are not nominal, those of the line by
+        ``grid.scr`` included.
+
+        Raises:
+            ValueError: as ``load_converter``, or the converter's line has no resistance, so that
+                nothing times it gives ``grid.x_over_r``.
+        """
+        line = self.grid.line()
+        if line is None:
+            return self.factors
+        nominal = load_converter(self.converter).pu()
+        if nominal["R_g"] == 0.0:
+            raise ValueError(
+                f"plant.grid.x_over_r = {self.grid.x_over_r}: needs a converter file with R_g > 0"
+            )
+        return {**self.factors, **{name: line[name] / nominal[name] for name in line}}

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from gfm_plant.bases import Bases
 
 LEAST, MOST = 1e-12, 1e12
-"""Of any quantity, in SI units or p.u.; beyond them products overflow before they are checked."""
+"""Limits of any quantity, in SI units or p.u.; beyond them products overflow before the checks."""
 
 
 def _not_tiny(value: float) -> float:

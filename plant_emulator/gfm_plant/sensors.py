@@ -1,4 +1,4 @@
-"""What the controller gets to see: the true quantities through sensors and A/D."""
+"""The measurements of the controller: the true quantities through sensors and A/D."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from gfm_plant.records import PlantRecord
 
 @compiled
 def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> None:
-    """Write what the A/D reads at this tick to y (5,): (v_dc, p, omega_u, q, V).
+    """Write the readings of the A/D at this tick to y (5,): (v_dc, p, omega_u, q, V) in p.u.
 
-    omega_u is the one that acts at this instant, exactly.
+    omega_u is the command that acts at this instant, without error.
     """
     r, s = par[0], st[0]
     if r.filtered:

@@ -1,4 +1,4 @@
-"""Where the plant rests: x and u at which a wanted power and voltage are an equilibrium."""
+"""The plant's equilibrium: x and u for a given power and voltage."""
 
 from __future__ import annotations
 

@@ -31,11 +31,12 @@ X_MAX = 10.0  # p.u.; stands for "no upper end" of a schedule's last stage
 class Controller:
     """A controller with several laws ready, one of them active.
 
-    Everything that a tick needs is in the records ``ctl``, ``laws``, ``states`` and ``est``;
-    ``gfm_runtime.controller.control`` takes them as they are.
+    The records ``ctl``, ``laws``, ``states`` and ``est`` hold all that a tick needs, and are the
+    arguments of ``gfm_runtime.controller.control``.
 
-    ``asked`` is the name of the law last asked for, ``gains`` what of it is not as in its file;
-    ``names`` and ``changed`` say the same of every place in ``laws``, ``labels`` are for people.
+    ``asked`` is the name of the law that was requested last, and ``gains`` are its gains that
+    differ from its file. ``names`` and ``changed`` are the same for every entry of ``laws``;
+    ``labels`` are their names in reports.
 
     Args:
         sets: the laws that may become active, each under its name; the first one starts.
@@ -92,10 +93,10 @@ class Controller:
         return self.discrete[int(self.ctl["active"][0])]
 
     def select(self, name: str) -> None:
-        """Ask for a law; the change is carried out, bumpless, at the next tick.
+        """Request a law; the controller changes to it at the next tick, bumpless.
 
         Raises:
-            LawError: the law is not among those made ready.
+            LawError: the law is not one of ``sets``.
         """
         if name not in self.sets:
             raise LawError(f"law {name!r}", f"not ready; ready are {list(self.sets)}")
@@ -114,11 +115,11 @@ class Controller:
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
 
     def retune(self, discrete: DiscreteLaw, packed: NDArray[Any], gains: dict[str, float]) -> int:
-        """Ask for the law last asked for with other gains; bumpless, at the next tick.
+        """Request the law that was requested last with other gains; bumpless, at the next tick.
 
         Args:
             discrete, packed: that law discretised and as ``pack_law`` gives it.
-            gains: what is not as in its file, by name.
+            gains: those that differ from its file, by name.
 
         Returns:
             Its index from now on.
@@ -152,7 +153,7 @@ class Controller:
         self.ctl["state"] = RUNNING
 
     def reset(self) -> None:
-        """Re-arm: leave SAFE or STOPPED for READY; the reason is forgotten, the laws stay."""
+        """Re-arm: go from SAFE or STOPPED to READY, clear the reason, and keep the laws."""
         self.ctl["state"], self.ctl["reason"], self.ctl["channel"] = READY, OK, 0
         self.ctl["stale"] = 0
 
@@ -168,7 +169,7 @@ def _stage_labels(s: LawSet) -> list[str]:
 
 
 def warm_up(controller: Controller) -> None:
-    """Compile everything a tick calls, on copies, so that nothing compiles once it runs."""
+    """Compile every function of a tick, on copies, so that nothing compiles during a run."""
     ctl, states = controller.ctl.copy(), controller.states.copy()
     ctl["state"], ctl["request"] = RUNNING, ctl["active"]
     y, u = np.ones(NY), np.ones(NU)

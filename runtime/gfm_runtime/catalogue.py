@@ -1,7 +1,7 @@
 """The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``.
 
-``laws/tuned`` holds the same laws with the gains that the league found for the paper's converter.
-They load by name like the others, but are listed apart.
+``laws/tuned`` holds the same laws with the gains that the law comparison found for the paper's
+converter. They load by name like the others, but ``law_names`` does not list them.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
-from gfm_runtime.errors import LawError
+from gfm_runtime.errors import LawError, meant
 from gfm_runtime.law import Law
 from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file
 
 
 @dataclass(frozen=True)
 class LawSet:
-    """What a name stands for: one law, or the stages of a gain-scheduled one.
+    """The laws of one name: a single law, or the stages of a gain-scheduled one.
 
     Attributes:
         name: the name asked for.
-        laws: one law, or one a stage in ascending order of the stage's reactance.
-        schedule: None, or when which stage is in force.
+        laws: one law, or one for each stage in ascending order of the stage's reactance.
+        schedule: None, or the limits of the stages.
     """
 
     name: str
@@ -37,7 +37,7 @@ def _natural(name: str) -> list[int | str]:
 
 @cache
 def law_names() -> tuple[str, ...]:
-    """Names of all laws that ship but for the tuned ones, in natural order."""
+    """Names of all laws that ship except the tuned ones, in natural order."""
     return _names("")
 
 
@@ -72,7 +72,8 @@ def law_file(name: str) -> LawFile:
     if name in tuned_names():
         return _shipped(name, "tuned")
     known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
-    raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}")
+    close = meant(name, [*law_names(), *tuned_names()])
+    raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}{close}")
 
 
 def load_law(name: str, **changed: float) -> LawSet:
@@ -82,10 +83,12 @@ def load_law(name: str, **changed: float) -> LawSet:
         LawError: as ``law_file`` and ``build_law``.
     """
     file = law_file(name)
-    if file.schedule is None:
-        return LawSet(file.name, (build_law(file, changed),))
-    stages = sorted(file.schedule.stages, key=lambda stage: stage.X)
-    laws = tuple(build_law(file, {**stage.parameters, **changed}) for stage in stages)
+    stages = sorted(file.schedule.stages, key=lambda stage: stage.X) if file.schedule else []
+    sets = [{**stage.parameters, **changed} for stage in stages] or [changed]
+    try:
+        laws = tuple(build_law(file, parameters) for parameters in sets)
+    except LawError as problem:
+        raise problem.within(f"law {'file ' * name.endswith('.toml')}{name}") from None
     return LawSet(file.name, laws, file.schedule)
 
 

@@ -1,9 +1,10 @@
-"""How what runs in a tick is compiled: laws, loops, frames, the quick links.
+"""Compilation of the functions of a tick: laws, loops, frames, and the fastest links.
 
-Without numba's runtime: what would allocate does not compile, and no call counts references to the
-arrays that it is given. Each count is a locked instruction, and a tick had dozens.
-Arrays belong to whoever calls from Python, and outlive the call. numba compiles helpers of its own
-this way; the option begins with an underscore, so versions that are known to have it are pinned.
+They are compiled without numba's runtime: code that would allocate does not compile, and no call
+counts references to its arrays. Each count is a locked instruction, and a tick had dozens.
+The Python caller owns the arrays and keeps them alive during the call. numba compiles its own
+helpers in this way. The option begins with an underscore, so pyproject.toml pins numba to versions
+that are known to have it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from numba import njit
 #: options of njit and cfunc
 FREE: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
 
-#: decorates such a function
+#: decorator for such a function
 compiled: Any = njit(**FREE)
 
-#: and one that becomes part of whoever calls it, for the innermost: left to itself the compiler
-#: calls it, hands over every word of every array on the stack, and saves registers
+#: decorator for the innermost functions, which become part of their callers: the compiler would
+#: otherwise emit a call, pass every word of every array on the stack, and save registers
 inlined: Any = njit(**FREE, forceinline=True)

@@ -1,11 +1,11 @@
 """The controller's tick: checks, set-points, the active law, changes of law, the safe state.
 
-Everything that changes lives in one record of ``controller_dtype`` and the laws' own records, so
-that a tick is one njit call and the same call serves every link, in lockstep and in real time.
+All variables are in one record of ``controller_dtype`` and in the records of the laws. A tick is
+therefore one njit call, the same for every link, in lockstep and in real time.
 States: INIT -> READY -> RUNNING -> SAFE (latched) -> STOPPED. In SAFE the outputs stay at the
-last good u and the state travels in every frame; the plant answers by blocking the bridge. Where a
-scenario waits after that, a reset takes the controller to READY, at rest; a plant that hears of
-it goes back to its own start and stops saying SAFE, upon which the controller is RUNNING again.
+last good u, every frame carries the state, and the plant blocks the bridge. If the scenario waits
+after that, a reset takes the controller to READY, at rest. The plant then returns to its own start
+and stops sending SAFE, and the controller goes to RUNNING.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def missed(ctl):
 
 @compiled
 def follow_plant(ctl, tripped):
-    """Take in what the plant's frame says of it: a trip takes a running controller to SAFE, and a
-    plant that is well again a READY one to RUNNING."""
+    """Use the plant's state from its frame: a trip takes a RUNNING controller to SAFE, and a plant
+    that runs takes a READY controller to RUNNING."""
     c = ctl[0]
     if tripped:
         if c.state == RUNNING:
@@ -116,7 +116,7 @@ def follow_plant(ctl, tripped):
 
 @compiled
 def _schedule(ctl, est, y):
-    """Pick the stage for the estimated reactance, with hysteresis and a least dwell."""
+    """Select the stage for the estimated reactance, with hysteresis and a minimum dwell time."""
     X = estimate(est, y[1], y[2], y[4])
     ctl.since += 1
     if ctl.since <= ctl.dwell:

@@ -27,7 +27,7 @@ Factor = tuple[float, ...]
 
 INTEGRATOR: Factor = (0.0, 1.0)
 _CANCELS = 1e-12  # relative remainder below which a factor divides a numerator
-T_MIN, T_MAX = 1e-9, 1e9  # s; what lies outside is a slip of the pen and would overflow
+T_MIN, T_MAX = 1e-9, 1e9  # s; a value outside is a typing error and would overflow
 K_MAX = 1e12
 
 

@@ -1,4 +1,4 @@
-"""Error maps: what Phi(s) is given instead of plain y and Y_ref.
+"""Error maps: the errors on which Phi(s) acts, if not Y_ref - y.
 
 Each map turns references r and measurements y (five each, p.u.) into mapped ones, in place, so
 that the error is (mapped r) - (mapped y). Column 3, omega_u, is never mapped.

@@ -1,19 +1,59 @@
-"""The one exception for a law that must not reach the kernel."""
+"""The one exception for a law that must not reach the kernel, and words that messages share."""
 
 from __future__ import annotations
+
+import contextlib
+import difflib
+from collections.abc import Iterable, Iterator, Sequence
 
 
 class LawError(ValueError):
     """A law, one of its elements or one of its parameters is not usable.
 
     Args:
-        where: what is wrong, e.g. ``"phi_22"``, ``"parameter H"``, ``"law file x.toml"``.
-        why: the value found and what is allowed.
+        where: the faulty item, e.g. ``"phi_22"``, ``"parameter H"``, ``"law file x.toml"``.
+        why: the value found and what is allowed; one text for each mistake.
+        lines: what to print, one line for each mistake; ``where`` and ``why`` if empty.
     """
 
-    def __init__(self, where: str, why: str) -> None:
-        self.where, self.why = where, why
-        super().__init__(printable(f"{where}: {why}"))
+    def __init__(self, where: str, *why: str, lines: Sequence[str] = ()) -> None:
+        self.where, self.why = where, "; ".join(why)
+        self.lines = [*lines] or [printable(f"{where}: {text}") for text in why]
+        super().__init__("\n".join(self.lines))
+
+    def within(self, where: str) -> LawError:
+        """The same mistakes, each line of which names ``where`` first."""
+        return LawError(
+            self.where, self.why, lines=[printable(f"{where}: {line}") for line in self.lines]
+        )
+
+
+class Mistakes:
+    """Collects the mistakes of a law, so that a person is told all of them at once."""
+
+    def __init__(self) -> None:
+        self._found: list[LawError] = []
+
+    @contextlib.contextmanager
+    def noting(self) -> Iterator[None]:
+        """Note a LawError of the block and go on after it."""
+        try:
+            yield
+        except LawError as problem:
+            self._found.append(problem)
+
+    def check(self) -> None:
+        """Raise LawError with every mistake noted, if there are any."""
+        if self._found:
+            lines = [line for problem in self._found for line in problem.lines]
+            whys = (problem.why for problem in self._found)
+            raise LawError(self._found[0].where, *whys, lines=lines)
+
+
+def meant(name: object, known: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the known name that is most like it, if any."""
+    close = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def printable(text: str) -> str:

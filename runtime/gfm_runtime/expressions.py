@@ -8,7 +8,7 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gfm_runtime.errors import LawError
+from gfm_runtime.errors import LawError, meant
 
 _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -41,7 +41,7 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
 
 
 def evaluate_each(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
-    """As ``evaluate`` for parameters that are arrays; what is not finite is left in the array."""
+    """As ``evaluate`` for parameters that are arrays; the result may hold values not finite."""
     return _walk(where, _parse(where, value), parameters)
 
 
@@ -60,7 +60,8 @@ def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
             return float(number)
         case ast.Name(id=name):
             if name not in parameters:
-                raise LawError(where, f"unknown parameter {name!r}; known: {sorted(parameters)}")
+                known = f"; known: {sorted(parameters)}{meant(name, parameters)}"
+                raise LawError(where, f"unknown parameter {name!r}{known}")
             return parameters[name]
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _UNARY:
             return _UNARY[type(op)](_walk(where, operand, parameters))

@@ -19,7 +19,7 @@ from gfm_runtime.signals import NU, NY
 from gfm_runtime.tustin import DiscreteLaw
 
 N_MAX = 12  # states; the largest law of Table II has five
-NEGLIGIBLE = 2.0**-100  # p.u.; what decays is 0 below it; exact in float32 too
+NEGLIGIBLE = 2.0**-100  # p.u.; decaying values below it become 0; exact in float32 too
 TREND_TIME = 0.01  # s; u[k] - u[k-1] is filtered with this before a bumpless change uses it
 
 
@@ -55,7 +55,7 @@ def law_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
 
 
 def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
-    """Record of what a running law changes; scratch space included, so a step allocates nothing."""
+    """Record of a running law's variables, scratch space included, so a step allocates nothing."""
     f = np.dtype(real)
     return np.dtype(
         [
@@ -142,13 +142,13 @@ def output(law, state, u):
 
 @inlined
 def _faded(value):
-    """0 for what has decayed to nothing: subnormal numbers can double the time of a tick."""
+    """0 for a value that has decayed: subnormal numbers can double the time of a tick."""
     return 0.0 if abs(value) < NEGLIGIBLE else value
 
 
 @inlined
 def advance(law, state):
-    """x[k+1] from this tick's inputs, with back-calculation of what the limits took away."""
+    """x[k+1] from this tick's inputs, with back-calculation where the limits clamp u."""
     n = law.n
     for i in range(NU):
         u = _limited(law, state, i)
@@ -182,8 +182,8 @@ def step(law, state, ref, y, u):
         ref, y: references and measurements, shape (5,), p.u.
         u: output, shape (3,), p.u.
 
-    Fields of a record are the quickest for ref, y and u: numba counts references to an array
-    wherever it hands one on, atomically, but not to a part of a record.
+    Fields of a record are the fastest for ref, y and u: numba counts references to an array
+    atomically whenever it passes one on, but not to a part of a record.
     """
     set_inputs(law, state, ref, y)
     output(law, state, u)

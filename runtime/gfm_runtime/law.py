@@ -1,4 +1,4 @@
-"""A law: the 3x5 grid of elements Phi(s), what it acts on and what it adds to.
+"""A law: the 3x5 grid of elements Phi(s), its error map, set-points and limits.
 
     u = u_0 + Phi(s) (Y_ref - y) - Psi(s) y                       (Fig. 6 of the paper)
 
@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gfm_runtime.elements import INTEGRATOR, ZERO, Element
-from gfm_runtime.errors import LawError
+from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
 
 Cell = tuple[int, int]  # (i, j), zero-based row of u and column of y
@@ -27,7 +27,7 @@ def cell_name(matrix: str, cell: Cell) -> str:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the kernel clamps u to, and how it lets go.
+    """The clamps of u and the anti-windup.
 
     Attributes:
         low, high: shape (3,), p.u., for (i_u, omega_u, E_u).
@@ -42,17 +42,21 @@ class Limits:
     T_off: float = 0.2
 
     def __post_init__(self) -> None:
+        mistakes = Mistakes()
         for name, low, high in zip(U_NAMES, self.low, self.high, strict=True):
-            if not low < high:
-                raise LawError(f"limits.{name}", f"[{low:g}, {high:g}] must be ascending")
+            with mistakes.noting():
+                if not low < high:
+                    raise LawError(f"limits.{name}", f"[{low:g}, {high:g}] must be ascending")
         for name in ("T_t", "T_off"):
-            if not getattr(self, name) > 0.0:
-                raise LawError(f"limits.{name}", f"{getattr(self, name):g} s must be > 0")
+            with mistakes.noting():
+                if not getattr(self, name) > 0.0:
+                    raise LawError(f"limits.{name}", f"{getattr(self, name):g} s must be > 0")
+        mistakes.check()
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A named number of a law: value, unit and where it comes from."""
+    """A named number of a law: value, unit and source."""
 
     value: float
     unit: str
@@ -74,7 +78,7 @@ class Law:
 
     Attributes:
         name: e.g. ``"vsg-2"``.
-        title, source: for people; the source names table, equation or paper.
+        title, source: for tables and reports; the source names table, equation or paper.
         phi: elements on the errors, by zero-based (row, column); absent means 0.
         psi: the ``{}`` terms on the measurements alone; u_i is lowered by psi_ij(s) y_j.
         u_0: set-points of u; a number in p.u., or the name of the reference it follows.
@@ -98,17 +102,22 @@ class Law:
     home_grid: HomeGrid = HomeGrid()
 
     def __post_init__(self) -> None:
+        mistakes = Mistakes()
         for matrix, cells in (("phi", self.phi), ("psi", self.psi)):
             for cell, element in cells.items():
-                if not (0 <= cell[0] < NU and 0 <= cell[1] < NY):
-                    raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
-                _check(cell_name(matrix, cell), element)
+                with mistakes.noting():
+                    if not (0 <= cell[0] < NU and 0 <= cell[1] < NY):
+                        raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
+                    _check(cell_name(matrix, cell), element)
         for name, value in zip(U_NAMES, self.u_0, strict=True):
-            if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):
-                raise LawError(
-                    f"u_0.{name}",
-                    f"{value!r} is neither a finite number nor one of {list(REF_NAMES)}",
-                )
+            with mistakes.noting():
+                if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):
+                    raise LawError(
+                        f"u_0.{name}",
+                        f"{value!r} is neither a finite number nor one of {list(REF_NAMES)}"
+                        + meant(value, REF_NAMES),
+                    )
+        mistakes.check()
 
     def element(self, matrix: str, cell: Cell) -> Element:
         """The element of ``"phi"`` or ``"psi"`` at a cell, ZERO where there is none."""

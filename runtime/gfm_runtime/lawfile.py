@@ -24,9 +24,10 @@ from pydantic_core import PydanticCustomError
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
-from gfm_runtime.errors import LawError
+from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.expressions import evaluate
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
+from gfm_runtime.mistakes import lines
 from gfm_runtime.signals import U_NAMES
 from gfm_runtime.toml_file import parse_toml, read_text
 
@@ -45,7 +46,7 @@ def _listed(value: Any) -> Any:
 
 
 # a number or an expression over the law's parameters; one union would give two errors a mistake
-Number = Annotated[float | str, PlainValidator(_number)]
+Number = Annotated[float | str, PlainValidator(_number, json_schema_input_type=float | str)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
@@ -57,96 +58,120 @@ class _Model(BaseModel):
 class ElementSpec(_Model):
     """One factor: its kind and its numbers (T, T_f in s)."""
 
-    type: Literal["P", "I", "D", "PI", "PD", "IF", "O"]
-    k: Number | None = None
-    k_i: Number | None = None
-    T: Number | None = None
-    xi: Number | None = None
-    T_f: Number | None = None
+    type: Literal["P", "I", "D", "PI", "PD", "IF", "O"] = Field(description="kind of element")
+    k: Number | None = Field(None, description="gain")
+    k_i: Number | None = Field(None, description="integral gain, 1/s")
+    T: Number | None = Field(None, description="time constant, s")
+    xi: Number | None = Field(None, description="damping ratio of O")
+    T_f: Number | None = Field(None, description="s; multiplies by 1/(T_f s + 1)")
 
 
 # the factors of one cell; a single one may stand without its list
-Factors = Annotated[list[ElementSpec], BeforeValidator(_listed), Field(min_length=1, max_length=8)]
+Factors = Annotated[
+    list[ElementSpec],
+    BeforeValidator(_listed, json_schema_input_type=list[ElementSpec] | ElementSpec),
+    Field(min_length=1, max_length=8),
+]
 
 
 class ParameterSpec(_Model):
     """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
 
-    value: float
-    unit: str
-    source: str
-    free: Range | None = None
-    tied: str | None = None
+    value: float = Field(allow_inf_nan=False, description="the number, in its unit")
+    unit: str = Field(description="e.g. p.u. or 1/s")
+    source: str = Field(description="where the number comes from")
+    free: Range | None = Field(None, description="[low, high] within which a synthesis may move it")
+    tied: str | None = Field(
+        None, description="expression that it follows while a synthesis moves others"
+    )
 
 
 class ErrorMapSpec(_Model):
-    """What Phi(s) acts on; R and X (p.u.) only for hybrid-angle."""
+    """The errors on which Phi(s) acts; R and X (p.u.) only for hybrid-angle."""
 
-    type: str = "linear"
-    R: Number | None = None
-    X: Number | None = None
+    type: str = Field("linear", description="linear, dc-energy, dvoc or hybrid-angle")
+    R: Number | None = Field(None, description="resistance of the line, p.u.; hybrid-angle only")
+    X: Number | None = Field(None, description="reactance of the line, p.u.; hybrid-angle only")
 
 
 class SetPoints(_Model):
     """u_0: numbers (p.u.) or names of references."""
 
-    i_u: Number = 0.0
-    omega_u: Number = 1.0
-    E_u: Number = "V_ref"
+    i_u: Number = Field(0.0, description="p.u., or the name of a reference")
+    omega_u: Number = Field(1.0, description="p.u., or the name of a reference")
+    E_u: Number = Field("V_ref", description="p.u., or the name of a reference")
 
 
 class LimitsSpec(_Model):
     """Clamps of u in p.u., times in s."""
 
-    i_u: Range = Field(default_factory=lambda: [-5.0, 5.0])
-    omega_u: Range = Field(default_factory=lambda: [0.9, 1.1])
-    E_u: Range = Field(default_factory=lambda: [0.0, 1.5])
-    T_t: float = 0.02
-    T_off: float = 0.2
+    i_u: Range = Field(default_factory=lambda: [-5.0, 5.0], description="[low, high], p.u.")
+    omega_u: Range = Field(default_factory=lambda: [0.9, 1.1], description="[low, high], p.u.")
+    E_u: Range = Field(default_factory=lambda: [0.0, 1.5], description="[low, high], p.u.")
+    T_t: float = Field(0.02, description="tracking time constant of the anti-windup, s")
+    T_off: float = Field(0.2, description="decay of the offset left by a change of law, s")
 
 
 class GridSpec(_Model):
     """The grid the defaults are meant for, as factors on the converter's."""
 
-    L_g: float = Field(1.0, gt=0)
-    R_g: float = Field(1.0, ge=0)
-    note: str = "the paper's grid"
+    L_g: float = Field(1.0, gt=0, description="factor on the converter's line inductor")
+    R_g: float = Field(1.0, ge=0, description="factor on the converter's line resistor")
+    note: str = Field("the paper's grid", description="for people")
 
 
 class Stage(_Model):
     """One stage of a gain-scheduled law, in force up to the reactance X (p.u.)."""
 
-    X: float = Field(gt=0)
-    parameters: dict[str, float] = Field(default_factory=dict)
+    X: float = Field(gt=0, description="upper end of the stage, p.u.; the last one has no end")
+    parameters: dict[str, float] = Field(
+        default_factory=dict, description="values that differ from [parameters]"
+    )
 
 
 class Schedule(_Model):
     """Gains as a function of the estimated grid reactance."""
 
-    stages: Annotated[list[Stage], Field(min_length=2, max_length=8)]
-    hysteresis: float = Field(0.15, ge=0, lt=1)
-    dwell_s: float = Field(0.5, ge=0)
-    X_0: float = Field(gt=0)
-    X_f: float = Field(0.0, ge=0)
+    stages: Annotated[list[Stage], Field(min_length=2, max_length=8)] = Field(
+        description="two to eight"
+    )
+    hysteresis: float = Field(0.15, ge=0, lt=1, description="relative, on every boundary")
+    dwell_s: float = Field(0.5, ge=0, description="least time between two changes, s")
+    X_0: float = Field(gt=0, description="estimate to start from, p.u.")
+    X_f: float = Field(
+        0.0,
+        ge=0,
+        description="reactance of the converter's own filter, taken off the estimate, p.u.",
+    )
 
 
 class LawFile(_Model):
     """The whole file."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_.-]*$")
-    title: str
-    source: str
-    error_map: ErrorMapSpec = ErrorMapSpec()
-    u_0: SetPoints = SetPoints()
-    parameters: dict[Name, ParameterSpec] = Field(default_factory=dict)
-    phi: dict[str, Factors]
-    psi: dict[str, Factors] = Field(default_factory=dict)
-    limits: LimitsSpec = LimitsSpec()
-    home_grid: GridSpec = GridSpec()
-    schedule: Schedule | None = None
+    name: str = Field(
+        pattern=r"^[a-z0-9][a-z0-9_.-]*$", description="lower case letters, digits, _, . and -"
+    )
+    title: str = Field(description="for people")
+    source: str = Field(description="where the law and its numbers come from")
+    error_map: ErrorMapSpec = Field(ErrorMapSpec(), description="what Φ acts on")
+    u_0: SetPoints = Field(SetPoints(), description="set-points of u")
+    parameters: dict[Name, ParameterSpec] = Field(
+        default_factory=dict, description="named numbers for the expressions"
+    )
+    phi: dict[str, Factors] = Field(
+        description="elements by cell, ij = row and column of the matrix"
+    )
+    psi: dict[str, Factors] = Field(
+        default_factory=dict,
+        description="the terms in braces of Table II, by cell: on the feedback only",
+    )
+    limits: LimitsSpec = Field(LimitsSpec(), description="clamps of u, anti-windup")
+    home_grid: GridSpec = Field(GridSpec(), description="where the defaults are meant to be used")
+    schedule: Schedule | None = Field(
+        None, description="gains by the estimated grid reactance; fixed gains if none"
+    )
 
 
-_SHOWN = 10
 _NUMBERS = {
     "P": ({"k"}, {"k"}),
     "I": ({"T"}, {"k_i"}),
@@ -189,63 +214,90 @@ def _made(where: str, kind: str, **numbers: float) -> Element:
 
 
 def _cells(
-    matrix: str, specs: Mapping[str, list[ElementSpec]], numbers: Mapping[str, float]
+    matrix: str,
+    specs: Mapping[str, list[ElementSpec]],
+    numbers: Mapping[str, float],
+    mistakes: Mistakes,
 ) -> dict[Cell, Element]:
     cells: dict[Cell, Element] = {}
     for key, spec in specs.items():
-        if len(key) != 2 or key[0] not in "123" or key[1] not in "12345":
-            raise LawError(f"{matrix}.{key}", "a cell is row 1..3 and column 1..5, e.g. 22")
-        cell = (int(key[0]) - 1, int(key[1]) - 1)
-        product = elements.P(1.0)
-        for factor in spec:
-            product = product * build_element(cell_name(matrix, cell), factor, numbers)
-        cells[cell] = product
+        with mistakes.noting():
+            if len(key) != 2 or key[0] not in "123" or key[1] not in "12345":
+                raise LawError(f"{matrix}.{key}", "a cell is row 1..3 and column 1..5, e.g. 22")
+            cell = (int(key[0]) - 1, int(key[1]) - 1)
+            product = elements.P(1.0)
+            for factor in spec:
+                product = product * build_element(cell_name(matrix, cell), factor, numbers)
+            cells[cell] = product
     return cells
 
 
-def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
-    """The law of a file, with some of its parameters changed if wanted.
-
-    Raises:
-        LawError: an element, parameter, set-point or limit that cannot be; it is named.
-    """
-    numbers = {name: spec.value for name, spec in file.parameters.items()}
-    for name, value in (changed or {}).items():
-        if name not in numbers:
-            raise LawError(f"parameter {name}", f"unknown to {file.name}; known: {sorted(numbers)}")
-        numbers[name] = value
+def _error_map(file: LawFile, numbers: Mapping[str, float]) -> tuple[str, tuple[float, ...]]:
+    """The name of the error map and its (R, X) in p.u., if it has any."""
     code = file.error_map.type
     if code not in ERROR_MAPS:
-        raise LawError("error_map.type", f"{code!r} is unknown; use one of {sorted(ERROR_MAPS)}")
+        known = f"use one of {sorted(ERROR_MAPS)}{meant(code, ERROR_MAPS)}"
+        raise LawError("error_map.type", f"{code!r} is unknown; {known}")
     impedance = (file.error_map.R, file.error_map.X)
     needs = ERROR_MAPS[code] == HYBRID_ANGLE
     if needs != (None not in impedance) or (not needs and impedance != (None, None)):
         raise LawError("error_map", "R and X belong to hybrid-angle, which needs both")
-    error_parameters = tuple(
+    values = tuple(
         evaluate(f"error_map.{n}", v, numbers)
         for n, v in zip("RX", impedance, strict=True)
         if v is not None
     )
-    if needs and not (error_parameters[0] >= 0.0 and error_parameters[1] > 0.0):
-        raise LawError("error_map", f"R, X = {error_parameters} p.u. must be R >= 0 and X > 0")
+    if needs and not (values[0] >= 0.0 and values[1] > 0.0):
+        raise LawError("error_map", f"R, X = {values} p.u. must be R >= 0 and X > 0")
+    return code, values
+
+
+def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
+    """The law of a file, with other values for some of its parameters if given.
+
+    Raises:
+        LawError: every invalid element, parameter, set-point and limit, one line each.
+    """
+    numbers = {name: spec.value for name, spec in file.parameters.items()}
+    for name, value in (changed or {}).items():
+        if name not in numbers:
+            known = f"known: {sorted(numbers)}{meant(name, numbers)}"
+            raise LawError(f"parameter {name}", f"unknown to {file.name}; {known}")
+        numbers[name] = value
     parameters = {
         name: Parameter(numbers[name], spec.unit, spec.source)
         for name, spec in file.parameters.items()
     }
-    low, high = zip(*(getattr(file.limits, name) for name in U_NAMES), strict=True)
-    return Law(
-        name=file.name,
-        title=file.title,
-        source=file.source,
-        phi=_cells("phi", file.phi, numbers),
-        psi=_cells("psi", file.psi, numbers),
-        u_0=(file.u_0.i_u, file.u_0.omega_u, file.u_0.E_u),
-        error_map=code,
-        error_parameters=error_parameters,
-        limits=Limits(low, high, file.limits.T_t, file.limits.T_off),
-        parameters=parameters,
-        home_grid=HomeGrid(**file.home_grid.model_dump()),
+    mistakes = Mistakes()
+    code, error_parameters = "linear", tuple[float, ...]()
+    with mistakes.noting():
+        code, error_parameters = _error_map(file, numbers)
+    phi, psi = (
+        _cells(name, cells, numbers, mistakes)
+        for name, cells in (("phi", file.phi), ("psi", file.psi))
     )
+    limits = Limits()
+    with mistakes.noting():
+        low, high = zip(*(getattr(file.limits, name) for name in U_NAMES), strict=True)
+        limits = Limits(low, high, file.limits.T_t, file.limits.T_off)
+    law = None
+    with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
+        law = Law(
+            name=file.name,
+            title=file.title,
+            source=file.source,
+            phi=phi,
+            psi=psi,
+            u_0=(file.u_0.i_u, file.u_0.omega_u, file.u_0.E_u),
+            error_map=code,
+            error_parameters=error_parameters,
+            limits=limits,
+            parameters=parameters,
+            home_grid=HomeGrid(**file.home_grid.model_dump()),
+        )
+    mistakes.check()
+    assert law is not None
+    return law
 
 
 def parse_law(text: str, where: str = "law file") -> LawFile:
@@ -257,7 +309,7 @@ def parse_law(text: str, where: str = "law file") -> LawFile:
     try:
         return LawFile.model_validate(parse_toml(text))
     except ValidationError as problem:
-        raise LawError(where, "; ".join(_lines(problem.errors()))) from None
+        raise LawError(where, *lines(problem, LawFile)) from None
     except ValueError as problem:
         raise LawError(where, str(problem)) from None
 
@@ -269,12 +321,3 @@ def read_law_file(path: str | Path) -> LawFile:
     except ValueError as problem:
         raise LawError(f"law file {path}", str(problem)) from None
     return parse_law(text, f"law file {path}")
-
-
-def _lines(errors: list[Any]) -> list[str]:
-    """One part a mistake, of at most ``_SHOWN`` of them."""
-    shown = [
-        f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r:.200})"
-        for e in errors[:_SHOWN]
-    ]
-    return shown + ([f"and {len(errors) - _SHOWN} more"] if len(errors) > _SHOWN else [])

@@ -3,7 +3,7 @@
 Each row of Phi(s) is written over the least common multiple of its denominators and realised in
 observer form, so elements of one row that share a factor share its states (MIMO-GFM needs three:
 the DC integrator, the inertia factor, the q-V integrator). States are scaled by powers of two so
-that a time constant of microseconds beside one of seconds stays well conditioned.
+that a law with time constants of microseconds and of seconds stays well conditioned.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
 
 
 def _check_series(law: Law) -> None:
-    """Refuse an integrator of omega_u before one behind it; one in column 3 closes its own loop."""
+    """Refuse two integrators in series through omega_u; one in column 3 closes its own loop."""
 
     def integrates(matrix: str, i: int, j: int) -> bool:
         return INTEGRATOR in law.element(matrix, (i, j)).den

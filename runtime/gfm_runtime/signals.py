@@ -37,7 +37,7 @@ class Signal:
         low, high: plausible range in ``unit``; a measurement outside is refused by the
             controller (safe state), a reference outside is refused by the scenario.
         default: value at start if nothing else is said.
-        description: one line for people.
+        description: one line for tables and tooltips.
     """
 
     group: Group

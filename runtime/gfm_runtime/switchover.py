@@ -15,10 +15,10 @@ from gfm_runtime.signals import NU, NY
 
 @compiled
 def settle_into(law, state, ref, y, u, trend):
-    """Set a law's state so that its output at (ref, y) is u (3,) p.u. and goes on by trend (3,).
+    """Set a law's state so that its output at (ref, y) is u (3,) in p.u. and continues with the
+    slope ``trend`` (3,) per tick.
 
-    Where u lies outside the law's limits the output is the limit, and the difference is a bump
-    that no state can hide.
+    If u lies outside the law's limits the output is the limit, and the difference is a bump.
     """
     set_inputs(law, state, ref, y)
     state.y[2] = u[1]
@@ -38,7 +38,7 @@ def settle_into(law, state, ref, y, u, trend):
                 wanted -= law.D_u0[j, m] * state.ref[m]
             a += law.F[i, j] * wanted + law.G[i, j] * trend[j]
         state.x[i] = a
-    # what is left, all of it for a stateless row and rounding for the others, is the offset
+    # the offset takes the rest: all of it in a row without states, rounding in the others
     i_u, omega_u, E_u = u[0], u[1], u[2]
     output(law, state, u)
     state.offset[1] = (omega_u - state.raw[1]) / law.loop

@@ -1,6 +1,6 @@
-"""Reading a TOML file of a user: every fault of the file is one line, and none stops the program.
+"""Reading a user's TOML file: every fault of the file gives a message of one line.
 
-What comes out is bounded: tables and arrays are nested at most ``MAX_DEPTH`` deep, so that code
+Tables and arrays of the result are nested at most ``MAX_DEPTH`` deep, so that code
 may walk through them by recursion.
 """
 

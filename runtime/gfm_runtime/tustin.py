@@ -1,4 +1,4 @@
-"""Tustin's discretisation of a whole law, and the checks that let it into the kernel.
+"""Tustin's discretisation of a whole law, and the checks before it reaches the kernel.
 
     x[k+1] = A x[k] + B_r r[k] + B_y y[k]
     u[k]   = u_0 + C x[k] + D_r r[k] + D_y y[k]

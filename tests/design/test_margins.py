@@ -236,6 +236,8 @@ def test_grid_strength_and_region() -> None:
     nominal = load_converter(loop.made_of.plant.converter).pu()
     assert grid.now == pytest.approx(1 / abs(0.5 * nominal["R_g"] + 1j * nominal["L_g"]))
     assert grid.weakest == pytest.approx(grid.now / grid.range.high.factor)
+    weak = grid_strength(loop_of("mimo-gfm", "pref_step", grid={"scr": 20.0, "x_over_r": 8.0}))
+    assert (weak.now, weak.x_over_r) == (pytest.approx(20.0), pytest.approx(8.0))
     assert grid.range.high.lost is not None
     assert grid.range.high.lost.frequency_hz == pytest.approx(1008.0, abs=2.0)
     region = stable_region(loop, points=4)

@@ -61,5 +61,6 @@ def test_where_it_is_wanted(processor, wanted, machine, kept, monkeypatch) -> No
 
 def test_without_the_policy_it_goes_on_without(monkeypatch) -> None:
     monkeypatch.setattr(awake, "_never_rest", lambda flags: None)  # as if refused
+    monkeypatch.setattr(awake, "warm_up", lambda: None)
     with kept_awake(HERE, "always") as kept:
         assert kept is False

@@ -45,7 +45,7 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path: Path, capsys: Any) -
     peers = {"iceoryx2"} if has_iceoryx2() else set()
     assert {r["link"] for r in rows} == {"shm", "zmq"} | peers
     assert {(r["mode"], r["load"]) for r in rows} == {
-        (m, w) for m in ("lockstep", "realtime") for w in ("idle", "hogs")
+        (m, w) for m in ("lockstep", "realtime") for w in ("idle", "busy")
     }
     for row in rows:
         assert row.keys() >= KEYS
@@ -160,7 +160,7 @@ def processes_with(mark: str) -> int:
 
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
-    ("kind", "everyone"),  # with the parent: two processes, hogs; the product's two sides
+    ("kind", "everyone"),  # with the parent: two processes, the CPU load; the product's two sides
     [("latency", 3 + len(os.sched_getaffinity(0))), ("loop", 5 + len(os.sched_getaffinity(0)))],
 )
 def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) -> None:
@@ -182,6 +182,27 @@ def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) 
         process.kill()
     assert process.returncode == 130, said
     assert said == ("", "")
+    assert processes_with(mark) == 0
+
+
+def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path: Path) -> None:
+    """The load's processes are stopped when their parent is killed: SIGTERM would not end them."""
+    mark = f"GFMHIL_TEST={uuid.uuid4()}"
+    program = (
+        "from gfm_hil.benchmark.cpu_load import cpu_load\nwith cpu_load():\n    input('ready')"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env={**os.environ, **dict([mark.split("=")])},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            assert process.stdout is not None and process.stdout.read(5) == b"ready"
+            assert processes_with(mark) == 1 + len(os.sched_getaffinity(0))
+        finally:
+            process.kill()
+    until = time.monotonic() + 60
+    while processes_with(mark) and time.monotonic() < until:
+        time.sleep(0.02)
     assert processes_with(mark) == 0
 
 

@@ -35,7 +35,7 @@ def content() -> dict[str, Any]:
             "ratio_to_baseline_p50": ratio, **times(median, k),
         }
         for mode in ("lockstep", "realtime")
-        for load in ("idle", "hogs")
+        for load in ("idle", "busy")
         for k, (name, link, peer, code, ratio, median) in enumerate(
             [
                 ("C shm", "shm", "C", "C", 1.0, 0.5),

@@ -97,12 +97,3 @@ def test_a_place_found_empty_is_asked_again(endpoint):
             while other.recv(0.02) is None:
                 assert time.monotonic() < until
                 one.send(ping)
-
-
-def test_without_cantools_it_says_what_to_install(make, monkeypatch):
-    monkeypatch.setattr("gfm_hil.links.can.find_spec", lambda name: None)
-    said = r"needs cantools: pip install 'gfmhil\[can\]'"
-    with pytest.raises(UserError, match=said):
-        make(link={"type": "can"})
-    with pytest.raises(UserError, match=said):
-        open_link("can", "plant", "can://can0")

@@ -205,7 +205,8 @@ def test_an_earlier_run_is_not_written_over(call):
 def test_the_exit_code_tells_whether_the_run_ended_as_expected(content, expect, code, call):
     found, out, _ = call("run", scenario(**content, expect=expect), "--out", "run", "--no-figures")
     assert found == code
-    assert out.startswith("tripped — over-current" if content is TRIP else "completed")
+    tripped = "tripped, as expected — over-current" if code == 0 else "tripped — over-current"
+    assert out.startswith(tripped if content is TRIP else "completed")
 
 
 def test_compare_draws_the_laws_side_by_side(call):
@@ -230,6 +231,29 @@ def test_compare_takes_the_laws_of_the_scenario_and_prints_json(call):
     assert list(json.loads(out)) == ["vsg-2", "vsg-5"]
 
 
+def test_compare_runs_in_process_unless_told_otherwise(call):
+    content = {"link": {"type": "zmq"}, "mode": "realtime", "duration": 0.02}
+    code, out, _ = call("compare", scenario(**content), "--laws", "vsg-2", "--json", "--out", "x")
+    assert code == 0
+    assert (json.loads(out)["vsg-2"]["link"], json.loads(out)["vsg-2"]["mode"]) == (
+        "inproc", "lockstep",
+    )  # fmt: skip
+
+
+def test_names_of_laws_are_whole_in_a_terminal_and_in_a_pipe(call, monkeypatch):
+    laws = [f"{law}-tuned" for law in ("mimo-gfm", "droop-5", "vsg-12", "vsg-10", "matching-1")]
+    command = ("compare", scenario(duration=0.02), "--laws", ",".join(laws))
+    code, out, _ = call(*command, "--out", "narrow")
+    assert code == 0
+    assert_fits(out)
+    assert all(law in out for law in laws)
+    monkeypatch.delenv("COLUMNS")
+    out = call(*command, "--out", "wide")[1]
+    assert out.splitlines()[0].split() == laws  # one table
+    rows = call("laws")[1].splitlines()
+    assert [row.split()[0] for row in rows] == ["law", *law_names()]  # no row is wrapped
+
+
 def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
     content = {
         "events": [*TRIP["events"], {"t": 0.2, "type": "reference", "P_ref": 0.6}],
@@ -246,6 +270,10 @@ def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
         (["compare", "short.toml"], "compare list is empty"),
         (["compare", "short.toml", "--laws", "vsg-2,,vsg-1"], "none empty"),
         (["compare", "short.toml", "--laws", "vsg-99"], "vsg-99"),
+        (["run", "short.toml", "--law", "bad.toml"], "law file bad.toml: phi.22.0.typ"),
+        (["run", "short.toml", "--law", "vsg2"], "did you mean 'vsg-2'?"),
+        (["run", "short.toml", "--link", "can", "--option", "every=99"], "--option every 99"),
+        (["tell", "run", "Pref=1"], "did you mean 'P_ref'?"),
         (["run", "nowhere.toml"], "nowhere.toml: no such file"),
         (["run", "short.toml", "--duration", "-1"], "duration"),
         (["run", "short.toml", "--duration", "nan"], "duration"),
@@ -260,11 +288,25 @@ def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
 )
 def test_wrong_use_is_one_line_and_code_2(arguments, part, call):
     scenario()
+    Path("bad.toml").write_text('name="a"\ntitle=""\nsource=""\nphi.22={type="P", k=0, typ=1}')
     code, out, err = call(*arguments)
     assert (code, out) == (2, "")
     assert err.startswith("gfmhil: ") and part in err
     assert len(err.splitlines()) == 1
-    assert [path.name for path in Path().iterdir()] == ["short.toml"]
+    assert sorted(path.name for path in Path().iterdir()) == ["bad.toml", "short.toml"]
+
+
+@pytest.mark.parametrize("option", ["--duration", "--seed", "--endpoint"])
+def test_an_option_is_blamed_for_its_value_and_not_the_scenario(option, call):
+    code, _, err = call("run", scenario(link={"type": "zmq"}), option, "-1")
+    assert code == 2
+    assert f"{option} -1" in err.split(": ")[1]
+
+
+def test_an_option_that_does_not_fit_the_scenario_is_named_with_it(call):
+    code, _, err = call("run", scenario(**STEP), "--duration", "0.05")
+    assert code == 2
+    assert err.startswith("gfmhil: short.toml with --duration 0.05: events.0: ")
 
 
 def test_unknown_options_are_argparse_s_to_refuse(capsys):

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gfm_hil.benchmark import doctor
 from gfm_hil.cli import main
 from gfm_hil.realtime.environment import environment
+from gfm_hil.results import doctor
 
 GOOD = {
     "preemption": "PREEMPT_RT",

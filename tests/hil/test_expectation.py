@@ -55,6 +55,8 @@ def test_a_trip_for_another_reason_is_not_the_one_expected(tmp_path, attack_now)
         controller_command=(sys.executable, str(tmp_path / "nan.py"), "{endpoint}", "{scenario}"),
     )  # fmt: skip
     assert run.summary["status"] == "tripped" == run.summary["expected"]
+    assert (run.summary["controller"], run.summary["laws"]) == ("droop in Python", [])
+    assert "droop in Python" in repr(run)
     assert run.summary["unmet"] == [
         "expect_reason = 'over-current', but the reason was 'command not finite'",
         "expect_after = 1 s, but the end came at 0.028 s",  # after 280 good commands
@@ -65,6 +67,10 @@ def test_a_trip_for_another_reason_is_not_the_one_expected(tmp_path, attack_now)
 def test_the_shipped_experiment_ends_as_it_expects(tmp_path):
     run = run_scenario(switchover(), tmp_path / "run", figures=False)
     assert (run.summary["status"], run.summary["unmet"]) == ("tripped", [])
+    (event,) = run.summary["events"]
+    assert event["cut_short"].startswith("over-current at 1.4")
+    assert event["p_final"] is event["settling_s"] is event["overshoot_pct"] is None
+    assert event["oscillation_hz"] > 40 and event["p_peak"] is not None  # what led to the trip
     assert run.summary["reason"].startswith("over-current: ")
     assert run.summary["duration_s"] > 1.0
 
@@ -90,6 +96,8 @@ def test_terminal_summary_report_and_exit_code_agree(expected, part, make, tmp_p
     assert len(unmet) == (0 if part is None else 1)
     assert ("not as expected: " + (part or "") in out) is (part is not None)
     assert ("not as expected: " in report) is (part is not None)
+    assert ("tripped, as expected" in out) is (", as expected:" in report) is (part is None)
+    assert "over-current at 0.05" in out and "over-current at 0.05" in report  # no final values
     if part is not None:
         assert unmet[0].startswith(part + ", but ")
 
@@ -97,6 +105,8 @@ def test_terminal_summary_report_and_exit_code_agree(expected, part, make, tmp_p
 @pytest.mark.parametrize(("after", "met"), [(0.05, True), (0.08, False)])
 def test_a_run_that_waits_is_judged_by_its_last_trip(run, after, met):
     done = run(**TRIP, after_trip="wait", expect_reason="over-current", expect_after=after)
+    assert [t["reason"][:12] for t in done.summary["trips"]] == ["over-current"]
+    assert done.summary["events"][0]["p_final"] is None
     assert done.summary["ticks"] == 1000  # it waited to its end, which is not the time that counts
     assert (not done.summary["unmet"]) is met
 

@@ -6,8 +6,9 @@ import warnings
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from gfm_hil.results.figures import draw_comparison, draw_run
+from gfm_hil.results.figures import draw_comparison, draw_run, draw_signals
 
 RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 0, "ticks": 0}
 
@@ -44,6 +45,17 @@ def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ResourceWarning)  # of what another test has left
         draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []})
+
+
+def test_a_trip_is_marked_and_no_curve_hides_another(make):
+    """The recording's curves are all identical; p's reference is dashed over p."""
+    trips = [{"t": 0.2, "reason": "over-current: |i_dq| = 3.1 p.u."}]
+    summary = {**RUN, "controller": "a foreign one", "events": events(2), "trips": trips}
+    figure = Figure()
+    axes = draw_signals(figure, make(), recording(3000), summary)
+    assert "over-current" in [text.get_text() for text in axes[0].texts]
+    assert figure.get_suptitle() == "test — a foreign one"
+    assert [line.get_linestyle() for line in axes[0].lines] == ["-", "--"]
 
 
 def test_a_controller_alone_has_no_picture_of_the_plant(make, tmp_path):

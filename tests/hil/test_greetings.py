@@ -131,6 +131,12 @@ def test_a_long_greeting_is_refused_before_it_is_read(make, attack_now):
     attack_now(f"refused above {LONGEST} bytes")
 
 
+@pytest.mark.parametrize("name", ["", " x", "x" * 65, "\x1b[2J", "x\n", "\u202ex"])
+def test_a_controller_whose_name_cannot_be_printed_is_refused(name, make):
+    with pytest.raises(handshake._Refused, match=r"hello\.name: String should match"):
+        handshake._read(hello(make(), side="controller", name=name))
+
+
 def test_a_peer_that_says_nothing_is_told_from_none(ends, make):
     said: list[str] = []
     ends["plant"].send(b"x")  # so that it is there

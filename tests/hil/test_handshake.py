@@ -43,6 +43,7 @@ def test_both_sides_agree_on_the_start(make, endpoint):
     found = meet(dict.fromkeys(SIDES, scenario), endpoint)
     assert found["controller"] == found["plant"]
     assert found["plant"].t0_ns > 0 and found["plant"].one_clock
+    assert found["plant"].controller == "gfmhil" and len(found["plant"].run) == 16
 
 
 def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):

@@ -239,12 +239,12 @@ def test_what_an_editor_for_windows_writes_is_read(text):
 
 def test_thousands_of_mistakes_are_not_thousands_of_lines(capsys):
     Path("many.toml").write_text(BASE + f"events = [{'1,' * 5000}]\n")
-    assert main(["run", "many.toml"]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 21 and lines[-1].endswith("and 4980 more mistakes")
     law = (LAWS / "dvoc.toml").read_text() + "\n[psi]\n11 = [" + "1," * 5000 + "]\n"
     Path("law.toml").write_text(law)
-    assert "and 4990 more" in refused(["laws", "show", "law.toml"], capsys)
+    for command in (["run", "many.toml"], ["laws", "show", "law.toml"]):
+        assert main(command) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 21 and lines[-1].endswith("and 4980 more mistakes")
 
 
 @pytest.mark.parametrize("kind", KINDS)

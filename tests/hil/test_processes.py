@@ -141,6 +141,8 @@ def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
         assert "completed" in out
         found = summary(tmp_path / side)
         assert (found["status"], found["ticks"], found["laws"]) == ("completed", 1000, ["vsg-2"])
+        assert found["misses"] == (0 if side == "plant" else None)
+        assert f"{'–' if side == 'controller' else 0} misses" in out
         assert not (tmp_path / side / "parts").exists()
     plant, controller = signals(tmp_path / "plant"), signals(tmp_path / "controller")
     assert "true_p" in plant and "true_p" not in controller
@@ -149,6 +151,17 @@ def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
     together = signals(tmp_path / "together")
     for name in plant.keys() - {"laws"}:
         assert plant[name].tobytes() == together[name].tobytes(), name
+
+    code, out, _ = end(start("merge", "controller", "plant", "-o", "merged"))
+    assert code == 0 and "p final" in out
+    assert_same(tmp_path / "merged", tmp_path / "together")
+    assert summary(tmp_path / "merged")["events"] == summary(tmp_path / "together")["events"]
+    assert (tmp_path / "merged" / "report.html").stat().st_size > 10_000
+    code, _, err = end(start("merge", "plant", "merged"))
+    assert code == 2 and "merged: holds the recording of controller and plant" in err
+    (tmp_path / "plant" / "summary.json").write_text(json.dumps(found | {"run": "another"}))
+    code, _, err = end(start("merge", "plant", "controller"))
+    assert code == 2 and "are not of the same run: run = 'another', " in err
 
 
 def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):

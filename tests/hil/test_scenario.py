@@ -139,6 +139,30 @@ def test_every_mistake_is_named_at_once():
         assert sum(field in line for line in lines) == 1
 
 
+@pytest.mark.parametrize(
+    ("content", "meant"),
+    [
+        ({"durration": 3}, "duration"),
+        ({"link": {"typ": "zmq"}}, "type"),
+        ({"link": {"type": "zmg"}}, "zmq"),
+        ({"link": {"type": "can", "options": {"ever": 2}}}, "every"),
+        ({"law": "mimo_gfm"}, "mimo-gfm"),
+        ({"mode": "real-time"}, "realtime"),
+        (event(type="grid-frequenzy", f_hz=49.0), "grid-frequency"),
+        (event(type="reference", Pref=0.3), "P_ref"),
+        ({"plant": {"protection": {"overcurrent": {"threshold": 2.0}}}}, "over_current"),
+    ],
+)
+def test_a_name_that_is_nearly_right_is_suggested(content, meant):
+    with pytest.raises(UserError, match=f"did you mean '{meant}'\\?"):
+        check_scenario({"title": "test", "duration": 0.1, **content}, "test.toml")
+
+
+def test_a_scenario_that_is_nearly_right_is_suggested():
+    with pytest.raises(UserError, match=r"did you mean 'pref_step'\?"):
+        load_scenario("prefstep")
+
+
 def gfmhil(*arguments: str) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own."""
     return subprocess.run(

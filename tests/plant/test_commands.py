@@ -8,7 +8,7 @@ import pytest
 from numba import njit
 from numba.core.runtime import _nrt_python, rtsys
 
-from gfm_plant import plant_advance, plant_sample, plant_truth
+from gfm_plant import TRUTH, plant_advance, plant_sample, plant_truth
 
 
 def commands(n: int, u0: Any) -> Any:
@@ -65,6 +65,7 @@ def test_limited_source(rest: Callable[..., Any]) -> None:
     limited.advance(10, limited.near(i_u=5.0))
     other.advance(10, np.array([0.7, *other.u[1:]]))
     assert (limited.st["x"] == other.st["x"]).all()
+    assert limited.truth()["i_dc"] == other.truth()["i_dc"] == 0.7
 
 
 def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -> None:
@@ -73,6 +74,8 @@ def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -
     assert plant.truth()["p"] > 0.57
     plant.advance(10_000, plant.near(i_u=-9.0))
     assert plant.truth()["v_dc"] == pytest.approx(1.0, abs=1e-4)
+    drawn = plant.st["u_now"][0, 2] * plant.st["x"][0, 0]  # E_u i_d, which the source delivers
+    assert plant.truth()["i_dc"] * plant.truth()["v_dc"] == pytest.approx(drawn, abs=1e-4)
 
 
 def test_regulated_source_does_not_wind_up(rest: Callable[..., Any]) -> None:
@@ -106,7 +109,7 @@ def test_no_allocation_in_a_tick(rest: Callable[..., Any]) -> None:
         dac="DS2101",
         delay={"samples": 1, "fraction": 0.5},
     )
-    arguments = plant.par, plant.st, plant.u, np.empty(5), np.empty(10)
+    arguments = plant.par, plant.st, plant.u, np.empty(5), np.empty(len(TRUTH))
     run(*arguments, 1)
     _nrt_python.memsys_enable_stats()
     before = rtsys.get_allocation_stats().alloc

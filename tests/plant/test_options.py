@@ -88,3 +88,26 @@ def test_boards_of_the_rig() -> None:
     assert (DS2004.bits, DS2101.bits) == (16, 12)
     assert set(DS2004.range) == {"v_dc", "p", "q", "V"}
     assert "omega_u" not in DS2101.range
+
+
+def test_the_line_by_its_short_circuit_ratio() -> None:
+    """SCR = 2 and X/R = 10, by hand: 1/2 p.u. = sqrt(R^2 + X^2) with X = 10 R."""
+    par, _ = make_plant(Plant.model_validate({"grid": {"scr": 2.0, "x_over_r": 10.0}}), 1e-4)
+    assert par["R_g"][0] == par["R_line"][0] == pytest.approx(0.0497518595, rel=1e-9)
+    assert par["L_g"][0] == par["L_line"][0] == pytest.approx(0.497518595, rel=1e-9)
+    assert par["L_line_n"][0] == make_plant(Plant(), 1e-4)[0]["L_g"][0]  # of the file, for events
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"grid": {"scr": 2.0}}, "scr = 2.0, x_over_r = None: give both or neither"),
+        (
+            {"grid": {"scr": 2.0, "x_over_r": 5.0}, "factors": {"L_g": 2.0}},
+            "grid.scr = 2: sets the line; leave out factors.L_g",
+        ),
+    ],
+)
+def test_a_line_is_given_once_and_whole(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Plant.model_validate(options)

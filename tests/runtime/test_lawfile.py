@@ -121,7 +121,7 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         '"IF", gain = 3, k = 1.0, T = 0.2',
         ("phi.23.0.gain", "3"),
     ),
-    "unknown table": ("[psi]", "[chi]", ("chi", "not permitted")),
+    "unknown table": ("[psi]", "[chi]", ("chi", "unknown key", "did you mean 'phi'?")),
     "unknown type": (
         '"IF", k = 1.0, T = 0.2',
         '"XY", k = 1.0, T = 0.2',
@@ -139,7 +139,7 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "a number for a name": ('name = "custom-1"', "name = 3", ("name", "3", "string")),
     "bad name": ('name = "custom-1"', 'name = "a b"', ("name", "'a b'", "pattern")),
-    "no type": ('type = "I", T = 2.0', "T = 2.0", ("phi.34.0.type", "required")),
+    "no type": ('type = "I", T = 2.0', "T = 2.0", ("phi.34.0.type", "missing")),
     "no factors": ('{ type = "I", T = 2.0 }', "[]", ("phi.34", "at least 1")),
     "too many factors": (
         '{ type = "I", T = 2.0 }',
@@ -166,13 +166,13 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "gigantic integer": ("k_i = 400", "k_i = 1" + 400 * "0", ("phi.11.0.k_i", "must be a number")),
     "gigantic parameter": ("value = 90.0", "value = 1" + 400 * "0", ("parameters.k_p.value",)),
     "absurd gain": ("k_i = 400", "k_i = 1e300", ("phi_11.k_i", "1e+300", "1e+12")),
-    "nan parameter": ("value = 90.0", "value = nan", ("phi_11.k", "nan", "finite")),
+    "nan parameter": ("value = 90.0", "value = nan", ("parameters.k_p.value", "nan", "finite")),
     "unknown parameter": ('k = "D_p"', 'k = "D_q"', ("phi_22.k", "'D_q'", "D_p")),
     "bad parameter name": ("k_p = {", '"k p" = {', ("parameters.k p", "pattern")),
     "parameter without source": (
         ', source = "Table III"',
         "",
-        ("parameters.D_p.source", "required"),
+        ("parameters.D_p.source", "missing"),
     ),
     "parameter as expression": (
         "value = 0.05",
@@ -228,7 +228,7 @@ def test_a_mistake_is_one_clear_line(mistake: str) -> None:
     assert all(part in message for part in says), message
     assert "\n" not in message and "; " not in caught.value.why.replace("; use", "").replace(
         "; give", ""
-    ).replace("; known", ""), f"one message for one mistake: {message}"
+    ).replace("; known", "").replace("; did you", ""), f"one message for one mistake: {message}"
 
 
 def test_all_mistakes_at_once() -> None:
@@ -237,6 +237,27 @@ def test_all_mistakes_at_once() -> None:
         parse_law(text, "law file a.toml")
     assert str(caught.value).startswith("law file a.toml: ")
     assert "phi.34.0.T" in caught.value.why and "limits.T_t" in caught.value.why
+
+
+def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
+    text = CUSTOM.replace('k = "D_p"', 'k = "D_q"').replace("34 = {", "46 = {")
+    text = text.replace('type = "hybrid-angle"', 'type = "hybrid_angle"')
+    text = text.replace("[0.95, 1.05]", "[1.05, 0.95]").replace(", T_f = 0.001", "")
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(LawError) as caught:
+        load_law(str(path))
+    lines = str(caught.value).splitlines()
+    assert all(line.startswith(f"law file {path}: ") for line in lines)
+    for part in (
+        "phi_22.k: unknown parameter 'D_q'",
+        "did you mean 'D_p'?",
+        "phi.46: a cell is row",
+        "did you mean 'hybrid-angle'?",
+        "limits.omega_u: [1.05, 0.95]",
+        "phi_21: improper",
+    ):
+        assert sum(part in line for line in lines) == 1, part
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:

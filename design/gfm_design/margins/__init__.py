@@ -1,1 +1,1 @@
-"""What a loop stands: gain, phase, disk, delay and parameter margins."""
+"""Margins of a loop: gain, phase, disk, delay and parameters."""

@@ -16,12 +16,12 @@ from gfm_design.model.linear import Mode
 from gfm_plant.parameters import Element
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
-_AT_REST = 1e-6  # 1/s; what decays more slowly is an integrator, to rounding
+_AT_REST = 1e-6  # 1/s; a mode that decays more slowly is an integrator, to rounding
 _INSIDE, _OUTSIDE = 0.99, 1.01  # of a margin, in dB, degrees or seconds
 
 
 class UnstableLoop(ArithmeticError):
-    """The loop does not hold as it is, so it has no margins; ``mode`` is what grows fastest."""
+    """The nominal loop is unstable, so it has no margins; ``mode`` grows fastest."""
 
     def __init__(self, mode: Mode) -> None:
         self.mode = mode
@@ -48,13 +48,13 @@ class ChannelMargins:
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """What a loop stands at its one operating point.
+    """The margins of a loop at one operating point.
 
     Attributes:
         worst: the mode that is damped least, its sigma the largest.
         u, y: each channel that the loop uses.
         disk_u, disk_y: all channels of u, of y at once.
-        delay: more delay of all of u; ``longest`` is how far it was looked for, s.
+        delay: additional delay of all of u; the scan ended at ``longest``, s.
     """
 
     worst: Mode
@@ -68,7 +68,7 @@ class LoopMargins:
 
 @dataclass(frozen=True)
 class Margins:
-    """``loop`` at the operating point, and how far the circuit and the grid may change."""
+    """The margins of ``loop``, and the ranges of the circuit's elements and of the grid."""
 
     loop: LoopMargins
     elements: dict[Element, Range | None]
@@ -121,7 +121,7 @@ def _channels(loop: ClosedLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargin
 
 
 def _confirmed(loop: ClosedLoop, channel: int, at_u: bool, m: GainPhase) -> bool:
-    """Close the loop a little inside and outside of every margin and look at its eigenvalues."""
+    """Check the eigenvalues of the loop closed slightly inside and outside of every margin."""
 
     def held(factor: complex) -> bool:
         by = np.ones(NU if at_u else NY, complex)
@@ -133,7 +133,7 @@ def _confirmed(loop: ClosedLoop, channel: int, at_u: bool, m: GainPhase) -> bool
         if 0.0 < gain < np.inf:
             good &= held(gain**_INSIDE) and not held(gain**_OUTSIDE)
     if m.phase_deg < np.inf:
-        # at the crossing's negative frequency the same mode turns the other way: try both
+        # at the negative frequency the same mode rotates in the other direction: try both
         turns = [
             [held(np.exp(sign * share * 1j * np.radians(m.phase_deg))) for sign in (1, -1)]
             for share in (_INSIDE, _OUTSIDE)

@@ -1,8 +1,8 @@
 """Gain and phase margins of one loop, all others closed, from the crossings of its locus.
 
 A factor k e^(-j phi) on a stable loop first meets the unit circle at a crossing: of the real axis
-for a gain alone, of the unit circle for a phase alone. So the nearest crossing is the margin, and
-no stable island beyond it is taken for one.
+for a gain alone, of the unit circle for a phase alone. The nearest crossing is therefore the
+margin, even if the loop is stable again beyond it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gfm_design.margins.locus import Locus
 Vector = NDArray[np.float64]
 
 _BISECTIONS = 60
-_NO_LIMIT = 1e6  # a gain factor beyond this is rounding
+_NO_LIMIT = 1e6  # a larger gain factor is due to rounding
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class GainPhase:
 
     Attributes:
         gain_low, gain_high: factors between which the loop gain may go; 0 and inf: no limit.
-        gain_low_hz, gain_high_hz: frequency of the mode that is lost there, Hz.
-        phase_deg: the smallest phase, lagging or leading, that is too much; inf: none is.
-        phase_hz: frequency of the mode that it loses, Hz.
+        gain_low_hz, gain_high_hz: frequency of the mode that becomes unstable there, Hz.
+        phase_deg: the smallest lag or lead that makes the loop unstable; inf: there is none.
+        phase_hz: frequency of the mode that becomes unstable then, Hz.
         disk: disk margin of this loop alone (skew 0), at most 2.
     """
 
@@ -100,7 +100,7 @@ def _crossings(f: Callable[[Vector], Vector], omega: Vector, values: Vector) -> 
 
 
 def _peak(at: Callable[[Vector], NDArray[np.complex128]], omega: Vector, size: Vector) -> float:
-    """The largest |H|, looked at again and again around the best point of the grid."""
+    """The largest |H|, refined repeatedly around the best point of the grid."""
     k = int(np.argmax(size))
     low, high = omega[max(k - 1, 0)], omega[min(k + 1, len(omega) - 1)]
     best = float(size[k])

@@ -1,7 +1,7 @@
-"""How far something can go until a loop is lost: a scan from where it is stable, then bisection.
+"""Delay margins: a scan from a stable value to the first unstable one, then bisection.
 
-The scan ends at the first loss. A loop that comes back further out is stable there, but the way
-to it is not, and it is no margin.
+The scan ends at the first unstable value, even if the loop is stable again at larger ones: it
+could not get there without becoming unstable.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_runtime.signals import NU, NY
 
-_TOLERANCE = 1e-6  # relative, of what bisection ends with
+_TOLERANCE = 1e-6  # relative accuracy of the bisection
 
 
 def first_loss(sigma: Callable[[float], float], values: Sequence[float]) -> float | None:
-    """The last value known to be stable before the first loss; None if there is none.
+    """The last value known to be stable before the first unstable one; None if all are stable.
 
     Args:
-        sigma: largest growth at a value; 0 and more is lost, inf where nothing can be said.
-        values: what to scan, from the nearest to the furthest; the first one is taken as stable.
+        sigma: largest growth rate at a value; unstable from 0 on, inf if there is no loop.
+        values: to scan, from the nearest to the furthest; the first one counts as stable.
     """
     held = values[0]
     for value in values[1:]:
@@ -57,23 +57,23 @@ class DelayMargin:
 
 
 def longest(T_s: float) -> float:
-    """The largest added delay that is looked at, s."""
+    """The largest added delay of the scan, s."""
     least, most = _SAMPLES
     return float(np.clip(_LONGEST_S, least * T_s, most * T_s))
 
 
 def overall_delay(loop: ClosedLoop) -> DelayMargin:
-    """Margin for more delay of all of u at once; 0 of a loop that does not hold as it is."""
+    """Margin for more delay of all of u at once; 0 for an unstable loop."""
     return _margin(loop, np.ones(NU), np.zeros(NY))
 
 
 def delay_at_u(loop: ClosedLoop, channel: int) -> DelayMargin:
-    """Margin for more delay of one command alone."""
+    """Margin for more delay of one command only."""
     return _margin(loop, np.eye(NU)[channel], np.zeros(NY))
 
 
 def delay_at_y(loop: ClosedLoop, channel: int) -> DelayMargin:
-    """Margin for a later reading of one measurement alone."""
+    """Margin for more delay of one measurement only."""
     return _margin(loop, np.zeros(NU), np.eye(NY)[channel])
 
 

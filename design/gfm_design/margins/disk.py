@@ -5,8 +5,8 @@ to disk margins", IEEE Control Systems 40(5), 2020. Each channel may be multipli
 within the disk through (2 - alpha)/(2 + alpha) and (2 + alpha)/(2 - alpha), all at the same time.
 
 mu of a diagonal complex uncertainty is bounded from above by scaling, sigma_max(D H D^-1), which
-is exact for up to three channels at the best D. What is reported is therefore a margin that the
-loop has at least. ``full`` takes no structure into account (D = 1): smaller still, but without any
+is exact for up to three channels at the best D. The reported value is therefore a margin that the
+loop has at least. ``full`` ignores the structure (D = 1): it is smaller, but needs no
 grid of frequencies.
 """
 
@@ -45,13 +45,13 @@ class DiskMargin:
 
     @property
     def gain(self) -> tuple[float, float]:
-        """Factors between which every channel's gain may go at once."""
+        """Factors between which the gains of all channels may vary at once."""
         low = (2 - self.alpha) / (2 + self.alpha)
         return low, 1 / low if low > 0.0 else np.inf
 
     @property
     def phase_deg(self) -> float:
-        """Phase by which every channel may be turned at once, each its own way."""
+        """Phase by which every channel may lag or lead, all at once."""
         return float(np.degrees(2 * np.arctan(self.alpha / 2)))
 
 
@@ -62,7 +62,7 @@ def disk_margin(locus: Locus) -> DiskMargin:
     omega, H = locus.sampled()
     rough = mu_bound(H, _ROUGH)
     top, at = _largest(locus, omega, rough, 0.0)
-    # the summit may stand between two frequencies: look closer beside every one that comes near
+    # the maximum may lie between two frequencies: refine around every one that comes near it
     around = np.concatenate([[0.0], rough, [0.0]])
     summits = (rough >= around[:-2]) & (rough >= around[2:]) & (rough > _NEAR * top)
     for k in [int(k) for k in np.flatnonzero(summits)]:
@@ -80,7 +80,8 @@ def disk_margin(locus: Locus) -> DiskMargin:
 def _largest(locus: Locus, omega: Matrix, rough: Matrix, top: float) -> tuple[float, float]:
     """The largest bound above ``top`` and its frequency; (top, nan) if there is none.
 
-    A rough bound is a bound too: what it puts below the largest one found needs no closer look.
+    A rough bound is a bound too: a frequency with a rough bound below the largest one found needs
+    no refinement.
     """
     at = np.nan
     for k in np.argsort(-rough):

@@ -1,4 +1,4 @@
-"""H = (S - T)/2 on the unit circle, where every margin of a loop can be read off.
+"""H = (S - T)/2 on the unit circle, from which all margins of a loop follow.
 
 S is the sensitivity of the closed loop at u or at y, T = I - S. For one loop, with all others
 closed, L = (1/2 - H)/(1/2 + H): the gain of L is 1 where Re H = 0, its phase 0 or 180 degrees
@@ -19,10 +19,10 @@ from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
-_LOWEST = 1e-3  # rad/s; below it a loop is what it is at rest, unless a pole is there
+_LOWEST = 1e-3  # rad/s; below it a loop behaves as at rest, unless it has a pole there
 _STRAIGHT = 0.01
 _ROUNDS = 12
-_GONE = 1e-9  # |z| of an emptied delay line, which shapes nothing
+_GONE = 1e-9  # |z| of an emptied delay line, which has no effect on H
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Locus:
     """H of the channels of one cut as a stable discrete state space.
 
     Shapes: A (n,n), B (n,m), C (m,n); H = C (zI - A)^-1 B + I/2. ``channels`` are their indices
-    in u or y; those that the loop does not use are left out.
+    in u or y, without those that the loop does not use.
     """
 
     A: Matrix

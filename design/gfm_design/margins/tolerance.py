@@ -1,7 +1,7 @@
-"""How far one element of the circuit, or the grid, may be from what it is until a mode is lost.
+"""Ranges of each element of the circuit, and of the grid, within which the loop is stable.
 
-Each element alone, the operating point solved anew. A place without an operating point counts as
-lost too: the converter cannot be there.
+Each element varies alone, and the operating point is solved for each value. A value without an
+operating point counts as unstable: the converter cannot run there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gfm_plant.parameters import ELEMENTS, Element
 
 FLOOR, CEILING = 0.01, 100.0  # of the factor
 _POINTS = 45  # from 1 to an end: a step of a tenth
-_BEYOND = 1e-4  # relative; where the mode that is lost is looked at
+_BEYOND = 1e-4  # relative distance at which the unstable mode is determined
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class End:
     """One end of a range.
 
     Attributes:
-        factor: over the present value; the floor or the ceiling if it holds up to there.
-        lost: the mode that is lost beyond; None at the floor or ceiling, or if what is lost is
-            the operating point.
-        bounded: it was lost, before the floor or ceiling.
+        factor: over the present value; the floor or the ceiling if the loop is stable up to there.
+        lost: the mode that is unstable beyond; None at the floor or ceiling, or if there is no
+            operating point beyond.
+        bounded: the range ends before the floor or ceiling.
     """
 
     factor: float
@@ -41,7 +41,7 @@ class End:
 
 @dataclass(frozen=True)
 class Range:
-    """From ``low`` to ``high`` the loop holds."""
+    """The loop is stable from ``low`` to ``high``."""
 
     low: End
     high: End
@@ -67,7 +67,7 @@ class GridStrength:
 
 
 def element_ranges(loop: ClosedLoop) -> dict[Element, Range | None]:
-    """The range of every element; None for one whose value is 0 and has no percentage."""
+    """The range of every element; None for an element whose value is 0."""
     return {
         name: element_range(loop, (name,)) if factor(loop, name) > 0.0 else None
         for name in ELEMENTS
@@ -76,7 +76,7 @@ def element_ranges(loop: ClosedLoop) -> dict[Element, Range | None]:
 
 def factor(loop: ClosedLoop, element: Element) -> float:
     """Real over nominal value of an element in a loop."""
-    return loop.made_of.plant.factors.get(element, 1.0)
+    return loop.made_of.plant.real_factors().get(element, 1.0)
 
 
 def element_range(loop: ClosedLoop, names: Sequence[Element]) -> Range:

@@ -1,9 +1,9 @@
 """A law file's state space for many sets of gains at once.
 
 ``gfm_runtime.realisation`` builds one law with all checks, in some milliseconds; a search asks for
-thousands. Here the same elements are multiplied out for a whole population in one pass: every
-coefficient is a column of N numbers. Which factors are shared and which cancel is read off row 0,
-a set of gains at which no two factors agree by chance.
+thousands. This module multiplies the same elements for a whole population in one pass: every
+coefficient is a column of N numbers. Row 0 decides which factors are shared and which cancel; at
+its gains no two factors agree by chance.
 """
 
 from __future__ import annotations
@@ -132,12 +132,12 @@ class _Builder:
         return np.stack([np.broadcast_to(c, (self._count,)) for c in coefficients], axis=1)
 
 
-@np.errstate(all="ignore")  # what comes of it is no usable row
+@np.errstate(all="ignore")  # such a row is not usable
 def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
     """The law at N sets of parameters: as ``realise``, every matrix with a leading axis of N.
 
-    Rows whose numbers make no law are nan. Row 0 must be a law, and one at which factors that are
-    not the same differ.
+    Rows whose numbers make no law are nan. Row 0 must be a law at which different factors have
+    different values.
     """
     count = max(len(c) for c in numbers.values())
     builder = _Builder(numbers, count)

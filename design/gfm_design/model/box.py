@@ -1,4 +1,4 @@
-"""The box of real loops that deployable gains must hold: its points, corners and inside."""
+"""The box of real loops that deployable gains must stabilise: its points and corners."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SENSORS_HZ = 300.0
 
 @dataclass(frozen=True)
 class Point:
-    """One loop of the box: a converter with its line, the loop delay, what it delivers.
+    """One loop of the box: a converter with its line, the loop delay and the power reference.
 
     Attributes:
         R_f, R_g, L_g: real over nominal value of the elements.
@@ -74,7 +74,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Box:
-    """The extremes (and what lies between them) that the corners combine."""
+    """The values that the corners combine; the extremes bound the box."""
 
     R_f: tuple[float, ...] = (0.1, 1.0, 3.0)
     R_g: tuple[float, ...] = (0.1, 1.0, 3.0)

@@ -1,4 +1,4 @@
-"""Small signals: plant and law linearised at an operating point, and the plant from tick to tick.
+"""Plant and law linearised at an operating point, and the plant from tick to tick.
 
 The plant's matrices come from ``gfm_plant.model.f`` and ``g`` by complex step, which takes no
 difference and is exact to rounding. The sampled plant is exact too: each input is held over its
@@ -64,7 +64,7 @@ class LinearLaw:
     x' is dx/dt, or the x of the next tick. The omega_u loop is closed and the error map is in the
     matrices, so y and r are plain measurements and references. Shapes: A (m,m), B and B_r (m,5),
     C (3,m), D and D_r (3,5); several laws have leading axes. ``rows`` names the row of u that each
-    state belongs to; rows that are not in force have no states.
+    state belongs to; rows that do not act have no states.
     """
 
     A: Matrix
@@ -142,7 +142,7 @@ def linearise_plant(
 def linearise_law(
     law: Law, ss: DiscreteLaw | LawStateSpace, op: OperatingPoint, ref: Matrix, dc_control: bool
 ) -> LinearLaw:
-    """A law, discrete or continuous, around ``op``; ``dc_control`` says that row 1 is in force."""
+    """A law, discrete or continuous, around ``op``; ``dc_control`` says that row 1 acts."""
     slopes = error_map_slopes(law.error_map, law.error_parameters, op.y, ref)
     return closed_law(ss, slopes, dc_control)
 
@@ -249,7 +249,7 @@ def sampled_plant(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matr
 
 
 def _split(delay: float, T_s: float) -> tuple[int, float]:
-    """Whole samples and what is left of one."""
+    """Whole samples, and the remaining fraction of one."""
     samples = float(delay) / T_s
     whole = int(np.floor(samples + _WHOLE))
     part = samples - whole

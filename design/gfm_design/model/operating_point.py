@@ -1,9 +1,9 @@
-"""The operating point of a converter under a law: where both rest, found from their own equations.
+"""The operating point of a converter under a law: the equilibrium of their own equations.
 
 Unknowns are the plant's states, the DC current, E_u and the law's states; omega_u is the grid's.
 The equations are the plant's Eq. (1)-(8) (``gfm_plant.model.f``, not a copy of it), the law's
-x = A x + B (r, y) and u = u_0 + C x + D (r, y) at its sampling time, with what the sensors make
-of y. A DC source that regulates itself holds v_dc = 1 and row 1 of the law is not in force.
+x = A x + B (r, y) and u = u_0 + C x + D (r, y) at its sampling time, with y as the sensors report
+it. A regulated DC source holds v_dc = 1, and row 1 of the law does not act.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _NUDGE = 1e-7  # central differences; the error map is compiled for real numbers
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Where plant and law rest together, all in p.u.
+    """The common equilibrium of plant and law, all in p.u.
 
     Attributes:
         x: the plant's state, shape (8,), order as in ``gfm_plant.model``.
-        u: the inputs, shape (3,); i_u is the current that flows, whoever commands it.
+        u: the inputs, shape (3,); i_u is the current of the DC source, also of a regulated one.
         y: the outputs as the sensors report them, shape (5,).
         x_law: the law's state, shape (n,).
     """

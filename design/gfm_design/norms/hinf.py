@@ -1,13 +1,13 @@
 """The H-infinity norm with a guarantee: Bruinsma and Steinbuch's level-set method.
 
 A level gamma is crossed by the largest singular value of G(j omega) exactly at the imaginary
-eigenvalues of a Hamiltonian matrix. Starting from a gain that is reached, the level is raised to
-the largest gain between its crossings until it has none: then no frequency, on no grid, exceeds
-it. N. A. Bruinsma and M. Steinbuch, "A fast algorithm to compute the H-infinity norm of a
-transfer function matrix", Systems & Control Letters 14 (1990).
+eigenvalues of a Hamiltonian matrix. The level starts from a gain that is reached and rises to
+the largest gain between its crossings until it has none: then the gain exceeds it at no frequency.
+N. A. Bruinsma and M. Steinbuch, "A fast algorithm to compute the H-infinity norm of a transfer
+function matrix", Systems & Control Letters 14 (1990).
 
-An unstable system has no H-infinity norm (its L-infinity norm may well be finite, and misleads);
-it is refused with the eigenvalue that stands in the way.
+An unstable system has no H-infinity norm, although its L-infinity norm may be finite. It is
+refused, with the unstable eigenvalue.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 Matrix = NDArray[np.float64]
 
 _ROUNDS = 60
-# an eigenvalue this close to the axis, relative to its size, may be a crossing: where a level
-# grazes a peak, eigenvalues carry the root of the rounding; one too many only costs a look
+# an eigenvalue this close to the axis, relative to its size, may be a crossing: if a level touches
+# a peak, the error of the eigenvalues is the root of the rounding; one too many costs little
 _CROSSES = 1e-2
 _ZOOMS = 12
 
@@ -100,7 +100,7 @@ def _crossings(A: Matrix, B: Matrix, C: Matrix, D: Matrix, level: float) -> Matr
 
 
 def _climb(A: Matrix, B: Matrix, C: Matrix, D: Matrix, start: Norm) -> Norm:
-    """The top of the peak that ``start`` is on, by ever closer looks around the best so far."""
+    """The maximum of the peak around ``start``, by repeated refinement around the best point."""
     best, reach = start, 0.05
     if not np.isfinite(start.omega) or start.omega == 0.0:
         return start

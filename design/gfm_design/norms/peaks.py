@@ -1,4 +1,4 @@
-"""The peaks of weighted channels, and how high they are nearby.
+"""The peaks of weighted channels, and their heights at nearby gains.
 
 A peak's height has derivatives over whatever the loop's matrices depend on smoothly: with the
 resolvent R = (j omega - A)^-1, T = C R B + D, and dR = R dA R. A peak also moves along the
@@ -71,7 +71,7 @@ def peaks(loop: StateSpace, weights: tuple[Weight, ...]) -> Peaks | None:
     weight = sizes_of(weights)
     sizes *= np.sqrt(weight.squared(omega))
     padded = np.pad(sizes, ((1, 1), (0, 0)), constant_values=-np.inf)
-    tall = sizes > 0.5 * _TALL * sizes.max()  # a narrow one may grow when looked at closer
+    tall = sizes > 0.5 * _TALL * sizes.max()  # a narrow one may be higher on a finer grid
     k, channel = np.nonzero((sizes >= padded[:-2]) & (sizes > padded[2:]) & tall)
     height, top, each = sizes[k, channel], omega[k], np.arange(len(k))
     low, high = omega[np.maximum(k - 1, 0)], omega[np.minimum(k + 1, len(omega) - 1)]

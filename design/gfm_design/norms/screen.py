@@ -1,9 +1,9 @@
-"""A quick look at gamma for a search that looks thousands of times.
+"""A fast estimate of gamma for a search that needs it thousands of times.
 
-The loops of a whole population are taken apart into their modes at once; all channels are then
-evaluated on a grid that follows the modes, with points across every narrow resonance. The result
-is a lower bound close to the norm; ``tuning.polish`` works on the peaks themselves, and what
-a search ends with is confirmed by ``gfm_design.norms.hinf``.
+It decomposes the loops of a whole population into their modes at once, and evaluates all channels
+on a grid that follows the modes, with points across every narrow resonance. The result
+is a lower bound close to the norm. ``tuning.polish`` works on the peaks themselves, and
+``gfm_design.norms.hinf`` confirms the result of a search.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 _BASE = np.concatenate(  # rad/s; as good as 0 and infinity at the ends, where many laws are worst
     [[1e-6, 1e-3], np.logspace(-2, 0, 10), np.logspace(0.05, 3, 70), np.logspace(3.1, 5, 20), [1e7]]
 )
-_ACROSS = np.array([-2.0, -0.8, -0.3, 0.0, 0.3, 0.8, 2.0])  # half widths beside a resonance
+_ACROSS = np.array([-2.0, -0.8, -0.3, 0.0, 0.3, 0.8, 2.0])  # half widths around a resonance
 
 
 class Screen:

@@ -72,8 +72,7 @@ def read_weights(path: Path) -> tuple[Weight, ...]:
     """The weights of a file.
 
     Raises:
-        ValueError: it cannot be read or is not TOML, or a weight in it cannot be; the first such
-            is named.
+        ValueError: it cannot be read, is not TOML, or has an invalid weight; it names the first.
     """
     content = read_toml(path)
     if not content:

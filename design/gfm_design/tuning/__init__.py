@@ -1,1 +1,1 @@
-"""The synthesis: free gains, searches, the box that deployable gains must hold."""
+"""The synthesis: free gains, searches, and the box that deployable gains must stabilise."""

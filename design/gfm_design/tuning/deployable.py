@@ -1,7 +1,7 @@
-"""Gains that hold in the box: tune on a few of its points, add those that break, and repeat.
+"""Gains that stabilise the box: tune on a few of its corners, add violated ones, and repeat.
 
 The box has a thousand corners, most of which never bind. A round searches with the corners found
-so far; then all of them are looked at, and the worst that are broken join.
+so far. Then all corners are evaluated, and the worst violated ones are added.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from gfm_runtime.lawfile import LawFile
 
 Vector = NDArray[np.float64]
 
-_JOIN, _JOIN_STEPS = 12, 5  # broken corners that join after a round
+_JOIN, _JOIN_STEPS = 12, 5  # violated corners that are added after a round
 _TOLERANCE = 1e-3
 LATE = (7.0, 9.0, 11.0)  # samples: the delays at which the nominal loop must hold as well
 
 
 @dataclass(frozen=True)
 class Round:
-    """What the search stands at after a round: gains, gamma, and the worst over the whole box.
+    """The state of the search after a round: gains, gamma, and the worst over the whole box.
 
-    ``slow`` [1/s] and ``beyond`` (a part of the step) are by how much sigma and the overshoot
-    break what is wanted, at worst; negative if all hold.
+    ``slow`` [1/s] and ``beyond`` (a part of the step) are the worst violations of the limits of
+    sigma and of the overshoot; negative if all corners meet them.
     """
 
     values: Vector
@@ -45,7 +45,7 @@ class Round:
 
 
 def steps(box: Box) -> list[Point]:
-    """Where the step of P_ref is looked at: from 0.5 p.u., at the least and largest delay."""
+    """The points for the step of P_ref: from 0.5 p.u., at the least and the largest delay."""
     return replace(box, P_ref=(0.5,), delay=(min(box.delay), max(box.delay))).corners()
 
 

@@ -1,7 +1,7 @@
-"""What a controller of full order could do: a bound from below for every law.
+"""A lower bound of gamma for every law, from controllers of full order.
 
 The diagonal problem, the largest of the norms of W_ij T_ij, is not one standard H-infinity
-problem: each w_j is judged by itself. But for one w_j alone, the stack of its m channels is one,
+problem: each w_j counts separately. But for one w_j alone, the stack of its m channels is one,
 and the stack's norm is at most sqrt(m) times its largest channel. So with gamma_j the least norm
 of the stack over *all* stabilising controllers that see (v_dc, p, q, V) and P_ref,
 

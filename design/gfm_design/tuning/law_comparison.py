@@ -1,4 +1,4 @@
-"""One law of the league: its free gains tuned for the paper's converter, and what its loop stands.
+"""One law of the comparison: its gains tuned for the paper's converter, and its loop's margins.
 
 gamma is that of the paper's ideal continuous loop (``PaperProblem``). What a real loop does to the
 gains is read off the exact sampled one at T_S: modes, elements and grid with one sample of delay,

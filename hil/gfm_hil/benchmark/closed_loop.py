@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import OURS, attribute, bursts, counts, missed_ticks
 from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.cpu_load import Load, hogs
+from gfm_hil.benchmark.cpu_load import Load, cpu_load
 from gfm_hil.benchmark.inproc_loop import Loop
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import Policy, pair
@@ -39,7 +39,7 @@ from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
 
 LAW = "mimo-gfm"
 T_S = 1e-4  # s
-_SETTLE = 1_000  # ticks after the hogs were let go that are left out
+_SETTLE = 1_000  # ticks after the CPU load begins that are left out
 _PATIENCE_S = 5.0  # a machine that is busy with other things shall not end a run
 _SHORT = 2_000  # ticks of one of the short runs in process
 
@@ -162,7 +162,7 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
     cells = [_Cell(link, load) for link in plan.links for load in plan.loads]
     with ExitStack() as stack:
         place = memory_folder(stack)
-        load_is = stack.enter_context(hogs())
+        load_is = stack.enter_context(cpu_load())
         two = stack.enter_context(pair(plan.policy, place))
         two.both(pace_here, 0, 1, HYBRID, 1)
         for number in rounds(plan.rounds, plan.until):

@@ -1,4 +1,4 @@
-"""Other work on the machine: one process a processor that never rests, at ordinary priority."""
+"""CPU load for a benchmark: a process on each processor that never sleeps, of ordinary priority."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Literal
 
-Load = Literal["idle", "hogs"]
-LOADS: tuple[Load, ...] = ("idle", "hogs")
+Load = Literal["idle", "busy"]
+LOADS: tuple[Load, ...] = ("idle", "busy")
 
-_HOG = (
-    "import os, sys\n"
+_COMPUTE = (
+    "import os, signal, sys\n"
     "from gfm_hil.core.stopping import end_with_parent\n"
-    "end_with_parent(int(sys.argv[2]))\n"
+    # a stopped process takes no other signal
+    "end_with_parent(int(sys.argv[2]), signal.SIGKILL)\n"
     "os.sched_setaffinity(0, {int(sys.argv[1])})\n"
+    "os.kill(os.getpid(), signal.SIGSTOP)\n"
     "while True:\n"
     "    pass\n"
 )
@@ -26,11 +28,11 @@ _SETTLE_S = 0.02
 
 
 @contextmanager
-def hogs() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
-    """Start them, halted; yields a context that lets them go for ``hogs`` and not for ``idle``."""
+def cpu_load() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
+    """Start the processes, stopped; yields a context in which they run if it is ``busy``."""
     started = [
         subprocess.Popen(  # own session: Ctrl-C is the parent's to handle
-            [sys.executable, "-c", _HOG, str(cpu), str(os.getpid())], start_new_session=True
+            [sys.executable, "-c", _COMPUTE, str(cpu), str(os.getpid())], start_new_session=True
         )
         for cpu in sorted(os.sched_getaffinity(0))
     ]
@@ -52,8 +54,8 @@ def hogs() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
             send(signal.SIGSTOP)
 
     try:
-        time.sleep(0.3)
-        send(signal.SIGSTOP)
+        for process in started:  # each stops itself
+            os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
         yield load
     finally:
         for process in started:

@@ -15,7 +15,7 @@ from gfm_hil.benchmark.result import check_result, write_result
 from gfm_hil.core.errors import UserError
 
 KINDS = ("latency", "jitter", "kernel", "loop")
-_LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # what grows with every turn
+_LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # what grows with every round
 
 
 def interleave(
@@ -45,7 +45,7 @@ def interleave(
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in commands}
     for turn in range(turns):
         for k, name in enumerate(list(commands)[:: -1 if turn % 2 else 1]):
-            tell(f"turn {turn + 1}, {name}", (turn + k / 2) / turns)
+            tell(f"round {turn + 1}, {name}", (turn + k / 2) / turns)
             found[name].append(_once(name, commands[name], chosen))
     results = {name: _merged(runs) for name, runs in found.items()}
     for name, content in results.items():

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import bursts
 from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.cpu_load import Load, hogs
+from gfm_hil.benchmark.cpu_load import Load, cpu_load
 from gfm_hil.benchmark.pair import Pair, Policy, pair
 from gfm_hil.benchmark.rounds import rounds
 from gfm_hil.benchmark.spread import REST, summary
@@ -85,7 +85,7 @@ def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, An
         for policy in plan.policies for load in plan.loads for wait in plan.waits
     }  # fmt: skip
     with ExitStack() as stack:
-        load_is = stack.enter_context(hogs())
+        load_is = stack.enter_context(cpu_load())
         two = {
             policy: stack.enter_context(pair(policy, memory_folder(stack)))
             for policy in plan.policies

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.c_code import NoCompiler, compile_c
 from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
-from gfm_hil.benchmark.cpu_load import Load, hogs
+from gfm_hil.benchmark.cpu_load import Load, cpu_load
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.rounds import rounds
 from gfm_hil.benchmark.spread import REST, summary
@@ -36,7 +36,7 @@ class Plan:
     Attributes:
         links: names.
         modes: lockstep: one round trip after the other; realtime: one every 100 µs.
-        loads: idle, or beside a hog on each processor.
+        loads: idle, or busy: with a CPU load on each processor.
         policy: how the two processes are scheduled.
         payload: bytes there; ``FRAME`` stands for the bench's frames, 64 there and 48 back.
         seconds: of one round.
@@ -80,7 +80,7 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
             remarks.append(f"{problem}: no limits in C, no ratios")
         contenders = of_links(list(plan.links), place, library)
         two = stack.enter_context(pair(plan.policy, place))
-        load = stack.enter_context(hogs())
+        load = stack.enter_context(cpu_load())
         cells = []
         for contender in contenders:
             tell(f"opening {contender.name}", 0.0)

@@ -47,7 +47,7 @@ _SECTIONS = {
         "A message there and its answer back, between two processes on two processors. Solid: the "
         "links of the bench; dashed: the limit, the same exchange in C, in the same rounds. "
         "lockstep: one after the other. realtime: one every 100 µs, counted from its deadline, so "
-        "that a late start is part of it. hogs: a busy process on each processor.",
+        "that a late start is part of it. busy: another process computes on each processor.",
     ),
     "misses": (
         "Real time",

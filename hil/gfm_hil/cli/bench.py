@@ -9,12 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from gfm_hil.cli.common import new_folder
+from gfm_hil.core.terminal import terminal
 from gfm_hil.links import link_names
 from gfm_hil.results.run_folder import check_free
 
@@ -94,8 +94,8 @@ def _add_modes(command: argparse.ArgumentParser) -> None:
 
 def _add_load(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--load", default="idle,hogs",
-        help="idle, or beside a busy process on each processor (default: %(default)s)",
+        "--load", default="idle,busy",
+        help="idle, or busy: with a CPU load on each processor (default: %(default)s)",
     )  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(content, indent=1))
         return 0
-    console = Console()
+    console = terminal()
     console.width = max(console.width, _WIDTH)
     for table in tables(content):
         console.print(_drawn(table))
@@ -197,7 +197,7 @@ def compare_call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"results": rows, "remarks": remarks}, indent=1))
         return 0
-    console = Console()
+    console = terminal()
     console.width = max(console.width, _WIDTH)
     console.print(_drawn(comparison_table(rows)))
     for remark in remarks:
@@ -216,7 +216,7 @@ def _drawn(table: Any) -> Table:
 
 @contextmanager
 def _bar(quiet: bool) -> Iterator[Tell]:
-    console = Console(stderr=True, quiet=quiet)
+    console = terminal(stderr=True, quiet=quiet)
     with Progress(
         BarColumn(),
         TaskProgressColumn(),

@@ -11,12 +11,13 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.runner import Notice
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
 from gfm_hil.studies.campaign.loading import load_campaign
@@ -66,9 +67,9 @@ def call(options: argparse.Namespace) -> int:
         store = Store(store_at, campaign, options.resume)
         jobs = store.missing(campaign)
         began, lost = time.monotonic(), None
-        with Interrupt() as interrupt, _bar(campaign, store, options.quiet) as tell:
+        with Interrupt() as interrupt, _bar(campaign, store, options.quiet) as (tell, notice):
             if jobs and executor is None:
-                compile_once(campaign)
+                compile_once(campaign, notice)
                 executor = stack.enter_context(processes(workers))
 
             def keep(records: list[Record]) -> None:
@@ -115,16 +116,16 @@ def _only(options: argparse.Namespace, campaign: Campaign) -> int:
 def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar for the checks, which appears once they take long; one line where there is no
     terminal. Yields what tells it of them."""
-    console, began = Console(stderr=True, quiet=quiet), time.monotonic()
+    console, began = terminal(stderr=True, quiet=quiet), time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-    terminal = console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=not terminal) as bar:
+    shown = console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=not shown) as bar:
         task = bar.add_task("checking the runs", visible=False)
 
         def tell(done: int, of: int) -> None:
             if time.monotonic() - began < _PATIENCE_S:
                 return
-            if not terminal and not bar.tasks[0].visible:
+            if not shown and not bar.tasks[0].visible:
                 console.print(f"checking the runs: {done} of {of} done …", highlight=False)
             bar.update(task, completed=done, total=of, visible=True)
 
@@ -132,8 +133,9 @@ def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextlib.contextmanager
-def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
-    """A bar with what became of the runs, and the time left; yields what tells it of records."""
+def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[tuple[Any, Notice]]:
+    """A bar with what became of the runs, and the time left; yields what tells it of records, and
+    what prints a line above it."""
     counts = dict.fromkeys(VERDICTS, 0)
     with Progress(
         TextColumn("{task.description}"),
@@ -141,7 +143,7 @@ def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
         TaskProgressColumn(),
         TextColumn("{task.fields[found]}"),
         TimeRemainingColumn(),
-        console=Console(stderr=True, quiet=quiet),
+        console=terminal(stderr=True, quiet=quiet),
         transient=True,
         refresh_per_second=4,
     ) as bar:
@@ -156,4 +158,4 @@ def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[Any]:
 
         if store.records:
             tell(store.sorted(campaign))
-        yield tell
+        yield tell, above(bar)

@@ -5,23 +5,35 @@ from __future__ import annotations
 import argparse
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.results.report import as_expected, cell, event_rows
+from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
+from gfm_hil.results.summary import controlled_by
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
-_ABREAST = 4  # events in one table, so that it fits 80 columns
+
+
+#: what the command line calls the overrides of ``load_scenario``
+_OPTIONS = {
+    "mode": "--mode",
+    "link__type": "--link",
+    "link__endpoint": "--endpoint",
+    "duration": "--duration",
+    "seed": "--seed",
+    "law": "--law",
+}
 
 
 def add_scenario_options(command: argparse.ArgumentParser) -> None:
@@ -60,6 +72,7 @@ def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
         mode = "lockstep"
     return load_scenario(
         options.scenario,
+        _OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
         mode=mode,
         link__type=options.link,
         link__endpoint=options.endpoint,
@@ -82,10 +95,21 @@ def new_folder(out: str | None, stem: str) -> Path:
     return folder
 
 
+def above(bar: Progress) -> Notice:
+    """What prints a line above a progress bar."""
+
+    def notice(text: str) -> None:
+        bar.console.print(escape(text), style="dim", highlight=False, soft_wrap=True)
+
+    return notice
+
+
 @contextmanager
-def progress_bar(scenario: Scenario, label: str, quiet: bool) -> Iterator[tuple[TellProgress, Any]]:
+def progress_bar(
+    scenario: Scenario, label: str, quiet: bool
+) -> Iterator[tuple[TellProgress, Notice]]:
     """A bar with simulated time and misses on stderr; yields (progress, notice)."""
-    console = Console(stderr=True, quiet=quiet)
+    console = terminal(stderr=True, quiet=quiet)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -103,44 +127,41 @@ def progress_bar(scenario: Scenario, label: str, quiet: bool) -> Iterator[tuple[
             sim = f"{ticks * scenario.T_s:.2f} s simulated"
             bar.update(task, completed=ticks, sim=sim + (f", {misses} misses" if misses else ""))
 
-        def notice(text: str) -> None:
-            bar.console.print(escape(text), style="dim", highlight=False, soft_wrap=True)
-
-        yield tell, notice
+        yield tell, above(bar)
 
 
 def print_summary(summary: dict[str, Any], folder: Path) -> None:
     """The short table that ends a run."""
-    console = Console()
+    console = terminal()
     colour = "red" if summary["unmet"] else "green"
     reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
-    console.print(f"[bold {colour}]{summary['status']}[/]{reason}", highlight=False)
+    expected = ", as expected" if as_expected(summary) else ""
+    console.print(f"[bold {colour}]{summary['status']}[/]{expected}{reason}", highlight=False)
     for part in summary["unmet"]:
         console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
-    console.print(escape(" → ".join(summary["laws"])), highlight=False)
+    console.print(escape(controlled_by(summary)), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
-        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {summary['misses']} misses",
+        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {cell(summary['misses'])} misses",
         highlight=False,
     )
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         console.print(escape(f"round trip [µs]: {text}"), highlight=False)
-    for first in range(0, len(summary["events"]), _ABREAST):
-        console.print(events_table(summary["events"][first : first + _ABREAST]))
+    for table in fitting(console, summary["events"], events_table):
+        console.print(table)
     console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
 
 
-def events_table(events: list[dict[str, Any]]) -> Table:
-    """One row a quantity, one column an event."""
+def events_table(events: Sequence[dict[str, Any]]) -> Table:
+    """A table with one row a quantity and one column an event."""
     table = Table(box=None, pad_edge=False)
     table.add_column("", no_wrap=True)
     for event in events:
         table.add_column(escape(f"{event['label']} @ {event['t']:g} s"), justify="right")
-    for name, title in EVENT_COLUMNS[2:]:
-        values = [e.get(name) for e in events]
-        if any(v is not None for v in values):
-            table.add_row(escape(title), *[cell(v) for v in values])
+    for name, title in event_rows(events):
+        if name not in ("label", "t"):
+            table.add_row(escape(title), *[cell(e.get(name)) for e in events])
     return table
 
 

@@ -1,4 +1,4 @@
-"""A server beside a run that is about to begin: another command of ours, as its own process."""
+"""A companion of a run: another gfmhil command, such as the scope, as a process of its own."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _GRACE_S = 5.0
 
 
 @contextlib.contextmanager
-def beside(
+def companion(
     command: str, folder: Path, port: int | None, ready: int = 0, ends_itself: bool = True
 ) -> Iterator[subprocess.Popen[str]]:
-    """Start ``gfmhil COMMAND`` for a run folder that is not there yet.
+    """Start ``gfmhil COMMAND`` for a run folder that does not exist yet.
 
-    What it says goes to stderr, as stdout may be somebody's JSON. It ends with this process,
-    however that ends.
+    Its output goes to stderr, as stdout may carry JSON. It ends with this process, however that
+    ends.
 
     Args:
         command: one that takes a folder, ``--wait``, ``--port`` and ``--part``.
         folder: where the run will be recorded.
         port: to serve at; the command's own choice if None.
-        ready: lines that it says once it serves, to be waited for; 0 if it does so only when
-            there is a run.
-        ends_itself: it ends soon after the run; if not, it is ended in the end.
+        ready: how many lines it prints once it serves, which this function waits for; 0 if it
+            prints them only when there is a run.
+        ends_itself: it ends soon after the run; otherwise this function ends it.
 
     Raises:
-        UserError: the port is not to be had, or it ended, having said why on stderr.
+        UserError: the port is taken, or the command ended; it has printed why on stderr.
     """
     if port:
         _check_free(command, port)

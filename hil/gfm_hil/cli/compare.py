@@ -1,12 +1,12 @@
-"""gfmhil compare: one scenario under several laws, side by side."""
+"""gfmhil compare: one scenario under several laws, in one table and one figure."""
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -20,17 +20,22 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
+from gfm_hil.core.terminal import fitting, terminal
 from gfm_hil.results.figures import draw_comparison
-from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.scenario.model import find_scenario
+from gfm_hil.scenario.model import INPROC, find_scenario
 
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
-    command = commands.add_parser("compare")
+    command = commands.add_parser(
+        "compare",
+        description="In one process and in lockstep, unless --link, --endpoint, --option or "
+        "--mode realtime asks for two.",
+    )
     add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
     command.add_argument("--out", help="folder; runs/<scenario>-compare-<time> by default")
@@ -41,6 +46,8 @@ def add(commands: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
+    if not (options.link or options.endpoint or options.option or options.mode == "realtime"):
+        options.link = INPROC
     base = resolve(options)
     names = split_laws(options.laws) if options.laws else base.compare
     if not names:
@@ -65,22 +72,26 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(summaries, indent=2))
     else:
         _print(summaries, events)
-        Console().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
+        terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
     return max(exit_code(run.summary) for run in runs.values())
 
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
-    console = Console()
-    table = Table(box=None, pad_edge=False)
-    table.add_column("")
-    for name in summaries:
-        table.add_column(escape(name), justify="right")
-    table.add_row("status", *[s["status"] for s in summaries.values()])
-    for k, event in enumerate(events):
-        table.add_row(f"[bold]{escape(event['label'])} @ {event['t']:g} s[/]")
-        for key, title in EVENT_COLUMNS[2:]:
-            values = [s["events"][k].get(key) if k < len(s["events"]) else None
-                      for s in summaries.values()]  # fmt: skip
-            if any(v is not None for v in values):
-                table.add_row("  " + escape(title), *[cell(v) for v in values])
-    console.print(table)
+    def table_of(names: Sequence[str]) -> Table:
+        table = Table(box=None, pad_edge=False)
+        table.add_column("")
+        for name in names:
+            table.add_column(escape(name), justify="right")
+        some = [summaries[name] for name in names]
+        table.add_row("status", *[s["status"] for s in some])
+        for k, event in enumerate(events):
+            table.add_row(f"[bold]{escape(event['label'])} @ {event['t']:g} s[/]")
+            same = [s["events"][k] if k < len(s["events"]) else {} for s in some]
+            for key, title in event_rows(same):
+                if key not in ("label", "t"):
+                    table.add_row("  " + escape(title), *[cell(e.get(key)) for e in same])
+        return table
+
+    console = terminal()
+    for table in fitting(console, list(summaries), table_of):
+        console.print(table)

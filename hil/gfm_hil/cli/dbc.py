@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 
 _RATES = {
     False: [(500_000, 0), (1_000_000, 0)],
@@ -31,12 +30,10 @@ def add(commands: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Write the file, or show the budget."""
-    if find_spec("cantools") is None:
-        raise UserError("gfmhil dbc: needs cantools: pip install 'gfmhil[can]'")
     if options.T_s <= 0:
         raise UserError(f"--T_s {options.T_s:g}: must be more than 0 s")
     if options.budget:
-        Console().print(_budgets(options.T_s), highlight=False)
+        terminal().print(_budgets(options.T_s), highlight=False)
         return 0
     from gfm_hil.links.can.dbc import write_dbc
 

@@ -6,12 +6,12 @@ import argparse
 import json
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gfm_hil.benchmark.doctor import examine, worst
 from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.doctor import examine, worst
 
 
 def add(commands: Any) -> None:
@@ -41,5 +41,5 @@ def call(options: argparse.Namespace) -> int:
             table.add_row(mark, f.what, escape(f.found))
             if f.advice:
                 table.add_row("", "", escape(f"→ {f.advice}"))
-        Console().print(table, highlight=False)
+        terminal().print(table, highlight=False)
     return EXIT_OTHERWISE if options.strict and level == "red" else 0

@@ -7,9 +7,9 @@ import json
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Column, Table
 
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.law import cell_text
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
 from gfm_runtime.lawfile import LawFile
@@ -22,7 +22,9 @@ def add(commands: Any) -> None:
     """Add the command and its sub-command to the parser."""
     command = commands.add_parser("laws")
     command.add_argument("--json", action="store_true", help="as JSON")
-    command.add_argument("--tuned", action="store_true", help="those with the league's gains")
+    command.add_argument(
+        "--tuned", action="store_true", help="those with the gains of the law comparison"
+    )
     command.set_defaults(call=call_list)
     show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
     show.add_argument("name", help="catalogue name or law file")
@@ -62,7 +64,7 @@ def call_list(options: argparse.Namespace) -> int:
         cells = "  ".join(f"φ{k} {v}" for k, v in row["elements"].items())  # type: ignore[attr-defined]
         weak = "" if row["home_grid"]["L_g"] == 1 else " [dim](weak grid)[/]"  # type: ignore[index]
         table.add_row(str(row["name"]), str(row["order"]), cells, f"{row['title']}{weak}")
-    Console().print(table)
+    terminal().print(table)
     return 0
 
 
@@ -73,7 +75,7 @@ def call_show(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(_as_json(file, discrete), indent=2, ensure_ascii=False))
         return 0
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     first = laws.laws[0]
     console.print(f"[bold]{laws.name}[/]: {first.title}")
     console.print(" ".join(first.source.split()).replace("[", "\\["), style="dim")

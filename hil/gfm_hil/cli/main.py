@@ -13,7 +13,7 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import version
+from typing import Any, NoReturn
 
 #: each command's module and what it does. Only the module of the command that is called is
 #: imported, so that the help and the light commands load neither numba nor the design tools.
@@ -21,6 +21,7 @@ COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
     "tell": ("tell", "have a run that is going on do something, or show where it is"),
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
+    "merge": ("merge", "put together the two folders of sides that were started apart"),
     "scope": ("scope", "look at a run in the browser while it goes on, or afterwards"),
     "modbus": ("modbus", "serve a run that is going on as a SunSpec device on Modbus/TCP"),
     "export": ("export", "a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF"),
@@ -31,7 +32,9 @@ COMMANDS = {
     "laws": ("laws", "list the laws, or show one"),
     "design": ("design", "gamma, margins, and gains by H-infinity synthesis"),
     "dbc": ("dbc", "the CAN link's DBC file, or its bus budget"),
+    "warm-up": ("warm_up", "compile all that runs call, so that the first one starts at once"),
     "doctor": ("doctor", "what timing on this machine depends on, and what to do about it"),
+    "schema": ("schema", "the JSON schema of a scenario, law or campaign file, for editors"),
     "scenarios": ("scenarios", "list the scenarios that ship"),
     "keys": ("keys", "make a key pair per side, for ZeroMQ between two machines"),
     "deploy": ("deploy", "write service units, container files and the tuning script to a folder"),
@@ -40,12 +43,25 @@ COMMANDS = {
 }
 
 
+class _Version(argparse.Action):
+    """Looks the version up once it is asked for, which takes as long as everything else here."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(nargs=0, **more)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"gfmhil {version('gfmhil')}")
+        parser.exit()
+
+
 def parser(command: str | None = None) -> argparse.ArgumentParser:
     """The parser of one command with its options; that of no command only lists all of them."""
     top = argparse.ArgumentParser(
         prog="gfmhil", description="Hardware-in-the-loop bench for grid-forming converter control."
     )
-    top.add_argument("--version", action="version", version=f"gfmhil {version('gfmhil')}")
+    top.add_argument("--version", action=_Version, help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     if command in COMMANDS:
         import_module(f"gfm_hil.cli.{COMMANDS[command][0]}").add(commands)
@@ -81,16 +97,21 @@ def _refuse(problem: Exception) -> int:
         Exception: the problem itself, if it is a mistake of ours.
     """
     from gfm_hil.core.errors import Unfinished, UserError  # these imports take longer than --help
-    from gfm_plant import NoEquilibrium
     from gfm_runtime import LawError
     from gfm_runtime.errors import printable
 
     if isinstance(problem, OSError) and problem.filename is not None:  # a file that the user named
         text = f"{problem.filename}: {problem.strerror}"
-    elif isinstance(problem, UserError | LawError | NoEquilibrium | Unfinished):
+    elif isinstance(problem, UserError | LawError | Unfinished) or _no_equilibrium(problem):
         text = str(problem)
     else:
         raise problem
     said = "\n".join(printable(line) for line in text.split("\n"))
     print(f"gfmhil: {said}", file=sys.stderr)
     return 3 if isinstance(problem, Unfinished) else 2
+
+
+def _no_equilibrium(problem: Exception) -> bool:
+    from gfm_plant import NoEquilibrium  # with it comes numba
+
+    return isinstance(problem, NoEquilibrium)

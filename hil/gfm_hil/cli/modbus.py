@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import end_with_parent
 
 PORT = 5020
@@ -52,7 +52,6 @@ def add(commands: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry it out; returns the exit code."""
-    need_pysunspec2()
     from gfm_hil.modbus.image import vendor_model
     from gfm_hil.modbus.serve import LOCAL, Address, begun, serve
 
@@ -78,8 +77,3 @@ def call(options: argparse.Namespace) -> int:
         time.sleep(_LOOK_S)
     serve(options.folder, address, options.heartbeat, lambda text: print(text, flush=True))
     return 0
-
-
-def need_pysunspec2() -> None:
-    """Raise UserError if what the server needs is not installed."""
-    need("sunspec2", "pysunspec2", "the Modbus server", "modbus")

@@ -16,9 +16,8 @@ from gfm_hil.cli.common import (
     progress_bar,
     resolve,
 )
-from gfm_hil.cli.companion import beside
+from gfm_hil.cli.companion import companion
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
-from gfm_hil.cli.modbus import need_pysunspec2
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
@@ -59,14 +58,13 @@ def call(options: argparse.Namespace) -> int:
         if options.scope is not None:
             need_websockets()
             port = None if options.scope < 0 else options.scope
-            scope = stack.enter_context(beside("scope", folder, port, ends_itself=False))
+            scope = stack.enter_context(companion("scope", folder, port, ends_itself=False))
         if options.stream is not None:
-            stack.enter_context(beside("stream", folder, options.stream, ready=2))
+            stack.enter_context(companion("stream", folder, options.stream, ready=2))
         if options.modbus is not None:
             if scenario.link.type == INPROC:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
-            need_pysunspec2()
-            stack.enter_context(beside("modbus", folder, options.modbus))
+            stack.enter_context(companion("modbus", folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
             run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
         if options.json:

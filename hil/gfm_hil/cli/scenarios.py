@@ -6,9 +6,9 @@ import argparse
 import json
 from typing import Any
 
-from rich.console import Console
 from rich.table import Column, Table
 
+from gfm_hil.core.terminal import terminal
 from gfm_hil.scenario.model import load_scenario, shipped_scenarios
 
 
@@ -37,5 +37,5 @@ def call(options: argparse.Namespace) -> int:
     table = Table(*columns, box=None, pad_edge=False)
     for name, s in found.items():
         table.add_row(name, s.mode, ", ".join(s.laws()), f"{s.duration:g}", s.title)
-    Console().print(table)
+    terminal().print(table)
     return 0

@@ -11,8 +11,8 @@ from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, prin
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.core.stopping import end_with_parent
+from gfm_hil.engine.compiling import compiled_bench
 from gfm_hil.engine.process import run_side
-from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import link_names
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import INPROC
@@ -45,13 +45,13 @@ def call(options: argparse.Namespace) -> int:
             run_side(side, scenario, folder, notice=lambda text: None)
         return 0
     check_free(folder, scenario.ticks)
-    labels = make_bench(scenario).controller.labels
-    folder.mkdir(parents=True, exist_ok=True)
 
     def notice(text: str) -> None:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
+    labels = compiled_bench(scenario, notice, (side,)).controller.labels
+    folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     with in_use(folder):
         run_side(side, scenario, folder, notice)

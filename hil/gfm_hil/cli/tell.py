@@ -10,6 +10,7 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.operator import Operator
+from gfm_runtime.errors import meant
 from gfm_runtime.signals import REF_NAMES
 
 
@@ -93,9 +94,9 @@ def _values(texts: list[str], what: str, known: Sequence[str] | None = None) -> 
     values: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")
+        if known is not None and name not in known:
+            raise UserError(f"{text!r}: must be NAME=VALUE, NAME {what}{meant(name, known)}")
         try:
-            if known is not None and name not in known:
-                raise ValueError
             values[name] = float(value)
         except ValueError:
             raise UserError(f"{text!r}: must be NAME=VALUE, NAME {what}") from None

@@ -1,1 +1,1 @@
-"""What every room uses: errors, the two roles, temporary folders, being stopped, BLAS settings."""
+"""What all packages use: errors, the two roles, temporary folders, signals, BLAS settings."""

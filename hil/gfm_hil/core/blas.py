@@ -1,7 +1,7 @@
 """One thread for linear algebra, set before NumPy is first imported.
 
-The matrices here are small: more threads only wait for each other, spinning on processors that the
-loop needs. Whoever sets the variable knows better.
+The matrices here are small: more threads only wait for each other and spin on processors that the
+loop needs. A value that the user has set stays.
 """
 
 from __future__ import annotations

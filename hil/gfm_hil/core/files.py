@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: written under another name, then renamed."""
+"""Atomic files: written under another name, then renamed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _PREFIX = ".part-"
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to; what was written there then becomes ``path``.
+    """Yield a path beside ``path`` to write to; afterwards rename it to ``path``.
 
-    The data are on the disk before the new name is, so that a power failure leaves either the old
-    file or the new one. If the block raises, ``path`` stays as it was.
+    The data is on disk before the rename is, so that a power failure leaves either the old file or
+    the new one. If the block raises, ``path`` stays as it was.
 
     Raises:
         OSError: the file cannot be written.
@@ -31,13 +31,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a whole text file, see ``replacing``."""
+    """Write a text file atomically, see ``replacing``."""
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in ``folder`` on the disk before anything else is done."""
+    """Wait until the names in ``folder`` are on disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -46,5 +46,5 @@ def sync_folder(folder: Path) -> None:
 
 
 def unfinished(folder: Path) -> list[Path]:
-    """What a killed process was just writing in ``folder``."""
+    """Files in ``folder`` that a killed process was writing."""
     return sorted(folder.glob(f"{_PREFIX}*"))

@@ -1,4 +1,4 @@
-"""Who gives a command, as the log of the run records it."""
+"""Who gives a command, for the log of the run."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 class Identity(BaseModel):
     """An operator. The desk's socket is in a folder of this user alone, so that only programs of
-    this user can say who gives a command; each server says what it knows of its peer.
+    this user can say who gives a command; each server reports what it knows about its peer.
 
     Attributes:
         through: what passes the command on: scope, modbus, tell or python.
-        name: of the token (scope), of the local user (tell, python), or ``timer`` where the
-            Modbus server itself takes a set-point back.
+        name: of the token (scope), of the local user (tell, python), or ``timer`` if the Modbus
+            server itself reverts a set-point.
         peer: address and port of the other end.
         certificate: subject of the client's TLS certificate.
         uid, pid: of a local process.
@@ -32,22 +32,22 @@ class Identity(BaseModel):
     pid: int | None = Field(None, ge=0, lt=2**32)
 
     def plain(self) -> dict[str, Any]:
-        """What is known, as plain data."""
+        """The known fields as plain data."""
         return self.model_dump(exclude_none=True)
 
 
 def local(through: str) -> Identity:
-    """This process and the user that it belongs to."""
+    """The identity of this process and its user."""
     uid = os.getuid()
     try:
         name = pwd.getpwuid(uid).pw_name
-    except KeyError:  # a container may have users without names
+    except KeyError:  # in a container a user may have no name
         name = None
     return Identity(through=through, name=name, uid=uid, pid=os.getpid())
 
 
 def address(peer: Any) -> str:
-    """Address and port as one text, of what ``getpeername`` gives."""
+    """Address and port as one text, from the result of ``getpeername``."""
     if not isinstance(peer, tuple):
         return str(peer)
     host, port = peer[:2]

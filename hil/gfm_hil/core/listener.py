@@ -1,9 +1,8 @@
-"""A listening socket with room for so many peers: a new one takes the place of the most silent.
+"""A listening socket with a limit of peers: a new peer replaces the one that was silent longest.
 
-The servers of asyncio take every connection that comes, to the last descriptor of the process. They
-call ``accept`` of the socket that they are given, and here that socket counts. Peers that have sent
-nothing whole yet have their own room, so that however many of them come, they take no place from
-those that speak.
+asyncio's servers accept every connection, up to the last descriptor of the process. They call
+``accept`` of the given socket, and this socket counts. Peers that have not yet sent a whole message
+have a limit of their own, so that any number of them takes no place from those that have.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-_KEEPALIVE = (  # the kernel finds out within a minute that the other machine is gone
+_KEEPALIVE = (  # the kernel detects within a minute that the other machine is gone
     (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
     (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 30),
     (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
@@ -24,8 +23,8 @@ _KEEPALIVE = (  # the kernel finds out within a minute that the other machine is
 
 @dataclass
 class _Peer:
-    """A connection; ``since`` is when it last sent something whole or, if it never ``spoke``, when
-    it came, s. One that is ``kept`` may be silent for ever and is not counted."""
+    """A connection; ``since`` is the time of its last whole message or, if it never ``spoke``, of
+    its accept, s. A connection that is ``kept`` may be silent for ever and is not counted."""
 
     connection: socket.socket
     since: float
@@ -38,13 +37,13 @@ class Listener(socket.socket):
 
     Args:
         host, port: to listen at; the first address that the name stands for.
-        limit: connections that have not spoken yet, and as many that have; never more than a
+        limit: most connections that have not spoken yet, and as many that have; never more than a
             quarter of the descriptors that the process may have.
         half_open_s: how long a peer may take to send its first whole message.
         idle_s: how long a peer may be silent after a message.
 
     Raises:
-        OSError: the address is not to be had.
+        OSError: the address cannot be bound.
     """
 
     def __init__(self, host: str, port: int, limit: int, half_open_s: float, idle_s: float) -> None:
@@ -54,7 +53,7 @@ class Listener(socket.socket):
         super().__init__(family, kind, protocol)
         self._limit = min(limit, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
         self._silence_s = {False: half_open_s, True: idle_s}  # by ``spoke``
-        self._peers: dict[int, _Peer] = {}  # by descriptor, the most silent first
+        self._peers: dict[int, _Peer] = {}  # by descriptor, longest silent first
         try:
             self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self.bind(address)
@@ -64,11 +63,11 @@ class Listener(socket.socket):
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port on which it listens."""
         return int(self.getsockname()[1])
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection; ends the oldest that has not spoken yet if there are too many.
+        """Accept a connection; if too many have not spoken yet, close the oldest of them.
 
         Raises:
             OSError: there is none (BlockingIOError), or no descriptor for it.
@@ -82,8 +81,8 @@ class Listener(socket.socket):
         return connection, address
 
     def heard(self, number: int) -> None:
-        """The peer of this descriptor has sent something whole; ends the most silent one of those
-        that once did if there are too many."""
+        """Note that the peer of this descriptor sent a whole message; if too many peers have
+        spoken, close the one that was silent longest."""
         peer = self._peers.pop(number, None)
         if peer is not None:
             peer.since, first, peer.spoke = time.monotonic(), not peer.spoke, True
@@ -92,12 +91,12 @@ class Listener(socket.socket):
                 self._make_room(spoke=True)
 
     def keep(self, number: int, kept: bool = True) -> None:
-        """Keep the connection of this descriptor however silent it is, or no longer do so."""
+        """Exempt the connection of this descriptor from all limits, or no longer do so."""
         if number in self._peers:
             self._peers[number].kept = kept
 
     def reap(self) -> None:
-        """End the connections that have been silent for too long; to be called now and then."""
+        """Close the connections that have been silent too long; call this periodically."""
         now = time.monotonic()
         for number, peer in list(self._peers.items()):
             if not peer.kept and now - peer.since > self._silence_s[peer.spoke]:
@@ -109,9 +108,9 @@ class Listener(socket.socket):
             self._end(number)
 
     def _end(self, number: int) -> None:
-        """Both ways at once, so that its server sees the end of it and closes the descriptor."""
+        """Shut down both directions, so that its server sees EOF and closes the descriptor."""
         connection = self._peers.pop(number).connection
         try:
             connection.shutdown(socket.SHUT_RDWR)
-        except OSError:  # the peer or its server was first
+        except OSError:  # the peer or its server has closed it
             return

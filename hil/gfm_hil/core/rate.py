@@ -1,4 +1,4 @@
-"""How many commands one may give: a token bucket."""
+"""Rate limit of commands: a token bucket."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Rate:
         """Count one command.
 
         Raises:
-            UserError: it is one too many; nothing is to be done.
+            UserError: it exceeds the limit; the caller must not carry it out.
         """
         with self._lock:
             now = self._clock()

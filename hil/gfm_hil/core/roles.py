@@ -6,3 +6,6 @@ from typing import Literal
 
 Side = Literal["controller", "plant"]
 SIDES: tuple[Side, ...] = ("controller", "plant")
+
+#: what this project's own controller calls itself
+OUR_CONTROLLER = "gfmhil"

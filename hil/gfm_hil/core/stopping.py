@@ -1,4 +1,4 @@
-"""Being stopped: Ctrl-C and its kin as a flag, and ending together with the process above."""
+"""Stopping: Ctrl-C and similar signals set a flag; a process ends with its parent."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
 class Interrupt:
-    """Context in which Ctrl-C, SIGTERM and a closed terminal set ``came`` and nothing else.
+    """Context in which Ctrl-C, SIGTERM and a closed terminal only set ``came``.
 
-    A second signal raises KeyboardInterrupt: whoever insists need not wait for an orderly end.
+    A second signal raises KeyboardInterrupt, so that a user need not wait for an orderly end.
     """
 
     def __init__(self) -> None:
@@ -23,11 +23,11 @@ class Interrupt:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupt:
-        with contextlib.suppress(ValueError):  # not in the main thread: nothing to catch
+        with contextlib.suppress(ValueError):  # only the main thread can set handlers
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 before = signal.getsignal(number)
                 if number == signal.SIGHUP and before == signal.SIG_IGN:
-                    continue  # nohup means it
+                    continue  # nohup has set it
                 signal.signal(number, self._note)
                 self._before[number] = before
         return self
@@ -38,7 +38,7 @@ class Interrupt:
         self.came = True
 
     def ask(self) -> None:
-        """Stop in an orderly way, as one signal would; from any thread."""
+        """Request an orderly stop, as one signal does; from any thread."""
         self.came = True
 
     def __exit__(self, *_: object) -> None:
@@ -46,12 +46,12 @@ class Interrupt:
             signal.signal(number, before)
 
 
-def end_with_parent(parent: int | None = None) -> None:
-    """Have Linux send us SIGTERM when the parent is gone, even if it was killed.
+def end_with_parent(parent: int | None = None, number: signal.Signals = signal.SIGTERM) -> None:
+    """Have Linux send this process a signal when its parent is gone, even if it was killed.
 
-    ``parent`` is its process id, to see whether it is gone already.
+    ``parent`` is its process id, to check whether it has already ended.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
+        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, number)
         if parent not in (None, os.getppid()):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), number)

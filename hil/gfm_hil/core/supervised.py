@@ -1,4 +1,4 @@
-"""Work in the background that outlives its own exceptions: it is reported, and begins again."""
+"""Background work that survives its exceptions: they are reported, and the work restarts."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections.abc import Awaitable, Callable
 from gfm_hil.core.errors import UserError
 
 PAUSE_S = 1.0
-"""Between an exception and the next attempt: a lasting cause must not fill the log."""
+"""Pause between an exception and the next attempt: a lasting cause must not fill the log."""
 
 _LOG = logging.getLogger(__name__)
 
 
 async def supervised(name: str, work: Callable[[], Awaitable[None]]) -> None:
-    """Do the work until it ends by itself; one that ends by an exception begins again."""
+    """Run the work until it returns; after an exception start it again."""
     while True:
         try:
             return await work()
@@ -26,7 +26,7 @@ async def supervised(name: str, work: Callable[[], Awaitable[None]]) -> None:
 
 
 def attempt(name: str, work: Callable[[], None]) -> None:
-    """Do the work once; for loops that are no tasks. An exception is reported and paused after."""
+    """Run the work once, for loops that are not tasks; report an exception, then pause."""
     try:
         work()
     except Exception as problem:
@@ -35,7 +35,7 @@ def attempt(name: str, work: Callable[[], None]) -> None:
 
 
 def _report(name: str, problem: Exception) -> None:
-    """One line for what the machine lacks, a traceback for what must be a mistake of ours."""
+    """Log one line for an error of the machine, a traceback for what must be a bug of ours."""
     trace = None if isinstance(problem, (OSError, UserError)) else problem
     text = f"{name}: {problem or type(problem).__name__}; tried again in {PAUSE_S:g} s"
     _LOG.error(text, exc_info=trace)

@@ -1,9 +1,9 @@
-"""Folders that last as long as the processes that use them, and what killed processes have left.
+"""Temporary folders that exist while a process uses them, and those that killed processes left.
 
-A process that uses such a folder holds a shared lock on it, which the kernel takes back however the
-process ends. A folder that can be locked exclusively has been left. Only folders and files of our
-own user are locked, read or removed: another user of the machine may put anything beside them,
-under any name, and may hold a lock on whatever that user can open.
+A process that uses such a folder holds a shared lock on it, which the kernel releases however the
+process ends. If a folder can be locked exclusively, no process uses it any more. Only folders and
+files of our own user are locked, read or removed: another user may put anything beside them, under
+any name, and may hold a lock on any file that that user can open.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 
 
 def is_private(found: os.stat_result) -> bool:
-    """Whether something belongs to our user and no other user may do anything with it."""
+    """Whether a file or folder belongs to our user and no other user has any access to it."""
     return found.st_uid == os.geteuid() and not found.st_mode & 0o077
 
 
 def is_guarded(folder: os.stat_result) -> bool:
-    """Whether no other user (but root) can remove or replace what our user has in a folder."""
+    """Whether no other user (but root) can remove or replace our user's files in a folder."""
     if folder.st_uid not in (0, os.geteuid()):
         return False
     return not folder.st_mode & 0o022 or bool(folder.st_mode & stat.S_ISVTX)
@@ -41,10 +41,10 @@ def lock(handle: int, operation: int, patience_s: float = PATIENCE_S) -> None:
     Args:
         handle: file descriptor.
         operation: ``fcntl.LOCK_SH`` or ``fcntl.LOCK_EX``.
-        patience_s: how long another process may keep its own lock, s.
+        patience_s: how long to wait for another process's lock, s.
 
     Raises:
-        TimeoutError: it keeps it for longer.
+        TimeoutError: that process keeps its lock for longer.
     """
     give_up = time.monotonic() + patience_s
     while True:
@@ -59,10 +59,10 @@ def lock(handle: int, operation: int, patience_s: float = PATIENCE_S) -> None:
 
 
 def make(prefix: str, where: Path) -> tuple[Path, int]:
-    """A new folder in ``where`` and the hold on it, to be given to ``let_go``."""
+    """Make a folder in ``where``; returns it with a lock to pass to ``let_go``."""
     while True:
         place = Path(tempfile.mkdtemp(prefix=prefix, dir=where))
-        with contextlib.suppress(FileNotFoundError):  # it looked left before it was held: another
+        with contextlib.suppress(FileNotFoundError):  # removed before we locked it: try another
             return place, hold(place)
 
 
@@ -72,7 +72,7 @@ def hold(place: Path) -> int:
     Raises:
         FileNotFoundError: it is gone.
         PermissionError: it belongs to another user, or is open to others.
-        TimeoutError: a process that removes what was left keeps it locked.
+        TimeoutError: a process that removes unused folders keeps it locked.
     """
     handle = os.open(place, _FOLDER)
     try:
@@ -93,7 +93,7 @@ def let_go(handle: int) -> None:
 
 @contextlib.contextmanager
 def temporary(prefix: str) -> Iterator[Path]:
-    """A folder among the system's temporary ones, removed in the end; so are left ones."""
+    """A folder in the system's temporary folder, removed at the end; removes unused ones first."""
     where = Path(tempfile.gettempdir())
     for left, handle in left_behind(prefix, where):
         shutil.rmtree(left, ignore_errors=True)
@@ -110,7 +110,7 @@ def held(place: Path) -> bool:
     """Whether a process uses a folder.
 
     Raises:
-        OSError: it cannot be told, for example because there are no descriptors left.
+        OSError: it is unknown, for example because no descriptors are left.
     """
     try:
         handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
@@ -126,8 +126,8 @@ def held(place: Path) -> bool:
 
 
 def left_behind(prefix: str, where: Path) -> Iterator[tuple[Path, int]]:
-    """Folders of our user that no process uses any more, each with a hold that keeps others from
-    it. There are none in a folder where another user could replace them."""
+    """Folders of our user that no process uses any more, each with an exclusive lock. Yields none
+    if another user could replace them in ``where``."""
     parent = os.open(where, os.O_RDONLY | os.O_DIRECTORY)
     try:
         if not is_guarded(os.fstat(parent)):
@@ -153,7 +153,7 @@ def copy_files(names: list[str], source: int, target: int) -> None:
     """Copy regular files of our user from one open folder to another, readable by our user alone.
 
     Raises:
-        OSError: a file is not one of ours, or there is no room.
+        OSError: a file does not belong to our user, or there is no room.
     """
     for name in names:
         handle = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=source)

@@ -38,6 +38,7 @@ from gfm_hil.scenario.events import (
     Reset,
     apply_grid_event,
 )
+from gfm_runtime.errors import meant
 
 _LOOK_MS = 100
 _TAKEN_OVER_S = 5.0  # in lockstep a tick lasts until the other side answers
@@ -136,7 +137,7 @@ class CommandServer:
                     raise ValueError(f"{key} = {content[key]}: a command is carried out at once")
             return self._carry_out(self._checked({**content, "tick": 0}), by)
         except ValidationError as problem:
-            return {"ok": False, "error": "; ".join(lines(problem))}
+            return {"ok": False, "error": "; ".join(lines(problem, Event))}
         except (UserError, ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
         except Exception as problem:  # our own mistake must not end the server
@@ -155,7 +156,8 @@ class CommandServer:
             raise ValueError(f"type = {event.type!r}: for the {ours}, not the {self._side}")
         if isinstance(event, LawChange) and event.law not in self._bench.controller.sets:
             ready = sorted(self._bench.controller.sets)
-            raise ValueError(f"law = {event.law!r}: not made ready for this run; ready are {ready}")
+            known = f"ready are {ready}{meant(event.law, ready)}"
+            raise ValueError(f"law = {event.law!r}: not made ready for this run; {known}")
         c = self._bench.controller
         if isinstance(event, Gains):
             gains = {**c.gains, **event.values}

@@ -187,4 +187,6 @@ def _nothing(handle, message):
 class _Nowhere:
     """A link without a peer; enough to compile a loop, which is the same for all links."""
 
-    port = Port(np.zeros(1, np.int64), _nothing, _nothing, 0)
+    @property
+    def port(self) -> Port:
+        return Port(np.zeros(1, np.int64), _nothing, _nothing, 0)

@@ -1,16 +1,22 @@
-"""The start: both sides show what they are about to run, and refuse what does not fit.
+"""The start: each side says what it is about to run, and refuses a peer that runs something else.
 
-Plant: HELLO every 100 ms until answered. Controller: HELLO back. Plant: START with the time of
-tick 0. Messages are JSON; frames begin only after START. The plant sends START once. If the
-link loses it, the first frame that arrives tells the controller when tick 0 was.
+The plant sends HELLO every 100 ms until the controller answers with a HELLO of its own. Then the
+plant sends START with the time of tick 0. Messages are JSON, and frames begin only after START.
+The plant sends START once: if the link loses it, the controller takes the time of tick 0 from the
+plant's first frame.
 
-A side refuses and counts a malformed greeting, and goes on waiting. It shows what a peer said only
+The plant's HELLO carries a number that it draws for this run, by which the recordings of both sides
+are put together later. The controller's HELLO may carry a name, so that a report can say who
+controlled.
+
+A side refuses and counts a malformed greeting, and goes on waiting. It shows a peer's text only
 escaped and cut.
 """
 
 from __future__ import annotations
 
 import json
+import secrets
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import PeerLost, lines
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import OUR_CONTROLLER, Side
 from gfm_hil.engine.waiting import await_message
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
@@ -31,12 +37,12 @@ from gfm_runtime.signals import NY, TABLE_VERSION, table_hash
 
 _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
-_AGAIN_NS = 2_000_000_000  # after which a link that can do so connects again
+_AGAIN_NS = 2_000_000_000  # after which a link that knows how reaches out anew
 _LEAD_NS = 20_000_000  # from START to tick 0
 _MOST_LEAD_NS = 10_000_000_000  # of a plant that is not ours
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux; CLOCK_MONOTONIC counts from that boot
 
-#: what both sides must have in common, in the order of checking, and its name in words
+#: what both sides must have in common, in the order of comparison, and its name in words
 _MUST_FIT = {
     "version": "version of the signal table",
     "table": "signal table",
@@ -49,10 +55,12 @@ Notice = Callable[[str], None]
 
 
 _Text = Annotated[str, Field(max_length=100)]
+_Name = Annotated[str, Field(pattern="^[!-~]([ -~]{0,62}[!-~])?$")]  # printable ASCII
+_RunId = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
 
 
 class _Greeting(BaseModel):
-    """A foreign controller may send more fields than ours; they are ignored."""
+    """A foreign controller may send more fields than these; this side ignores them."""
 
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -66,6 +74,8 @@ class _Hello(_Greeting):
     T_s: float = Field(gt=0.0)
     laws: _Text
     digest: _Text
+    run: _RunId | None = None  # of the plant
+    name: _Name | None = None  # of the controller
 
 
 class _Go(_Greeting):
@@ -83,26 +93,31 @@ class Start:
     """What both sides agreed on.
 
     Attributes:
-        t0_ns: time of tick 0 on our own CLOCK_MONOTONIC. If the other side has another clock, the
-            controller's value is late by the travel time of START.
+        t0_ns: time of tick 0 by our own CLOCK_MONOTONIC; where the other side has another one,
+            the controller's is late by the time that START took to come.
         one_clock: both sides run on one machine.
         refused: how many malformed greetings came.
+        run: the number that the plant has drawn for this run, 16 hexadecimal digits; None if a
+            foreign plant sent none.
+        controller: what the controller calls itself; None if it did not say.
     """
 
     t0_ns: int
     one_clock: bool
     refused: int
+    run: str | None
+    controller: str | None
 
 
 class _Refused(Exception):
-    """A malformed greeting; says what is wrong with it."""
+    """A greeting that cannot be one; says why."""
 
 
 class _Heard:
-    """Counts what came over a link other than a good greeting.
+    """What came over a link that is no good greeting.
 
     Attributes:
-        refused: malformed messages that begin as a greeting does.
+        refused: messages that begin as a greeting does.
     """
 
     def __init__(self, link: Link) -> None:
@@ -114,7 +129,7 @@ class _Heard:
         self.refused, self._why = self.refused + 1, str(why)
 
     def no_greeting(self) -> None:
-        """Count a message that does not begin as a greeting."""
+        """Count a message that does not even begin as one."""
         self._others += 1
 
     def __str__(self) -> str:
@@ -130,8 +145,8 @@ def shake_hands(
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
 
-    Calls ``notice`` within a second, and then every five, with what it waits for and what came
-    instead.
+    ``notice`` is told, within a second and then every five, that the other side is awaited, and
+    what came instead.
 
     Raises:
         PeerLost: no good greeting came within ``link.start_timeout_s``, or the other side runs
@@ -139,6 +154,11 @@ def shake_hands(
     """
     boot = _boot()
     mine = {"side": side, "boot": boot, **_what_runs(scenario)}
+    if side == "plant":
+        mine["run"] = secrets.token_hex(8)
+    else:
+        mine["name"] = OUR_CONTROLLER
+    run, controller = mine.get("run"), mine.get("name")
     begin = time.monotonic_ns()
     deadline = begin + int(scenario.link.start_timeout_s * 1e9)
     say_at, again_at = begin + 500_000_000, begin + _AGAIN_NS
@@ -146,6 +166,10 @@ def shake_hands(
     met = one_clock = False
     answered = -_REPEAT_NS
     heard = _Heard(link)
+
+    def agreed(t0_ns: int) -> Start:
+        return Start(t0_ns, one_clock, heard.refused, run, controller)
+
     while not stopped():
         if side == "plant":
             link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
@@ -154,29 +178,34 @@ def shake_hands(
         try:
             greeting = None if message is None else _read(message)
             if isinstance(greeting, _Hello):
-                # answer first, so that both sides see a misfit, and once for all queued greetings
+                # Answer before comparing, so that both sides see a misfit, and answer once for
+                # all the greetings that had piled up.
                 if side == "controller" and now - answered >= _REPEAT_NS:
                     answered = now
                     link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
                 _compare(mine, greeting)
                 one_clock = bool(boot) and greeting.boot == boot
-                if not met:  # the peer is there: from now on its silence is a fault
+                if side == "plant":
+                    controller = greeting.name
+                else:
+                    run = greeting.run
+                if not met:  # from here on silence means that the other side is gone
                     met, deadline = True, now + int(scenario.link.peer_timeout_s * 1e9)
                 if side == "plant":
                     start = now + _LEAD_NS
                     go: dict[str, Any] = {"kind": "start", "t0": start}
                     link.send(_PREFIX + json.dumps(go).encode())
-                    return Start(start, one_clock, heard.refused)
+                    return agreed(start)
             elif isinstance(greeting, _Go) and met:
                 if not one_clock:
-                    return Start(now + _LEAD_NS, one_clock, heard.refused)
+                    return agreed(now + _LEAD_NS)
                 _check_time(greeting.t0, begin, now)
-                return Start(greeting.t0, one_clock, heard.refused)
+                return agreed(greeting.t0)
             elif message is not None and greeting is None:
                 tick = _tick(message, scenario) if met else None
-                if tick is not None:  # the plant runs already: START was lost
+                if tick is not None:  # it runs: START was lost
                     t0 = now - round(tick * scenario.T_s * 1e9)
-                    return Start(t0, one_clock, heard.refused)
+                    return agreed(t0)
                 heard.no_greeting()
         except _Refused as problem:
             heard.refuse(problem)
@@ -199,7 +228,7 @@ def shake_hands(
 
 
 def _nothing() -> None:
-    """Stands in for a method that a link does not have."""
+    """Of a link that has no second way, or cannot know whether a peer is there."""
 
 
 def _what_runs(scenario: Scenario) -> dict[str, Any]:
@@ -229,10 +258,10 @@ def _tick(message: bytes, scenario: Scenario) -> int | None:
 
 
 def _read(message: bytes) -> _Hello | _Go | None:
-    """The greeting in a message; None if the message does not begin as a greeting.
+    """The greeting in a message; None if it does not begin as one.
 
     Raises:
-        _Refused: it begins as one and is malformed.
+        _Refused: it begins as one, but is none.
     """
     if message[: len(_PREFIX)] != _PREFIX[: len(message)]:
         return None
@@ -245,7 +274,7 @@ def _read(message: bytes) -> _Hello | _Go | None:
 
 
 def _check_time(t0: int, begin: int, now: int) -> None:
-    """Check that tick 0 is neither before this side's greeting nor far away.
+    """See that tick 0 is neither before this side asked for it nor far away.
 
     Raises:
         _Refused: it is.

@@ -24,7 +24,7 @@ from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.links import Link, open_link
+from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.realtime.prevent_idle import kept_awake
@@ -143,7 +143,8 @@ def _meet_and_run(
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link in several frames a message
     faults = {**reader.faults, **counted, "refused_greetings": start.refused}
-    return {"faults": faults, "e2e": reader.e2e, "one_clock": start.one_clock, **injected}
+    met = {"one_clock": start.one_clock, "run": start.run, "controller": start.controller}
+    return {"faults": faults, "e2e": reader.e2e, **met, **injected}
 
 
 def compile_side(side: Side, bench: Bench, part: Part) -> None:
@@ -159,6 +160,7 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
         reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
         reader.judge(False, False)
     compile_loops(side, bench, part)
+    pump.warm_up()
     if side == "plant":
         record_sample(part.signals[0].copy(), y, par, st)
         record_command(part.signals[0].copy(), u)

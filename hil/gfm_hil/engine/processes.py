@@ -16,8 +16,6 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.process import compile_side
-from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import link_kind
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.recorder import Part, keep_in_memory
@@ -61,9 +59,6 @@ class Processes:
         Raises:
             UserError: a side refused to start, for example because the endpoint is occupied.
         """
-        self._compile_once()
-        if self.interrupt.came:
-            return time.monotonic(), self._interrupted
         with contextlib.ExitStack() as stack:
             endpoint = self.scenario.link.endpoint
             if endpoint is None:  # a Unix socket's path may hold 107 bytes, so not the run folder
@@ -86,14 +81,6 @@ class Processes:
     @property
     def _interrupted(self) -> Outcome:
         return Outcome("interrupted", "stopped by the operator", 0)
-
-    def _compile_once(self) -> None:
-        """Fill numba's cache first, so that the two processes do not compile the same code."""
-        self.notice("compiling the kernels (once a machine) …")
-        bench = make_bench(self.scenario)
-        with scratch.temporary("gfmhil-run-") as place:
-            for side in ("plant",) if self.controller_command else SIDES:
-                compile_side(side, bench, Part.create(place, side, 1))
 
     def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
         folder = self.folder.absolute()  # a name such as "--" must not look like an option

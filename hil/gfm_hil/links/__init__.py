@@ -1,4 +1,4 @@
-"""Links: how frames get from one process to the other. One folder a link, one interface."""
+"""Links carry frames between the two processes: one folder per link, one interface."""
 
 from gfm_hil.links.base import Link, LinkKind, LinkOptions
 from gfm_hil.links.port import Port, port_function

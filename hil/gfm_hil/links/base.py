@@ -1,4 +1,4 @@
-"""The interface of a link: whole messages, never blocking for longer than told."""
+"""The interface of a link: it carries whole messages and never blocks past the given timeout."""
 
 from __future__ import annotations
 
@@ -13,50 +13,54 @@ from pydantic import BaseModel, ConfigDict
 from gfm_hil.core.roles import Side
 from gfm_hil.links.port import Port
 
-LONGEST = 504  # bytes of a message that every link carries, be it a frame or a greeting
+LONGEST = 504  # bytes: every link carries a message, frame or greeting, up to this length
 
 
 class Link(Protocol):
     """One side's end of a link to exactly one peer.
 
-    A message is delivered whole or not at all, and in order. Nothing is queued without bound:
-    a message that the peer has no room for is dropped, and ``send`` says so.
+    The link delivers a message whole or not at all, and in order. Its queues are bounded: it drops
+    a message that the peer has no room for, and ``send`` returns False.
 
-    A link may have more methods. The handshake calls ``again()``, which reaches out anew to a peer
-    that has not come, and ``connected()``, which says whether a peer is at the other end, with None
-    where the link cannot know it. The loop calls ``start()`` before its first tick and ``stop()``
-    after its last message.
+    A link may have more methods. The handshake calls ``again()``, which retries the connection
+    while the peer has not come, and ``connected()``, which returns whether a peer is at the other
+    end, or None if the link cannot know. The loop calls ``start()`` before its first tick and
+    ``stop()`` after its last message.
     """
 
     @property
     def port(self) -> Port | None:
-        """The same end for the compiled loops, or None: a thread then pumps its messages."""
+        """The same end for the compiled loops; if it is None, a thread pumps the messages."""
 
     def send(self, message: bytes) -> bool:
-        """Hand a message over; False if it had to be dropped."""
+        """Send a message; False if the link dropped it."""
 
     def receive(self) -> bytes | None:
         """The next message, or None if none has arrived. Never blocks."""
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a message has arrived (True) or the time is over (False)."""
+        """Sleep until a message has arrived (True) or the timeout has expired (False)."""
 
     def close(self) -> None:
-        """Let go of everything; what was sent last gets a fraction of a second to leave."""
+        """Free all resources; the last messages get a fraction of a second to be sent."""
 
 
 class LinkOptions(BaseModel):
-    """Base of a link's own options, the table ``link.options`` of a scenario."""
+    """Base class of a link's own options, the table ``link.options`` of a scenario."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 def _fits(options: Any, T_s: float) -> None:
-    """Any options at any sampling time."""
+    """Accept any options at any sampling time."""
 
 
 def _may(endpoint: str | None, options: Any) -> None:
-    """Any endpoint with any options."""
+    """Accept any endpoint with any options."""
+
+
+def _nothing(options: Any) -> None:
+    """A link that compiles nothing."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +70,16 @@ class LinkKind:
     Attributes:
         name: as in ``link.type``.
         text: what it is, in a few words.
-        pattern, form: what an endpoint must match, and the same in words.
-        fresh: an endpoint for a run of our own, given a new empty folder of short path.
-        open: opens the end of a side at an endpoint with checked options. Heavy imports belong
-            in there. Raises ``UserError`` where the endpoint is not to be had.
+        pattern, form: the regular expression that an endpoint must match, and the same in words.
+        fresh: makes an endpoint for a new run, given a new empty folder with a short path.
+        open: opens one side's end at an endpoint with checked options. Heavy imports belong
+            in there. Raises ``UserError`` if it cannot use the endpoint.
         options: model of ``link.options``.
-        check: sees that options fit the sampling time in s; raises ValueError in one line.
-        check_both: sees that an endpoint (None: a fresh one) may be used with options; raises
-            ValueError likewise.
-        exact: float64 arrives as sent, so that results are those of a run in process.
+        check: checks the options against the sampling time in s; raises ValueError in one line.
+        check_both: checks that an endpoint (None: a fresh one) may be used with the options;
+            raises ValueError likewise.
+        warm_up: compiles, or loads from numba's cache, what an end with these options calls.
+        exact: float64 values arrive as sent, so that results equal those of a run in process.
     """
 
     name: str
@@ -86,9 +91,10 @@ class LinkKind:
     options: type[LinkOptions] = LinkOptions
     check: Callable[[Any, float], None] = _fits
     check_both: Callable[[str | None, Any], None] = _may
+    warm_up: Callable[[Any], None] = _nothing
     exact: bool = True
 
     def check_endpoint(self, endpoint: str) -> None:
-        """Raises ValueError if it is not of this link's form."""
+        """Raise ValueError if the endpoint does not have this link's form."""
         if re.fullmatch(self.pattern, endpoint) is None:
             raise ValueError(f"endpoint = {endpoint!r}: must be {self.form}")

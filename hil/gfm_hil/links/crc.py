@@ -1,8 +1,8 @@
 """CRC-32 of a frame, compiled: that of zlib and Ethernet (reflected polynomial 0xEDB88320).
 
-Where the processor multiplies without carries (PCLMULQDQ), 16 bytes are folded onto the next 16
+If the processor has a carry-less multiplication (PCLMULQDQ), 16 bytes are folded onto the next 16
 until 16 are left (V. Gopal et al., "Fast CRC Computation for Generic Polynomials Using PCLMULQDQ
-Instruction", Intel, 2009); those, and all bytes elsewhere, go through tables.
+Instruction", Intel, 2009); tables process those 16, and all bytes on other processors.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _AT_ONCE = 16  # bytes
 _ONES = np.uint32(0xFFFFFFFF)
 _HALF = np.uint64(32)
 
-# what the first and the second 8 bytes are multiplied by to stand 16 further on: x^(128+32) and
-# x^(128-32) modulo the polynomial, reflected
+# factors that move the first and the second 8 bytes 16 bytes ahead: x^(128+32) and x^(128-32)
+# modulo the polynomial, reflected
 _FIRST, _SECOND = np.uint64(0x1_7519_97D0), np.uint64(0x0_CCAA_009E)
 
 
 def _tables() -> np.ndarray:
-    """Tables of the reflected polynomial: what a byte becomes that 0, 1, … bytes follow."""
+    """Tables of the reflected polynomial: remainder of a byte followed by 0, 1, … zero bytes."""
     tables = np.zeros((_AT_ONCE, 256), np.uint32)
     for byte in range(256):
         crc = byte
@@ -43,7 +43,7 @@ _T = _tables()
 
 
 def _make_load(bits: int, kind: types.Integer) -> Any:
-    """An intrinsic that reads a little-endian number of so many bits at an address."""
+    """An intrinsic that reads a little-endian number of ``bits`` bits at an address."""
 
     def load(typingctx, address):
         def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -60,7 +60,7 @@ _load32, _load64 = _make_load(32, types.uint32), _make_load(64, types.uint64)
 
 @intrinsic
 def _fold(typingctx, low, high, next_low, next_high):
-    """Two words, multiplied without carries to where the next two stand, added to those."""
+    """Fold two words onto the next two by carry-less multiplication, and add (XOR)."""
     word = types.uint64
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -88,7 +88,7 @@ def _fold(typingctx, low, high, next_low, next_high):
 
 @inlined
 def _four(word, after):
-    """What four bytes become that ``after`` more of the same step follow."""
+    """Remainder of four bytes followed by ``after`` more bytes of the same step."""
     return (
         _T[after + 3, word & 0xFF]
         ^ _T[after + 2, (word >> np.uint32(8)) & 0xFF]
@@ -104,7 +104,7 @@ def crc32_by_tables(message, count):
     at = message.ctypes.data
     k = 0
     while k + _AT_ONCE <= count:
-        # what does not wait for the step before comes first
+        # first the terms that do not depend on the previous step's CRC
         later = _four(_load32(at + k + 12), 0) ^ _four(_load32(at + k + 8), 4)
         later ^= _four(_load32(at + k + 4), 8)
         crc = later ^ _four(crc ^ _load32(at + k), 12)
@@ -120,11 +120,11 @@ def crc32_by_tables(message, count):
 
 @inlined
 def crc32_by_folding(message, count):
-    """The same for 12, 28, 44, … bytes, as both frames have; others go through the tables."""
+    """The same for 12, 28, 44, … bytes, the lengths of our frames; others go through the tables."""
     if count % _AT_ONCE != 12:
         return crc32_by_tables(message, count)
     at = message.ctypes.data
-    # four zeros before it do not change the remainder: 16 whole bytes to begin with
+    # four leading zero bytes do not change the remainder and make the first block 16 bytes
     low, high = np.uint64(_load32(at) ^ _ONES) << _HALF, _load64(at + 4)
     k = 12
     while k < count:
@@ -134,5 +134,5 @@ def crc32_by_folding(message, count):
     return crc ^ _four(np.uint32(high), 4) ^ _four(np.uint32(high >> _HALF), 0) ^ _ONES
 
 
-#: what the frames use; numba compiles, and caches, for the processor at hand
+#: the variant for this processor; numba's cache is per processor too
 crc32: Any = crc32_by_folding if binding.get_host_cpu_features().get("pclmul") else crc32_by_tables

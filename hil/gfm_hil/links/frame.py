@@ -1,6 +1,6 @@
-"""Packing and checking frames, compiled: the one implementation that both kinds of loop use.
+"""Packing and checking frames, compiled: Python and the compiled loops use the same functions.
 
-The layout is ``gfm_hil.links.frame.frame_dtype``.
+``frame_dtype`` gives the layout.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ FAULTS: tuple[Fault, ...] = (
 ) = range(len(FAULTS))  # fmt: skip
 
 #: the state of the end-to-end protection (E2E): no good frame yet; good frames with newer ticks
-#: come; for too long none came
+#: arrive; none arrived for too long
 E2E = ("initial", "valid", "invalid")
 INITIAL, VALID, INVALID = range(len(E2E))
 
-#: what a reader knows, and the limits within which it accepts a frame
+#: the state of a reader, and the limits within which it accepts a frame
 reader_dtype = np.dtype(
     [
         ("faults", "i8", (len(FAULTS),)),
-        ("fault", "i8"),  # of the frame last refused
+        ("fault", "i8"),  # of the last refused frame
         ("e2e", "i8"),
         ("next", "i8"),  # sequence expected
         ("tick", "i8"),  # of the last good frame, -1 before the first
-        ("repeats", "i8"),  # how often that tick came again
+        ("repeats", "i8"),  # how often that tick was repeated
         ("state", "i8"),
         ("reason", "i8"),
         # the limits
-        ("newest", "i8"),  # the highest tick that a peer which runs can be at
+        ("newest", "i8"),  # highest tick that a running peer can have reached
         ("behind", "i8"),  # how many ticks below ``newest`` its frame may be
         ("delta", "i8"),  # how many ticks it may advance from one good frame to the next
         ("jump", "i8"),  # how many frames in a row may be missing
-        ("again", "i8"),  # how often it may send one tick again
-        ("leaving", "i8"),  # the lowest state by which the peer says that it leaves
+        ("again", "i8"),  # how often it may repeat a tick
+        ("leaving", "i8"),  # lowest state that says that the peer leaves
     ],
     align=True,
 )
@@ -74,19 +74,19 @@ _HEADER = (
 
 
 def wire_dtype(count: int) -> np.dtype:
-    """A frame of ``count`` values as it travels."""
+    """The layout of a frame of ``count`` values on the link."""
     return np.dtype([*_HEADER, ("values", "<f8", (count,)), ("crc", "<u4")])
 
 
 def buffer(count: int, data_id: int) -> tuple[np.ndarray, np.ndarray]:
-    """A frame of our own: one record of ``wire_dtype`` and the same memory as bytes."""
+    """Memory for one frame: a record of ``wire_dtype``, and the same memory as bytes."""
     frame = np.zeros(1, wire_dtype(count))
     frame["magic"], frame["version"], frame["data_id"] = MAGIC, TABLE_VERSION, data_id
     return frame, frame.view(np.uint8)
 
 
 def make_reader() -> np.ndarray:
-    """A reader that has seen nothing yet and limits neither ticks nor missing frames."""
+    """A reader in its initial state that limits neither ticks nor missing frames."""
     reader = np.zeros(1, reader_dtype)
     reader["tick"], reader["leaving"] = -1, SAFE
     for limit in ("newest", "behind", "delta", "again"):
@@ -97,17 +97,17 @@ def make_reader() -> np.ndarray:
 
 @inlined
 def pack(sequence, frame, message, tick, state, reason, values):
-    """Fill a frame and count its sequence on.
+    """Fill a frame and increment the sequence counter.
 
     Args:
-        sequence: of this frame, shape (1,), int64.
+        sequence: counter with the number of this frame, shape (1,), int64.
         frame, message: a buffer as one record of ``wire_dtype`` and as bytes; magic, version and
             data id are set.
         tick, state, reason: of the sender.
         values: p.u., in the order of the signal table.
     """
     f = frame[0]
-    if f.state != state or f.reason != reason:  # a store just before the CRC reads it holds that up
+    if f.state != state or f.reason != reason:  # a store right before the CRC's load stalls it
         f.state, f.reason = state, reason
     f.tick = tick
     f.sequence = sequence[0]
@@ -121,15 +121,15 @@ def pack(sequence, frame, message, tick, state, reason, values):
 def unpack(reader, data_id, frame, message, size, values):
     """Check a frame and take its values.
 
-    A refused frame leaves all but the counters of the reader as it was. The tick of a good frame
-    never goes back. A peer that leaves says so under its last tick or the next one, however far
-    the reader has gone on since.
+    A refused frame changes nothing but the reader's counters. The tick of a good frame never goes
+    back. A peer that leaves says so with its last tick or the next one, however far the reader has
+    advanced since.
 
     Args:
         reader: one-element array of ``reader_dtype``.
-        data_id: the frame's that is expected.
-        frame, message: a buffer as one record of ``wire_dtype`` and as bytes; ``size`` were
-            received, which may be more than it holds.
+        data_id: of the expected frame.
+        frame, message: a buffer as one record of ``wire_dtype`` and as bytes.
+        size: bytes received, which may be more than the buffer holds.
         values: written only if the frame is good.
 
     Returns:
@@ -175,7 +175,7 @@ def unpack(reader, data_id, frame, message, size, values):
 
 @inlined
 def _implausible(r, tick, leaves):
-    """Whether the peer cannot be at that tick; one of 2**63 or more arrives here as negative."""
+    """Whether the peer cannot be at that tick; a tick of 2**63 or more is negative here."""
     if tick < 0 or tick < r.tick or tick - max(r.tick, 0) > r.delta:
         return True
     if leaves:
@@ -187,13 +187,12 @@ def _implausible(r, tick, leaves):
 
 @inlined
 def judge(reader, overdue, latched):
-    """Move the E2E state on, apart from what ``unpack`` does when a frame comes.
+    """Update the E2E state between frames; ``unpack`` updates it when a frame arrives.
 
     Args:
         reader: one-element array of ``reader_dtype``.
-        overdue: no newer good frame came for longer than the caller allows.
-        latched: the caller is in its safe state, or tripped; only a reset ends that, and with it
-            INVALID.
+        overdue: no newer good frame has arrived for longer than the caller allows.
+        latched: the caller is in its safe state, or tripped; INVALID then stays until a reset.
     """
     if overdue:
         reader[0].e2e = INVALID
@@ -205,13 +204,13 @@ if TYPE_CHECKING:
     from gfm_hil.core.roles import Side
     from gfm_hil.scenario.model import Scenario
 
-LAST_TIMES = 3  # how often a side sends the frame by which it leaves
+LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
 
 DATA_IDS: dict[Group, int] = {"y": 1, "u": 2}
 
 
 class FrameError(ValueError):
-    """A frame that must not be used; ``fault`` says which check it failed."""
+    """A frame that must not be used; ``fault`` names the check that it failed."""
 
     def __init__(self, fault: Fault) -> None:
         super().__init__(fault)
@@ -219,14 +218,14 @@ class FrameError(ValueError):
 
 
 def frame_dtype(group: Group) -> np.dtype:
-    """The layout as a NumPy record with a field a signal, for tools that read recorded frames."""
+    """The layout as a NumPy record with one field per signal, for tools that read recordings."""
     wire = wire_dtype(len(names(group)))
     fields = [(name, wire[name]) for name in wire.names or () if name not in ("values", "crc")]
     return np.dtype([*fields, *((name, "<f8") for name in names(group)), ("crc", "<u4")])
 
 
 class FrameWriter:
-    """Packs one side's vector; counts its own sequence.
+    """Packs one side's vector and keeps its sequence counter.
 
     Args:
         group: ``"y"`` or ``"u"``.
@@ -245,10 +244,10 @@ class FrameWriter:
 class FrameReader:
     """Unpacks the other side's vector and counts every frame that fails a check, by its fault.
 
-    A gap in the sequence is counted as that many ``lost`` frames, and the frame is used; a frame
-    that is not newer than the last is ``repeated`` or ``out_of_sequence`` and is refused. A frame
-    whose tick the sender cannot be at is refused as ``tick``, one whose state or reason byte has
-    no meaning as ``state``.
+    The reader counts a gap in the sequence as that many ``lost`` frames and uses the frame. It
+    refuses a frame that is not newer than the last as ``repeated`` or ``out_of_sequence``, a frame
+    whose tick the sender cannot be at as ``tick``, and one with an undefined state or reason byte
+    as ``state``.
 
     Args:
         group: ``"y"`` or ``"u"``. Without ``of``, the reader limits neither the tick nor the gap.
@@ -258,7 +257,7 @@ class FrameReader:
     def of(cls, side: Side, scenario: Scenario) -> FrameReader:
         """The reader of one side, with the limits that its scenario sets.
 
-        A gap of more ticks than ``link.peer_timeout_s`` has is that of a peer that is gone. The
+        A gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone. The
         plant's loop writes its own tick into ``newest`` at every tick.
         """
         reader, link = cls("u" if side == "plant" else "y"), scenario.link
@@ -303,7 +302,7 @@ class FrameReader:
 
     @property
     def left(self) -> bool:
-        """The last good frame said that its sender leaves."""
+        """Whether the last good frame said that its sender leaves."""
         return bool(self.record["state"][0] >= self.record["leaving"][0])
 
     @property
@@ -312,14 +311,15 @@ class FrameReader:
         return E2E[int(self.record["e2e"][0])]
 
     def judge(self, overdue: bool, latched: bool) -> None:
-        """Move the E2E state on; see ``gfm_hil.links.frame.judge``."""
+        """Update the E2E state; see ``gfm_hil.links.frame.judge``."""
         judge(self.record, bool(overdue), bool(latched))
 
     def unpack(self, message: bytes, values: NDArray[np.float64]) -> int:
         """Write the values of a good frame into ``values``; returns its tick.
 
         Raises:
-            FrameError: the frame failed a check, was counted, and ``values`` is unchanged.
+            FrameError: the frame failed a check; the reader has counted it, and ``values`` is
+                unchanged.
         """
         size = len(message)
         if size == len(self.message):

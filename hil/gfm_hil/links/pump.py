@@ -1,4 +1,4 @@
-"""Makes a link that has only Python methods fit for the compiled loops: a thread pumps messages.
+"""Connects a link that has only Python methods to the compiled loops: a thread pumps messages.
 
 The compiled loop writes to and reads from two rings in this process's memory. The thread owns the
 link: it takes what the loop sends from one ring and puts what arrives into the other.
@@ -16,18 +16,18 @@ from gfm_hil.links import ring
 from gfm_hil.links.base import LONGEST, Link
 from gfm_hil.links.port import Port, free_port_function
 
-_LOST = ring.HANDLE  # one word more than a ring's handle has: not 0 once the link is gone
-_HEADS = 128  # bytes from one head to the next: processors fetch lines in pairs
+_LOST = ring.HANDLE  # an additional word after a ring's handle: not 0 once the link is lost
+_HEADS = 128  # bytes from one head to the next: processors fetch cache lines in pairs
 _YIELDS_NS = 10_000_000  # the thread yields for this long after a message, then it sleeps
 _SLEEP_S = 1e-3
-_FAREWELL_S = 0.5  # at most, for what the loop sent last
+_FAREWELL_S = 0.5  # most time to send the loop's last messages
 
 
 class PumpedLink:
-    """A link with a port around one without; implements ``gfm_hil.links.Link``.
+    """Wraps a link without a port and gives it one; implements ``gfm_hil.links.Link``.
 
-    The thread owns the link from ``start`` to ``stop``; before, as in the handshake, and after,
-    the link may be called directly.
+    The thread owns the link from ``start`` to ``stop``; before (in the handshake) and after, the
+    link may be called directly.
 
     Args:
         link: an end that has no port.
@@ -49,23 +49,23 @@ class PumpedLink:
         self._thread = threading.Thread(target=self._run, name="pump", daemon=True)
 
     def start(self) -> None:
-        """Begin to move messages."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread once it has handed over what the loop sent last."""
+        """Stop the thread once it has sent the loop's last messages."""
         self._stopping.set()
         self._thread.join()
 
     def send(self, message: bytes) -> bool:
-        """Hand a message to the thread; False if the ring is full."""
+        """Pass a message to the thread; False if the ring is full."""
         return bool(ring.put(self._loop, np.frombuffer(bytearray(message), np.uint8)))
 
     def receive(self) -> bytes | None:
         """The next message, or None.
 
         Raises:
-            PeerLost, UserError: as the link did in the thread.
+            PeerLost, UserError: the link raised it in the thread.
         """
         size = ring.take(self._loop, self._message)
         if size == 0 and self._problem is not None:
@@ -73,7 +73,7 @@ class PumpedLink:
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until the thread has brought a message (True) or the time is over (False)."""
+        """Sleep until the thread has received a message (True) or the timeout expires (False)."""
         until = time.monotonic() + seconds
         while not ring.waiting(self._loop):
             if time.monotonic() >= until or self._problem is not None:
@@ -82,13 +82,13 @@ class PumpedLink:
         return True
 
     def close(self) -> None:
-        """Close the link underneath."""
+        """Close the wrapped link."""
         self._link.close()
 
     def _run(self) -> None:
         try:
             self._move()
-        except Exception as problem:  # ``receive`` raises it where somebody sees it
+        except Exception as problem:  # ``receive`` raises it in the caller's thread
             self._problem = problem
             self._loop[_LOST] = 1
 
@@ -100,7 +100,7 @@ class PumpedLink:
             if size:
                 link.send(message[:size].tobytes())
             came = link.receive()
-            if came is not None and len(came) <= LONGEST:  # as over shm: a longer one is no frame
+            if came is not None and len(came) <= LONGEST:  # as over shm: drop a longer message
                 ring.put(handle, np.frombuffer(bytearray(came), np.uint8))
             now = time.monotonic_ns()
             if size or came is not None:
@@ -115,8 +115,14 @@ class PumpedLink:
                 give_up = min(give_up, time.monotonic() + _FAREWELL_S)
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) what the loop and the thread call."""
+    ring.warm_up()
+    Port(np.zeros(_LOST + 1, np.int64), ring.port_send, _receive, 0)
+
+
 def ported(link: Link) -> Link:
-    """The link itself, or a pumped one around it if it has no port."""
+    """The link itself, or a ``PumpedLink`` around it if it has no port."""
     return link if link.port is not None else PumpedLink(link)
 
 

@@ -1,7 +1,7 @@
 """Links by name: ours, and those that other packages register.
 
-A package adds a link by an entry point of the group ``gfmhil.links`` whose name is that of the
-link and which is a ``LinkKind``.
+A package adds a link by an entry point of the group ``gfmhil.links`` that has the link's name and
+loads a ``LinkKind``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _OURS = {"can": "gfm_hil.links.can", "shm": "gfm_hil.links.shm", "zmq": "gfm_hil
 
 
 def link_names() -> list[str]:
-    """Names of all links there are."""
+    """Names of all available links."""
     return sorted({*_OURS, *(point.name for point in entry_points(group=GROUP))})
 
 
@@ -30,14 +30,14 @@ def link_kind(name: str) -> LinkKind:
     """The link of that name.
 
     Raises:
-        ValueError: there is none, or a foreign one cannot be loaded.
+        ValueError: there is none, or a package's link cannot be loaded.
     """
     if name in _OURS:
         return import_module(_OURS[name]).KIND
     for point in entry_points(group=GROUP, name=name):
         try:
             kind = point.load()
-        except Exception as problem:  # whatever a foreign module may raise
+        except Exception as problem:  # a foreign module may raise anything
             raise ValueError(f"link {name!r}: {point.value} cannot be loaded: {problem}") from None
         if not isinstance(kind, LinkKind):
             raise ValueError(f"link {name!r}: {point.value} is not a LinkKind")
@@ -49,7 +49,7 @@ def open_link(name: str, side: Side, endpoint: str, options: dict[str, Any] | No
     """Open one end of the link of that name.
 
     Raises:
-        UserError: an unknown name, or what the link's factory raises.
+        UserError: the name, the endpoint or the options are wrong, or the link cannot be opened.
     """
     try:
         kind = link_kind(name)

@@ -1,23 +1,23 @@
 """A ring of messages between one writer and one reader, both compiled.
 
-A slot is a word, the stamp, and up to 504 bytes. The writer fills the bytes and then releases the
-stamp: the number of the message and its length in one. The reader looks at the stamp of the slot
-that comes next, and so waits on the very line that brings the message; where the writer stands is
-told by nothing else. The reader releases the number of messages it has taken, the head, which the
-writer looks at only when its last copy of it says that the ring is full. Stamps and head make the
-whole state: whoever takes an end over goes on from them.
+A slot is a stamp (one word) and up to 504 bytes. The writer fills the bytes and then writes the
+stamp with a release store: the number of the message and its length in one word. The reader polls
+the stamp of the next slot, and so waits on the cache line that brings the message; the writer
+publishes no other position. The reader releases the head, the number of messages it has taken. The
+writer loads it only when its last copy says that the ring is full. Stamps and head are the whole
+state: a process that takes over an end continues from them.
 """
 
 from __future__ import annotations
 
-from numba import njit
+import numpy as np
 
 from gfm_hil.links.base import LONGEST
-from gfm_hil.links.port import PORT_CALL, free_port_function
+from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.realtime.atomics import copy, load_acquire, pause, store_release
-from gfm_runtime.compiled import FREE
+from gfm_runtime.compiled import compiled
 
-SLOTS = 64  # messages; 6 ms at 10 kHz, then frames are dropped rather than delivered stale
+SLOTS = 64  # messages: 6 ms at 10 kHz; a full ring drops frames instead of delivering stale ones
 WORD = 8  # bytes
 SLOT = WORD + LONGEST  # bytes
 RING = SLOTS * SLOT  # bytes
@@ -26,12 +26,12 @@ RING = SLOTS * SLOT  # bytes
 LENGTH_BITS = 16
 _LENGTH = (1 << LENGTH_BITS) - 1
 
-#: the handle: addresses of the ring written to and of its head (0: not open), messages sent, and
-#: the head as last seen; addresses of the ring read from and of its head, messages taken
+#: the handle: addresses of the ring to write and of its head (0: not open), messages sent, and
+#: the last copy of the head; addresses of the ring to read and of its head, messages taken
 OUT, OUT_HEAD, SENT, SEEN, IN, IN_HEAD, TAKEN, HANDLE = range(8)
 
 
-@njit(PORT_CALL, **FREE)
+@compiled
 def put(handle, message):
     """Write a message to the ring: 1, or 0 if it is full, closed, or the message does not fit."""
     size = message.size
@@ -49,10 +49,11 @@ def put(handle, message):
     return 1
 
 
-@njit(PORT_CALL, **FREE)
+@compiled
 def take(handle, message):
-    """Read the next message: its bytes, or 0 if none has come. A longer one is gone."""
-    room, to = message.size, message.ctypes.data  # here: in a branch numba would count references
+    """Read the next message: returns its length in bytes, or 0 if none has arrived. A message
+    longer than ``message`` is dropped, and its length returned."""
+    room, to = message.size, message.ctypes.data  # in a branch numba would count references
     if handle[IN] == 0:
         return 0
     taken = handle[TAKEN]
@@ -69,9 +70,9 @@ def take(handle, message):
     return size
 
 
-@njit("boolean(int64[::1])", **FREE)
+@compiled
 def waiting(handle):
-    """Whether a message has come."""
+    """Whether a message has arrived."""
     taken = handle[TAKEN]
     if handle[IN] == 0:
         return False
@@ -86,3 +87,12 @@ def port_send(handle, message):
 @free_port_function
 def port_receive(handle, message):
     return take(handle, message)
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) all functions, on a handle that is not open."""
+    handle, message = np.zeros(HANDLE, np.int64), np.zeros(1, np.uint8)
+    put(handle, message)
+    take(handle, message)
+    waiting(handle)
+    Port(handle, port_send, port_receive, 0)

@@ -1,1 +1,1 @@
-"""A SunSpec device on Modbus/TCP beside a run: what it measures, and an operator's commands."""
+"""A SunSpec device on Modbus/TCP beside a run: measurements and an operator's commands."""

@@ -1,7 +1,7 @@
-"""One client's connection: strict about frames, one request after the other.
+"""One client's connection: it checks frames strictly and answers requests one by one.
 
-pymodbus' own handler keeps only the newest request of a connection while one is being carried out,
-which mixes up answers to a client that does not wait. Here they queue.
+While pymodbus' own handler carries out a request, it keeps only the newest further one, and so
+mixes up the answers to a client that does not wait. Here requests queue.
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ from gfm_hil.core.listener import Listener
 from gfm_hil.core.rate import Rate
 
 UNIT = 1
-_HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows it, unit
-_LONGEST = 1024  # of unit and PDU; 254 by the specification, and what is longer hears so
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of the rest, unit
+_LONGEST = 1024  # of unit and PDU; the specification allows 254, longer ones get an error answer
 _BUFFER = 64 * 1024
 _MOST_WAITING = 32
 _WRITE_ONE, _WRITE_MANY = 6, 16
 _WRITES = (_WRITE_ONE, _WRITE_MANY)
 _FUNCTIONS = (3, *_WRITES)
 
-CLIENTS = 64  # at a time that have asked for something, and as many that have not yet
-HALF_OPEN_S = 10.0  # in which a client must make its first request
-IDLE_S = 300.0  # after which a silent client is dropped, but for the one that commands
-SEND_S = 5.0  # in which a client must take an answer
-_PER_S, _BURST = 50.0, 100  # requests of one client that come to commands
+CLIENTS = 64  # most clients that have sent a request, and as many that have not yet
+HALF_OPEN_S = 10.0  # timeout of a client's first request
+IDLE_S = 300.0  # timeout of a silent client, except the one that commands
+SEND_S = 5.0  # timeout of a client that does not read an answer
+_PER_S, _BURST = 50.0, 100  # limit per client of requests that cause commands
 
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Client:
-    """Who is at the other end, and how much it may command."""
+    """The identity of a client and its rate limit for commands."""
 
     identity: Identity
     rate: Rate
 
 
 CLIENT: ContextVar[Client | None] = ContextVar("client", default=None)
-"""Whose request is being carried out; None: nobody's, a timer has run out."""
+"""The client whose request is being carried out; None if a timer caused the command."""
 
 _Request = tuple[int, int, bytes]  # transaction, unit, PDU
 
@@ -61,9 +61,9 @@ class Connection(ServerRequestHandler):
     """A connection of ``Server``."""
 
     def callback_connected(self) -> None:
-        """Begin to answer."""
+        """Start the task that answers."""
         super().callback_connected()
-        self.max_buffer_size = _BUFFER  # pymodbus throws away what is beyond it
+        self.max_buffer_size = _BUFFER  # pymodbus discards data beyond it
         self._waiting: asyncio.Queue[_Request | None] = asyncio.Queue()
         self._room = asyncio.Event()
         self._room.set()
@@ -71,7 +71,7 @@ class Connection(ServerRequestHandler):
         self.server.workers.add(asyncio.create_task(self._work()))
 
     def _client(self) -> Client:
-        """Who it is, as far as the connection tells."""
+        """The client, as far as the connection identifies it."""
         peer = address(self.transport.get_extra_info("peername"))
         secure = self.transport.get_extra_info("ssl_object")
         subject = None if secure is None else secure.getpeercert()["subject"]
@@ -80,29 +80,29 @@ class Connection(ServerRequestHandler):
         return Client(who, Rate("this client", _PER_S, _BURST))
 
     def pause_writing(self) -> None:
-        """The client does not take what it is sent."""
+        """Note that the client does not read its answers."""
         self._room.clear()
 
     def resume_writing(self) -> None:
-        """It does again."""
+        """Note that the client reads again."""
         self._room.set()
 
     def callback_disconnected(self, exc: Exception | None) -> None:
-        """What was received is still carried out, what it said is not sent any more."""
+        """Carry out the requests received so far, without sending answers."""
         super().callback_disconnected(exc)
         self._waiting.put_nowait(None)
 
     def callback_data(self, data: bytes, addr: tuple[Any, ...] | None = None) -> int:
-        """Take whole requests; returns the bytes used. What is no Modbus ends the connection."""
+        """Take whole requests; returns the bytes used. Invalid data closes the connection."""
         used = 0
         while len(data) - used >= _HEADER.size:
             transaction, protocol, length, unit = _HEADER.unpack_from(data, used)
-            if self._waiting.qsize() >= _MOST_WAITING:  # it will not take its answers either
+            if self._waiting.qsize() >= _MOST_WAITING:  # it does not read its answers either
                 self._drop()
                 return len(data)
             if protocol or not 2 <= length <= _LONGEST:
                 self.close()
-                self._waiting.put_nowait(None)  # pymodbus does not say that this one has ended
+                self._waiting.put_nowait(None)  # pymodbus does not report this end
                 return len(data)
             end = used + _HEADER.size - 1 + length
             if end > len(data):
@@ -114,7 +114,7 @@ class Connection(ServerRequestHandler):
         return used
 
     def _drop(self) -> None:
-        """End the connection with what has not been sent yet."""
+        """Abort the connection; discard unsent data."""
         transport: Any = self.transport
         if transport is not None:
             transport.abort()
@@ -126,7 +126,7 @@ class Connection(ServerRequestHandler):
             transaction, unit, frame = request
             try:
                 answer = await self._answer(unit, frame)
-            except Exception:  # whatever it is, the client shall not wait for ever
+            except Exception:  # after any error, answer: the client must not wait for ever
                 _LOG.exception("request %s", frame.hex())
                 answer = ExceptionResponse(frame[0] & 0x7F, ExcCodes.DEVICE_FAILURE)
             answer.transaction_id, answer.dev_id = transaction, unit
@@ -152,7 +152,7 @@ class Connection(ServerRequestHandler):
         if request is None or (code != _WRITE_MANY and len(frame) != 5):
             return ExceptionResponse(code, ExcCodes.ILLEGAL_VALUE)
         answer = await request.datastore_update(self.server.context, UNIT)
-        if code == _WRITE_ONE and not answer.isError():  # an echo, whatever it reads afterwards
+        if code == _WRITE_ONE and not answer.isError():  # echo the request, not the new value
             answer.address, *answer.registers = struct.unpack(">HH", frame[1:])
         if code in _WRITES and not answer.isError():
             self.server.keep(self)
@@ -163,12 +163,12 @@ class Server(ModbusTcpServer):
     """pymodbus' server with these connections.
 
     Args:
-        device: what it serves.
+        device: the device to serve.
         address: host and port.
-        tls: of a server that demands a certificate of its clients; None: plain TCP.
+        tls: context that requires a certificate from clients; None: plain TCP.
 
     Raises:
-        OSError: the address is not to be had.
+        OSError: the address cannot be bound.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Server(ModbusTcpServer):
     ) -> None:
         super().__init__(device, address=address)
         self.peers = Listener(*address, CLIENTS, HALF_OPEN_S, IDLE_S)
-        # frames are the same with TLS: pymodbus' own server for it takes one a record
+        # TLS carries the same frames; pymodbus' own TLS server takes one per record instead
         self.call_create = partial(
             self.loop.create_server, self.handle_new_connection, sock=self.peers, ssl=tls
         )
@@ -184,19 +184,19 @@ class Server(ModbusTcpServer):
         self._commands: Connection | None = None
 
     def keep(self, connection: Connection) -> None:
-        """Keep a connection, however silent it may be: its client commands, until another does."""
+        """Exempt the connection of the last client that commanded from the idle timeout."""
         if self._commands is not None:
             self.peers.keep(self._commands.number, kept=False)
         self._commands = connection
         self.peers.keep(connection.number)
 
     async def shutdown(self) -> None:
-        """Hang up on everybody."""
+        """Close all connections."""
         await super().shutdown()
         for worker in self.workers:
             worker.cancel()
         await asyncio.gather(*self.workers, return_exceptions=True)
 
     def callback_new_connection(self) -> Connection:
-        """For a client that has connected."""
+        """Make the connection of a new client."""
         return Connection(self, self.trace_packet, self.trace_pdu, self.trace_connect)

@@ -1,10 +1,10 @@
 """Models 705 and 711: the voltage reference and the droops, as SunSpec's stored curves.
 
-Curve (or control) 1 shows what is in force and cannot be written; 2 is for the client to fill.
-``Adpt…Req`` = 2 checks what is there and takes it over, at once if the function is enabled, else
-when it is. Disabling goes back to what was in force before.
+Curve (or control) 1 shows the values in force and cannot be written; the client writes curve 2.
+``Adpt…Req`` = 2 checks curve 2 and adopts it, at once if the function is enabled, else when it is
+enabled. Disabling restores the values that were in force before.
 
-A curve that has not been written is as the one in force.
+A curve that has not been written reads as the one in force.
 
 - 705: two points (V_a, Var_a), (V_b, Var_b) in % of V_n and S_n on the line of the law's droop,
   with V relative to ``VRef`` and Var to the reactive set-point:
@@ -24,8 +24,8 @@ from gfm_hil.modbus.view import View
 from gfm_hil.scenario.events import check_reference
 
 COMPLETED, FAILED = 1, 2
-_SPAN = 100.0  # %, of Var on either side, with which the droop in force is shown
-_RESOLUTION = 0.015  # %, to which the points must lie on a line through the reference
+_SPAN = 100.0  # %: the two points that show the droop in force have Var = ± this
+_RESOLUTION = 0.015  # %: largest deviation of the line from the reference
 _MINE = 2  # the curve that a client may write
 
 #: what a client may write of a curve of model 705, and of a control of model 711
@@ -43,21 +43,21 @@ class Adopted:
     enabled: bool = False
     request: int = 1
     result: int = COMPLETED
-    meaning: Meaning | None = None  # adopted, and not yet forgotten by disabling
-    before: Meaning | None = None  # what was in force when it was enabled, and of which law
+    meaning: Meaning | None = None  # adopted; disabling clears it
+    before: Meaning | None = None  # in force when it was enabled, under the law below
     law: str = ""
 
 
 class Curves:
-    """What both models share.
+    """The part that both models share.
 
     Args:
         model, curve: ``705, "Crv"`` or ``711, "Ctl"``.
         stored: paths within the curve of the points that a client may write.
-        read: what stored values mean; ValueError if nothing that can be.
-        write: the stored values of what is in force.
+        read: converts stored values to a meaning; raises ValueError if they are invalid.
+        write: converts a meaning to stored values.
         events: commands that bring a meaning into force.
-        in_force: the meaning of what is.
+        in_force: the meaning now in force.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Curves:
         return Plan(events, keep, fail)
 
     def forget(self) -> None:
-        """After a reset: the run is back at its start, with nothing commanded."""
+        """Clear the state after a reset: the run is back at its start, without commands."""
         self.state, self._stored = Adopted(), {}
 
     def show(self, view: View, now: float) -> dict[str, Value]:
@@ -133,7 +133,7 @@ class Curves:
         }
 
     def _back(self, s: Adopted, view: View) -> Meaning:
-        """What was in force before; another law that came meanwhile keeps its own droops."""
+        """The values in force before; if the law has changed since, it keeps its own droops."""
         before = s.before or {}
         if view.law == s.law:
             return before
@@ -161,7 +161,7 @@ def read_volt_var(stored: Mapping[str, Value]) -> Meaning:
 
 
 def write_volt_var(meaning: Meaning) -> dict[str, Value]:
-    """The curve of model 705 that a law's V_ref and D_q are."""
+    """The curve of model 705 for a law's V_ref and D_q."""
     D_q = meaning.get("D_q")
     points: dict[str, Value] = {}
     for k, var in ((1, _SPAN), (2, -_SPAN)):
@@ -183,7 +183,7 @@ def read_droop(stored: Mapping[str, Value]) -> Meaning:
 
 
 def write_droop(meaning: Meaning) -> dict[str, Value]:
-    """The control of model 711 that a law's D_p is."""
+    """The control of model 711 for a law's D_p."""
     D_p = meaning.get("D_p")
     return {"DbOf": 0.0, "DbUf": 0.0, "KOf": D_p, "KUf": D_p, "RspTms": 0.0}
 

@@ -1,8 +1,8 @@
-"""The device: one register image, what writes to it come to, and a clock for what expires.
+"""The device: one register image, the commands that writes cause, and a clock for timers.
 
-A request is carried out as a whole or not at all: every value is checked, then the commands that it
-comes to are given to the run, which checks them again, and only then is anything remembered. One
-request at a time; reading goes on meanwhile.
+A request is carried out as a whole or not at all: the device checks every value, sends the
+resulting commands to the run, which checks them again, and only then stores anything. It carries
+out one request at a time; clients can read meanwhile.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from gfm_hil.modbus.view import Slack, View
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 
-#: carries a command out, or raises UserError
+#: carries out a command, or raises UserError
 Tell = Callable[[dict[str, Any]], object]
 
 _READ, _WRITE_ONE, _WRITE_MANY = 3, 6, 16
@@ -48,10 +48,10 @@ class Device:
 
     Args:
         scenario: of the run.
-        laws: names of those that are ready.
-        look: the newest tick.
-        tell: has the run do something; called in a thread of its own.
-        heartbeat_ms: how long a client's heartbeat may stand still, 0: for ever.
+        laws: names of the laws that are ready.
+        look: returns the newest tick.
+        tell: sends a command to the run; called in a separate thread.
+        heartbeat_ms: timeout of a client's heartbeat, 0: none.
         elapsed_s: time since the device was started, s.
     """
 
@@ -90,7 +90,7 @@ class Device:
         self._view: View | None = None
         self._was_safe = False
         self._beats, self._seen, self._second = 0, -1, 0
-        self._fresh = -1  # the tick that the registers are of
+        self._fresh = -1  # the device's tick at the last refresh
         self.slack = Slack()
         self.local = False
         self.refresh()
@@ -100,13 +100,13 @@ class Device:
         return point.path in self._owner
 
     def refresh(self) -> None:
-        """Bring every register up to the newest tick."""
+        """Update every register to the newest tick."""
         view = self._look()
         now = self._elapsed_s()
         self._fresh = int(now / TICK_S)
         if view is None:
             return
-        if self._was_safe and not view.safe:  # somebody has reset the run
+        if self._was_safe and not view.safe:  # the run was reset
             self._forget()
         self._view, self._was_safe = view, view.safe
         values = self._measures.now(view, self.slack, self._beats, self._heart.missing, self.local)
@@ -116,16 +116,16 @@ class Device:
             self.image.set(path, value)
 
     def take(self, local: bool) -> None:
-        """Who commands: the bench, which then has clients refused, or they again.
+        """Set who commands: the bench (``local``; clients are then refused) or the clients.
 
-        What clients had commanded stays as it is, and is no more taken back.
+        The clients' commands stay in force, and no timer reverts them any more.
         """
         if local and not self.local:
             self._forget()
         self.local = local
 
     async def clock(self) -> None:
-        """A tick of the device's clock: carry out what has expired by now."""
+        """One tick of the device's clock: carry out the timers that have expired."""
         now = self._elapsed_s()
         if int(now) != self._second:
             self._second = int(now)
@@ -140,7 +140,7 @@ class Device:
                     continue
                 try:
                     await self._carry_out([set_point.revert(view, now)], view)
-                except UserError as problem:  # at the next tick it is tried again
+                except UserError as problem:  # retried at the next tick
                     self.image.set(f"{VENDOR}.Refd", str(problem))
                 else:
                     self.refresh()
@@ -148,9 +148,9 @@ class Device:
     async def access(
         self, code: int, address: int, written: Sequence[Any] | None
     ) -> ExcCodes | None:
-        """A request as pymodbus hands it on; None if it is to be answered from the image.
+        """Process a request from pymodbus; None: pymodbus answers it from the image.
 
-        Raises nothing: what is refused changes nothing, and its reason is in the vendor model.
+        Raises nothing: a refused request changes nothing; the vendor model shows the reason.
         """
         if code not in (_READ, _WRITE_ONE, _WRITE_MANY):
             return ExcCodes.ILLEGAL_FUNCTION
@@ -202,7 +202,7 @@ class Device:
             raise Refused(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
 
     async def _carry_out(self, plans: Sequence[Plan], view: View) -> None:
-        """Give the run every command; then remember.
+        """Send the run every command, then store the new state.
 
         Raises:
             UserError: the run refused one.
@@ -225,7 +225,7 @@ class Device:
             function.forget()
 
     def _count_beat(self) -> None:
-        """DERHb goes on with the run: a device whose run stands still is as good as dead."""
+        """Count DERHb only while the run advances: a device of a stalled run must look dead."""
         view = self._look()
         if view is not None and view.tick != self._seen:
             self._beats, self._seen = self._beats + 1, view.tick
@@ -239,7 +239,7 @@ class Device:
         return {} if D_p is None else {"D_p": D_p}
 
     def _events(self, meaning: dict[str, float], view: View) -> tuple[dict[str, Any], ...]:
-        """Gains first: they are what may be refused."""
+        """The commands for a meaning; gains first, since the run may refuse them."""
         events: list[dict[str, Any]] = []
         droops = {name: value for name, value in meaning.items() if name in ("D_p", "D_q")}
         if droops:
@@ -250,7 +250,7 @@ class Device:
 
 
 def _count(plans: Sequence[Plan]) -> None:
-    """Count a request that comes to commands among those of its client; a stop always passes."""
+    """Apply the client's rate limit to a request that causes commands; a stop always passes."""
     client = CLIENT.get()
     kinds = [event["type"] for plan in plans for event in plan.events]
     if client is None or not kinds or "stop" in kinds:

@@ -1,11 +1,11 @@
-"""The droops of a law: the gains that SunSpec's models 711 and 705 speak of.
+"""The droops of a law: the gains of SunSpec's models 711 and 705.
 
-In the steady state of a law that has them (p.u.; Table III)
+In the steady state of a law with droops (p.u.; Table III)
 
     omega_u - omega_g = D_p (P_ref - p),        V - V_ref = D_q (Q_ref - q).
 
-A law has D_p if its file names it and phi_22(0) is that number; it has D_q if its file names it and
-phi_34(0)/phi_35(0), or its limit, is.
+A law has D_p if its file names it and phi_22(0) equals it; it has D_q if its file names it and
+phi_34(0)/phi_35(0), or its limit, equals it.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _RTOL = 1e-3  # printed gains are rounded
 
 @dataclass(frozen=True)
 class Droops:
-    """D_p and D_q of a law in p.u.; None where it has none."""
+    """D_p and D_q of a law in p.u.; None for one that it does not have."""
 
     D_p: float | None
     D_q: float | None
 
 
 def droops(file: LawFile, changed: Mapping[str, float] | None = None) -> Droops:
-    """The droops of a law, with some of its parameters changed if wanted; what is tied follows.
+    """The droops of a law, optionally with changed parameters; tied parameters follow.
 
     Raises:
-        LawError: such a law cannot be.
+        LawError: the changed law is invalid.
     """
     law = build_law(file, tied(file, dict(changed or {})))
     numbers = {name: p.value for name, p in law.parameters.items()}

@@ -1,4 +1,4 @@
-"""The droops of the laws of a run as they are at the moment, and the command that changes them."""
+"""The present droops of a run's laws, and the command that changes them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gfm_runtime import LawError, law_file
 
 
 class Gains:
-    """Of the laws that are ready.
+    """Gains of the laws that are ready.
 
     Args:
         laws: their names.
@@ -24,17 +24,17 @@ class Gains:
         )
 
     def droops(self, law: str, changed: Mapping[str, float]) -> Droops:
-        """D_p and D_q of a law, some of whose parameters are not as in its file."""
+        """D_p and D_q of a law; ``changed`` holds the parameters that differ from its file."""
         found: Droops = self._droops(law, tuple(changed.items()))
         return found
 
     def event(
         self, law: str, changed: Mapping[str, float], wanted: Mapping[str, float]
     ) -> dict[str, Any]:
-        """The command that gives a law other droops.
+        """The command that changes a law's droops.
 
         Raises:
-            ValueError: it has none of that name, or cannot have this value.
+            ValueError: the law has no droop of that name, or the value is invalid.
         """
         now = self.droops(law, changed)
         for name, value in wanted.items():

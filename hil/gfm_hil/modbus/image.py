@@ -1,6 +1,6 @@
-"""The register image: SunSpec models, laid out as pysunspec2's definitions say, from address 40000.
+"""The register image: SunSpec models from address 40000, with the layout of pysunspec2's files.
 
-A register belongs to one point; a point is known by its path, such as ``704.WSet`` or
+A register belongs to one point; a point is identified by its path, such as ``704.WSet`` or
 ``705.Crv2.Pt1.V``. Scale factors are set once, here, and never change.
 """
 
@@ -42,7 +42,7 @@ class Point:
 
     @property
     def type(self) -> str:
-        """SunSpec's name of its type."""
+        """SunSpec's name for its type."""
         return str(self.definition["type"])
 
     @property
@@ -52,13 +52,13 @@ class Point:
 
     @property
     def standard_access(self) -> str:
-        """``R`` or ``RW`` by its definition."""
+        """``R`` or ``RW``, from its definition."""
         return str(self.definition.get("access", "R"))
 
     def encode(self, value: Value) -> list[int]:
-        """Registers of a value in its units; what does not fit is the nearest that does.
+        """Registers of a value in the point's units; a value out of range is saturated.
 
-        None and NaN are SunSpec's "not implemented".
+        None and NaN become SunSpec's "not implemented".
         """
         if value is None or (isinstance(value, float) and math.isnan(value)):
             data = mb.create_unimpl_value(self.type, 2 * self.length)
@@ -74,7 +74,7 @@ class Point:
         return list(struct.unpack(f">{self.length}H", data))
 
     def decode(self, registers: Sequence[int]) -> Value:
-        """A value in its units from registers; None for "not implemented"."""
+        """The value of registers in the point's units; None for "not implemented"."""
         data = struct.pack(f">{self.length}H", *registers)
         if self.type.startswith("float"):
             number = float(struct.unpack(">f", data)[0])
@@ -87,16 +87,16 @@ class Point:
         return whole / 10**-self.exponent if self.exponent < 0 else whole * 10**self.exponent
 
     def limits(self) -> tuple[int, int]:
-        """Least and greatest whole number of its type that is not "not implemented"."""
+        """Smallest and largest integer of its type, without "not implemented"."""
         bits = 16 * self.length
         if self.type.startswith(("int", "sunssf")):
             return -(2 ** (bits - 1)) + 1, 2 ** (bits - 1) - 1
         return 0, 2**bits - 2
 
     def check(self, value: Value) -> None:
-        """Raise ValueError for a value that its definition does not name.
+        """Raise ValueError for a value that its definition does not list.
 
-        Only for points with symbols that exclude each other: any number is one of the others.
+        It checks only enumerations; any other point may have any number.
         """
         symbols = self.definition.get("symbols")
         if symbols and self.type.startswith("enum"):
@@ -109,8 +109,8 @@ class Image:
     """All registers of a device.
 
     Args:
-        models: number and content of every model, in order; the content has the points that
-            decide the layout (counts, scale factors) and lists for repeating groups.
+        models: number and content of every model, in order; the content holds the points that
+            determine the layout (counts, scale factors) and lists for repeating groups.
     """
 
     def __init__(self, models: Mapping[int, Mapping[str, Any]]) -> None:
@@ -138,8 +138,8 @@ class Image:
         return BASE + len(self.registers)
 
     def set(self, path: str, value: Value) -> None:
-        """Put a value into a point's registers."""
-        if self._set.get(path, self) == value:  # most do not change from one look to the next
+        """Write a value to a point's registers."""
+        if self._set.get(path, self) == value:  # most values do not change between refreshes
             return
         self._set[path] = value
         point = self.points[path]
@@ -155,7 +155,7 @@ class Image:
     def cut(
         self, address: int, registers: Sequence[int]
     ) -> list[tuple[Point, Sequence[int]]] | None:
-        """The points that registers from an address make up, or None if they cut through one."""
+        """The points that these registers make up, or None if they contain a point in part."""
         found, at = [], 0
         while at < len(registers):
             point = self._by_address.get(address + at)
@@ -167,7 +167,7 @@ class Image:
 
 
 def definition(number: int) -> dict[str, Any]:
-    """A model's definition: pysunspec2's, or that of the vendor model that ships here."""
+    """A model's definition, from pysunspec2 or, for the vendor model, from this package."""
     if number != VENDOR:
         return dict(sunspec.get_model_def(number))
     found: dict[str, Any] = json.loads(vendor_model())
@@ -176,7 +176,7 @@ def definition(number: int) -> dict[str, Any]:
 
 
 def vendor_model() -> str:
-    """The text of the vendor model's file, for clients that want to know its points."""
+    """The text of the vendor model's file, for clients."""
     name = f"model_{VENDOR}.json"
     return files("gfm_hil.modbus").joinpath("models", name).read_text(encoding="utf-8")
 

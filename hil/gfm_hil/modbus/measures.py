@@ -1,4 +1,4 @@
-"""What the device shows and nobody writes: its name plate, measurements, and the run's state."""
+"""The device's read-only points: its name plate, measurements, and the run's state."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Measures:
         self._bases: Bases = load_converter(scenario.plant.converter).bases
 
     def models(self, laws: Sequence[str]) -> dict[int, Mapping[str, Any]]:
-        """Every model of the device with what decides its layout, for ``Image``."""
+        """Every model of the device with the points that determine its layout, for ``Image``."""
         b = self._bases
         power = _exponent(b.S_n * _top("p"), 16, signed=True)
         volt, amp = _exponent(b.V_n * _top("V"), 16), _exponent(b.I_b * _top("p"), 16, signed=True)
@@ -77,7 +77,7 @@ class Measures:
         }  # fmt: skip
 
     def plate(self, laws: Sequence[str]) -> dict[str, Value]:
-        """What never changes."""
+        """The points that never change."""
         b = self._bases
         names = {f"{VENDOR}.Laws{k}.Nm": Path(name).name for k, name in enumerate(laws, 1)}
         island = self._scenario.plant.grid.load_R is not None
@@ -113,10 +113,10 @@ class Measures:
     def now(
         self, view: View, slack: Slack, beats: int, heart_lost: bool, local: bool
     ) -> dict[str, Value]:
-        """What changes with the run.
+        """The points that change with the run.
 
         Args:
-            beats: seconds that the run has been seen to go on.
+            beats: number of seconds in which the run advanced.
             heart_lost: the client's heartbeat is missing.
             local: remote control is refused.
         """
@@ -161,12 +161,12 @@ class Measures:
 
 
 def _top(name: str) -> float:
-    """The greatest magnitude that the signal table allows, p.u."""
+    """The largest magnitude that the signal table allows, p.u."""
     return max(max(abs(s.low), abs(s.high)) for s in SIGNALS if s.name == name)
 
 
 def _exponent(top: float, bits: int, signed: bool = False) -> int:
-    """The finest scale factor with which so much still fits."""
+    """The finest scale factor with which ``top`` still fits."""
     whole = 2 ** (bits - signed) - 2
     return math.ceil(math.log10(top / whole))
 

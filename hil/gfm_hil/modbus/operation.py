@@ -17,10 +17,10 @@ _SHORTEST_MS, _LONGEST_MS = 100, 3_600_000  # of HbTms
 
 
 class Heartbeat:
-    """The client's heartbeat: once it has been written, it must go on changing.
+    """The client's heartbeat: once a client has written it, it must keep changing.
 
     Args:
-        timeout_ms: how long it may stand still; 0: for ever.
+        timeout_ms: how long it may stay the same; 0: for ever.
     """
 
     def __init__(self, timeout_ms: int) -> None:
@@ -49,7 +49,7 @@ class Heartbeat:
         return Plan(keep=keep)
 
     def expire(self, now: float) -> bool:
-        """Whether it has just been lost; true once each time."""
+        """Whether it has just been lost; true once per loss."""
         if self._last is None or not self._timeout_ms:
             return False
         waited_ms = (now - self._last) * 1e3
@@ -59,7 +59,7 @@ class Heartbeat:
         return True
 
     def forget(self) -> None:
-        """Nobody needs to beat until somebody has begun to."""
+        """Expect no heartbeat until a client writes it again."""
         self._last, self.missing = None, False
 
     def show(self, view: View, now: float) -> dict[str, Value]:
@@ -78,7 +78,7 @@ class Operation:
     writable = ("715.AlarmReset", "715.OpCtl")
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """See ``Function``; what is so already needs no command."""
+        """See ``Function``; a value that already holds needs no command."""
         reset, control = written.get("715.AlarmReset", 0), written.get("715.OpCtl")
         if reset not in (0, 1):
             raise ValueError(f"AlarmReset = {reset}: must be 1, to reset")
@@ -105,8 +105,8 @@ class Direct:
     """The vendor model's points that act at once: law, voltage reference and droops.
 
     Args:
-        laws: names of those that are ready.
-        gains: of these.
+        laws: names of the laws that are ready.
+        gains: gains of these laws.
     """
 
     writable = tuple(f"{VENDOR}.{name}" for name in ("Law", "VRef", "Dp", "Dq"))

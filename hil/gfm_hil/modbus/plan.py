@@ -1,4 +1,4 @@
-"""What a write comes to: commands, and what is to be remembered once they were carried out."""
+"""The effect of a write: commands, and the state to store once they were carried out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gfm_hil.modbus.view import View
 
 
 class Refused(Exception):
-    """A request that changes nothing, with the Modbus exception that says so."""
+    """A refused request, which changes nothing, with its Modbus exception code."""
 
     def __init__(self, code: ExcCodes, why: str) -> None:
         super().__init__(why)
@@ -22,8 +22,8 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Plan:
-    """Commands for the run, in order; ``keep`` is called once all of them were carried out,
-    ``fail`` if one was refused."""
+    """Commands for the run, in order. The device calls ``keep`` once all of them were carried out,
+    or ``fail`` if one was refused."""
 
     events: tuple[dict[str, Any], ...] = ()
     keep: Callable[[], None] = lambda: None
@@ -31,10 +31,10 @@ class Plan:
 
 
 class Function(Protocol):
-    """A group of points that are written together and mean something together.
+    """A group of points that clients write together and that have a common meaning.
 
-    ``plan`` works out what a write would come to and brings nothing into force itself; it raises
-    ValueError for values that cannot be.
+    ``plan`` computes the effect of a write without applying it; it raises ValueError for invalid
+    values.
     """
 
     @property
@@ -43,13 +43,13 @@ class Function(Protocol):
         ...
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """What writing these values at the time ``now`` of the device, s, comes to."""
+        """The effect of writing these values at the device's time ``now``, s."""
         ...
 
     def forget(self) -> None:
-        """The run was reset, or is commanded from elsewhere: nothing of ours is in force."""
+        """Clear the state: the run was reset, or another operator commands it."""
         ...
 
     def show(self, view: View, now: float) -> dict[str, Value]:
-        """What its points read."""
+        """The values of its points."""
         ...

@@ -1,4 +1,4 @@
-"""The server of one run: the register image over Modbus/TCP until the run is over."""
+"""The server of one run: it serves the register image over Modbus/TCP until the run ends."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from gfm_hil.scenario.model import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
 
-_LOOK_S = 0.1  # between two looks at what changes seldom
-_LOOKS = 10  # of those between two looks at the slack
+_LOOK_S = 0.1  # poll interval of what changes rarely
+_LOOKS = 10  # such polls per update of the slack
 _TIMER = Identity(through="modbus", name="timer")
-_NICE = 10  # behind everything that is in a hurry
+_NICE = 10  # below every process with deadlines
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Address:
     """Where to listen, and to whom.
 
     Attributes:
-        tls: certificate, key, and the authority of the clients' certificates; None: no TLS.
-        anyone: unprotected on an address that others can reach, on purpose.
+        tls: certificate, key, and the CA of the clients' certificates; None: no TLS.
+        anyone: deliberately serve without TLS on an address that others can reach.
     """
 
     host: str
@@ -53,7 +53,7 @@ class Address:
     anyone: bool = False
 
     def check(self) -> None:
-        """Raise UserError for an address that others can reach without being known."""
+        """Raise UserError for an address that others can reach without authentication."""
         try:
             address = ipaddress.ip_address(self.host)
         except ValueError:
@@ -67,10 +67,10 @@ class Address:
             )
 
     def context(self) -> ssl.SSLContext | None:
-        """TLS that demands a certificate of the client as well.
+        """A TLS context that requires a certificate from clients too.
 
         Raises:
-            UserError: a file that cannot be used.
+            UserError: a file cannot be used.
         """
         if self.tls is None:
             return None
@@ -87,10 +87,10 @@ class Address:
 
 
 def serve(folder: Path, address: Address, heartbeat_ms: int, notice: Callable[[str], None]) -> None:
-    """Serve the run in ``folder`` until it is over, or SIGINT or SIGTERM comes.
+    """Serve the run in ``folder`` until it ends, or until SIGINT or SIGTERM.
 
     Raises:
-        UserError: no run is going on there, or the address is not to be had.
+        UserError: no run is in progress there, or the address cannot be bound.
     """
     address.check()
     context = address.context()
@@ -109,11 +109,11 @@ async def _serve(
     heartbeat_ms: int,
     notice: Callable[[str], None],
 ) -> None:
-    logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # clients hear what is wrong
+    logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # clients get the errors
     scenario = load_scenario(str(folder / "scenario.toml"))
     watcher = Watcher(operator, folder, scenario)
     over = _until_told()
-    while watcher.look() is None:  # the sides may still be shaking hands
+    while watcher.look() is None:  # the handshake may not be over
         if over.is_set() or not _going(folder):
             raise UserError(f"{folder}: no run is going on there")
         await asyncio.sleep(TICK_S)
@@ -162,7 +162,7 @@ def _server(device: Device, address: Address, context: ssl.SSLContext | None) ->
         refused = await device.access(code, at, written)
         image = device.image.registers
         registers[: len(image)] = image
-        if written is not None:  # pymodbus puts these into its registers itself
+        if written is not None:  # pymodbus writes them to its registers
             written[:] = image[at - first : at - first + count]
         return refused
 
@@ -172,7 +172,7 @@ def _server(device: Device, address: Address, context: ssl.SSLContext | None) ->
 
 
 async def _clock(device: Device, began: float, over: asyncio.Event) -> None:
-    """Tick until the run is over; ticks that were slept through are made up for by the last."""
+    """Tick until the run is over; one tick makes up for those that were missed."""
     tick = 0
     while not over.is_set():
         await device.clock()
@@ -183,7 +183,7 @@ async def _clock(device: Device, began: float, over: asyncio.Event) -> None:
 async def _watch(
     folder: Path, device: Device, watcher: Watcher, server: Server, over: asyncio.Event
 ) -> None:
-    """See until the run is over what changes seldom: the clock does not depend on it."""
+    """Poll what changes rarely until the run is over; the clock does not depend on it."""
     while not over.is_set():
         device.slack = watcher.slack()
         for _ in range(_LOOKS):
@@ -200,7 +200,7 @@ async def _rest(over: asyncio.Event, seconds: float) -> None:
 
 
 def begun(folder: Path) -> bool:
-    """Whether both sides of a run are there."""
+    """Whether both sides of a run have started."""
     return len(present(folder)) == len(SIDES)
 
 

@@ -1,9 +1,9 @@
-"""Set-points of model 704: a value, its mode, its enable, and the timer that takes them back.
+"""Set-points of model 704: a value, its mode, its enable, and the timer that reverts them.
 
-A set-point that has not been written since it was last disabled reads as the reference in force.
-So enabling it alone changes nothing, and of value, mode and enable the last one to be written makes
-the change, in whatever order they come and in however many requests. Disabling goes back to the
-reference that was in force before.
+A set-point that has not been written since it was last disabled reads as the reference in force,
+so that enabling it alone changes nothing. A client may write value, mode and enable in any order
+and in any number of requests; the last of them makes the change. Disabling restores the reference
+that was in force before.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from gfm_hil.scenario.events import check_reference
 
 @dataclass(frozen=True)
 class Settings:
-    """What clients have written; None: not since the function was last disabled.
+    """What clients have written; None: not written since the function was last disabled.
 
     Attributes:
         value, percent: the set-point in W or var, and in % of S_n.
-        value_back, percent_back: what they become when the timer runs out.
+        value_back, percent_back: their values after the timer expires.
         timeout: s, 0 for none.
-        until: the device's time at which it runs out, s; None: not running.
+        until: the device's time at which the timer expires, s; None: not running.
         before: the reference in force when it was enabled, p.u.
     """
 
@@ -49,8 +49,8 @@ class SetPoint:
         prefix: ``"WSet"`` or ``"VarSet"``.
         reference: ``"P_ref"`` or ``"Q_ref"``.
         rating: W or var at 1 p.u.
-        absolute: the value of ``Mod`` with which the set-point is in W or var.
-        percent: those with which it is in % of a maximum, each of which is S_n here.
+        absolute: the value of ``Mod`` for a set-point in W or var.
+        percent: the values of ``Mod`` for a set-point in % of a maximum, which is S_n here.
     """
 
     def __init__(
@@ -83,23 +83,23 @@ class SetPoint:
         return self._plan(new, view, now, changed=True)
 
     def end(self, now: float) -> None:
-        """Have the timer run out, whether there is one or not."""
+        """If enabled, let the timer expire now, even if none is running."""
         if self.settings.enabled:
             self.settings = replace(self.settings, until=now)
 
     def expire(self, now: float) -> bool:
-        """Whether the timer has run out."""
+        """Whether the timer has expired."""
         return self.settings.until is not None and now >= self.settings.until
 
     def revert(self, view: View, now: float) -> Plan:
-        """What the end of the timer comes to: the set-point and enable of ``…Rvrt``."""
+        """The effect of the timer's expiry: the set-point and enable of ``…Rvrt``."""
         s = self.settings
         name = self._in_force(s)
         new = replace(_with(s, name, self._back(s, name)), enabled=s.enabled_back)
         return self._plan(new, view, now, changed=False)
 
     def forget(self) -> None:
-        """After a reset: the run is back at its start, with nothing commanded."""
+        """Clear the state after a reset: the run is back at its start, without commands."""
         self.settings = Settings(mode=self._absolute)
 
     def show(self, view: View, now: float) -> dict[str, Value]:
@@ -123,7 +123,7 @@ class SetPoint:
         if new.enabled:
             if not old.enabled:
                 new = replace(new, before=view.references[self.reference])
-            if new.mode != old.mode:  # what was in force before is not kept for another day
+            if new.mode != old.mode:  # do not keep the old mode's value
                 left = self._in_force(old)
                 if getattr(new, left) == getattr(old, left):
                     new = _with(new, left, None)
@@ -147,7 +147,7 @@ class SetPoint:
         return "value" if s.mode == self._absolute else "percent"
 
     def _unit(self, name: str) -> float:
-        """What 1 p.u. is in the units of a setting."""
+        """1 p.u. in the unit of a setting."""
         return self._rating if name.startswith("value") else 100.0
 
     def _back(self, s: Settings, name: str) -> float | None:

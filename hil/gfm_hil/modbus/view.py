@@ -1,4 +1,4 @@
-"""What a run does at this moment, as the device needs it: read from its recording, off the loop."""
+"""The present state of a run, as the device needs it: read from the recording, not in the loop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gfm_hil.scenario.model import Scenario
 from gfm_runtime.states import SAFE
 
 _NAMES_S = 0.1  # how old names and gains may be
-_WINDOW_S = 1.0  # of ticks that the slack is taken over
+_WINDOW_S = 1.0  # window of the slack
 _SCHEDULED, _RECEIVED = PLANT_TIMES.index("scheduled"), PLANT_TIMES.index("received")
 
 
@@ -34,14 +34,14 @@ class Slack:
 
 @dataclass(frozen=True)
 class View:
-    """One look at a run.
+    """The state of a run at one tick.
 
     Attributes:
         row: every column of the recording at the newest tick, by name.
         tick, misses: of the plant, since the start.
         state: of the controller, index into ``gfm_runtime.controller.STATES``.
         law: name of the active law.
-        gains: what of it is not as in its file, by parameter.
+        gains: its parameters that differ from its file.
         reason: why the controller is in SAFE or the plant tripped, or "".
     """
 
@@ -55,7 +55,7 @@ class View:
 
     @property
     def safe(self) -> bool:
-        """The bridge is blocked: a trip, or the controller's safe state."""
+        """Whether the bridge is blocked: a trip, or the controller's safe state."""
         return self.state == SAFE or self.row["true_trip"] != 0.0
 
     @property
@@ -65,12 +65,12 @@ class View:
 
 
 class Watcher:
-    """Looks at a run that is going on; takes nothing from its loops.
+    """Observes a run in progress without load on its loops.
 
     Args:
         operator: of the run.
         folder: the run folder.
-        scenario: as resolved in it.
+        scenario: the resolved scenario of that run.
     """
 
     def __init__(self, operator: Operator, folder: Path, scenario: Scenario) -> None:
@@ -93,11 +93,11 @@ class Watcher:
             row.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
         code = (row["law"], row["state"], row["true_trip"])
         now = time.monotonic()
-        if code != self._code or now >= self._asked + _NAMES_S:  # takes the reading of files
-            with contextlib.suppress(UserError):  # names that are a little old serve as well
+        if code != self._code or now >= self._asked + _NAMES_S:  # reading files takes time
+            with contextlib.suppress(UserError):  # slightly old names will do
                 self._said = {**self._said, **self._operator.snapshot()}
             self._code, self._asked = code, now
-        if "active" not in self._said:  # the controller's desk is not there yet
+        if "active" not in self._said:  # the controller's desk is not open yet
             return None
         progress = self._parts["plant"].progress
         return View(
@@ -111,11 +111,11 @@ class Watcher:
         )
 
     def forget(self) -> None:
-        """Have the next look read the names again: there was a command."""
+        """Make the next ``look`` read the names again, after a command."""
         self._asked = -math.inf
 
     def slack(self) -> Slack:
-        """Over the last second of ticks; u[k] is due when tick k + 1 begins."""
+        """The slack over the last second of ticks; u[k] is due when tick k + 1 begins."""
         part = self._parts.get("plant")
         done = 0 if part is None else int(part.progress[0])
         if part is None or not done:
@@ -128,7 +128,7 @@ class Watcher:
         return Slack(*(float(v) for v in np.percentile(left, (50, 1, 0.1, 0))))
 
     def laws(self) -> list[str]:
-        """Names of the laws that are ready to be changed to, in order."""
+        """Names of the laws that the run can switch to, in order."""
         return [str(name) for name in self._operator.snapshot()["laws"]]
 
     def _part(self, side: str) -> Part | None:

@@ -1,4 +1,4 @@
-"""The operator of a run: sends commands to a role that is running, and reads what it records."""
+"""The operator of a run: sends commands to a running role and reads its recording."""
 
 from gfm_hil.operator.client import Operator
 

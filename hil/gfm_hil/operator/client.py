@@ -1,4 +1,4 @@
-"""An operator: sends commands to a run by its folder, and reads what it records as it goes."""
+"""An operator: finds a run by its folder, sends commands to it and reads its growing recording."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _CONTROLLERS = {get_args(e.model_fields["type"].annotation)[0] for e in CONTROLL
 
 
 def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
-    """What a recorded code stands for.
+    """The meaning of a recorded code.
 
     Raises:
-        UserError: nothing, so that the recording is damaged.
+        UserError: it has none, so that the recording is damaged.
     """
     if code not in words:
         raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
@@ -33,14 +33,14 @@ def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any
 
 
 class Operator:
-    """Commands and a look, for one run that is going on.
+    """Sends commands to one run in progress and reads its state.
 
     Args:
         folder: the run folder.
         through: what passes the commands on, for the log of the run.
 
     Raises:
-        UserError: nothing is going on there.
+        UserError: no run is in progress there.
     """
 
     def __init__(self, folder: Path, through: str = "python") -> None:
@@ -50,21 +50,21 @@ class Operator:
             raise UserError(f"{folder}: no run is going on there")
 
     def close(self) -> None:
-        """Let go of the sockets."""
+        """Close the sockets."""
         self._context.destroy(linger=0)
 
     def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
-        """Have an event of a scenario, without its time, carried out at once.
+        """Have the run carry out a scenario event, given without its time, at once.
 
         Args:
-            event: plain data, ``type`` and what belongs to it.
+            event: plain data, ``type`` and its fields.
             by: who gives the command; this process if None.
 
         Returns:
-            ``tick`` at which it was, and its ``label``.
+            ``tick`` at which it was carried out, and its ``label``.
 
         Raises:
-            UserError: it was refused, with the reason; or the side is gone.
+            UserError: the run refused it, with the reason; or the side is gone.
         """
         kind = event.get("type", "")
         if not isinstance(kind, str):
@@ -72,7 +72,7 @@ class Operator:
         return self._ask("controller" if kind in _CONTROLLERS else "plant", event, by)
 
     def stop(self, by: Identity | None = None) -> None:
-        """End the run as Ctrl-C would.
+        """Stop the run as Ctrl-C does.
 
         Raises:
             UserError: the run does not answer.
@@ -82,14 +82,14 @@ class Operator:
             return
 
     def snapshot(self) -> dict[str, Any]:
-        """The newest recorded tick: every column of the recording by name, and in words.
+        """The newest recorded tick: every column of the recording by name, codes also as words.
 
         Of the plant: ``tick``, ``misses``, ``trip`` ("" without one). Of the controller:
-        ``state``, ``reason`` (why SAFE), ``active`` (name of the law in force), ``gains`` (what of
-        it is not as in its file), ``laws`` (names of those that are ready), ``T_s`` (s). A side
-        that has not recorded anything is left out.
+        ``state``, ``reason`` (why SAFE), ``active`` (name of the law in force), ``gains`` (its
+        gains that differ from its file), ``laws`` (names of those that are ready), ``T_s`` (s). A
+        side that has not recorded anything is left out.
 
-        Rows are only ever appended, so that reading them takes nothing from the loop.
+        The loop only appends rows, so that reading them does not disturb it.
 
         Raises:
             UserError: the recording is damaged.
@@ -127,7 +127,7 @@ class Operator:
         content = {**event, "by": (by or self._local).plain()}
         try:
             answer = self._exchange(side, desk["endpoint"], content)
-        except zmq.ZMQError as problem:  # no descriptor for a socket, for example
+        except zmq.ZMQError as problem:  # for example no descriptor for a socket
             raise UserError(f"{self._folder}: the {side} cannot be asked: {problem}") from None
         if not answer["ok"]:
             raise UserError(str(answer["error"]))

@@ -1,1 +1,1 @@
-"""Time and processors: the clock, atomics, priority, and what timing on this machine depends on."""
+"""Time and processors: the clock, atomics, priority, and this machine's real-time properties."""

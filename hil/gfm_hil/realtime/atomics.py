@@ -1,7 +1,8 @@
-"""Memory that another process writes to, inside numba: ordered loads and stores at an address.
+"""Memory shared with another process, inside numba: ordered loads and stores at an address.
 
-numba has no atomics on the CPU; llvmlite has the instructions. An acquire load of what a release
-store wrote sees all that was written before that store (C11 and LLVM's "Atomic Memory Ordering").
+numba has no atomics on the CPU; llvmlite has the instructions. A thread whose acquire load reads
+the value of a release store sees all writes before that store (C11 and LLVM's "Atomic Memory
+Ordering").
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _BYTES = ir.IntType(8).as_pointer()
 
 @intrinsic
 def load_acquire(typingctx, address):
-    """The int64 at an address; what is read after it cannot be older."""
+    """Load the int64 at an address; later reads cannot be moved before it."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = builder.inttoptr(arguments[0], _WORD.as_pointer())
@@ -32,7 +33,7 @@ def load_acquire(typingctx, address):
 
 @intrinsic
 def store_release(typingctx, address, value):
-    """Write an int64 to an address; what was written before it is seen before it."""
+    """Store an int64 at an address; earlier writes become visible before it."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = builder.inttoptr(arguments[0], _WORD.as_pointer())
@@ -44,7 +45,7 @@ def store_release(typingctx, address, value):
 
 @intrinsic
 def pause(typingctx):
-    """Tell the processor that this is a spin: ``pause`` on x86, nothing elsewhere."""
+    """Hint to the processor that the thread spins: ``pause`` on x86, nothing elsewhere."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         module = builder.module
@@ -59,7 +60,7 @@ def pause(typingctx):
 
 @intrinsic
 def prefetch(typingctx, address):
-    """Have the line at an address fetched to be written to, while other work goes on."""
+    """Prefetch the cache line at an address for writing."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         i32 = ir.IntType(32)

@@ -1,6 +1,6 @@
-"""Time for compiled loops: read CLOCK_MONOTONIC, sleep to a deadline, give way.
+"""Time for compiled loops: read CLOCK_MONOTONIC, sleep until a deadline, yield.
 
-As intrinsics around libc, so that they allocate nothing and survive numba's cache.
+They are intrinsics around libc, so that they allocate nothing and numba can cache them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
 _NS = 1_000_000_000
 _SIGKILL = 9
 
-# numba's own annotation has the typing context among the caller's arguments
+# numba's annotation counts typingctx among the caller's arguments
 _intrinsic: Any = intrinsic
 
 pause: Any = _pause
@@ -26,9 +26,9 @@ pause: Any = _pause
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _TIMESPEC = ir.LiteralStructType([_I64, _I64])
 
-_SPINS_A_YIELD = 16  # looks in vain, once a peer that delivers by itself is late
+_SPINS_A_YIELD = 16  # polls per yield, once a peer that delivers directly is late
 
-#: woken this long before a deadline, the rest is spun: a sleep ends up to this late
+#: wake this long before a deadline and spin the rest: a sleep may end this late
 AHEAD_NS = 40_000
 
 
@@ -39,7 +39,7 @@ def _libc(builder: Any, name: str, arguments: list[ir.Type]) -> Any:
 
 
 def _timespec(builder: Any) -> Any:
-    with builder.goto_entry_block():  # once a call of the function, not once an iteration
+    with builder.goto_entry_block():  # allocate once per call, not once per iteration
         return builder.alloca(_TIMESPEC)
 
 
@@ -63,7 +63,7 @@ def now_ns(typingctx):
 
 @_intrinsic
 def sleep_until(typingctx, deadline_ns):
-    """Sleep to a time of CLOCK_MONOTONIC, int64 ns; returns at once if it has passed."""
+    """Sleep until a time of CLOCK_MONOTONIC, int64 ns; returns at once if it has passed."""
     if not isinstance(deadline_ns, types.Integer):
         return None
 
@@ -81,7 +81,7 @@ def sleep_until(typingctx, deadline_ns):
 
 @_intrinsic
 def give_way(typingctx):
-    """Let another thread have the processor: sched_yield."""
+    """Yield the processor: sched_yield."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.call(_libc(builder, "sched_yield", []), [])
@@ -91,7 +91,7 @@ def give_way(typingctx):
 
 @_intrinsic
 def end_this_process(typingctx):
-    """Die as if killed: SIGKILL to oneself."""
+    """Kill this process: send SIGKILL to itself."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.call(_libc(builder, "raise", [_I32]), [_I32(_SIGKILL)])
@@ -103,8 +103,8 @@ def end_this_process(typingctx):
 def wait_until(deadline_ns, spins):
     """Sleep until shortly before a deadline, then spin; returns the longest gap in the spin, ns.
 
-    A thread that only spins would be throttled by the kernel under SCHED_FIFO, one that only
-    sleeps wakes late. A gap is time that something else took: other work, or the host itself.
+    Under SCHED_FIFO the kernel throttles a thread that only spins; a thread that only sleeps wakes
+    late. A gap is time that other work on the processor, or the host, took.
     """
     gap = 0
     before = now_ns()
@@ -122,9 +122,9 @@ def wait_until(deadline_ns, spins):
 
 @compiled
 def between_looks(looks, spins):
-    """What a waiting loop does after its ``looks``-th look in vain: at first it spins, where the
-    peer itself delivers (``spins`` looks), then it yields, there only now and then: a yield takes
-    as long as the message."""
+    """Spin or yield after a waiting loop's ``looks``-th empty poll. If the peer delivers directly
+    (``spins`` > 0), it spins for ``spins`` polls and then yields every 16th poll only, since a
+    yield takes as long as a message; else it yields every time."""
     if looks <= spins or (spins > 0 and looks % _SPINS_A_YIELD != 0):
         pause()
     else:

@@ -1,4 +1,4 @@
-"""What timing on this machine depends on: its badge, and what a reader of times should know."""
+"""What timing on this machine depends on: its badge, and caveats for readers of its times."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PACKAGES = ("gfmhil", "numpy", "numba", "llvmlite", "pyzmq", "python-can")
 
 
 def environment() -> dict[str, Any]:
-    """The machine as plain data; a value that cannot be found out is None. Names no host."""
+    """The machine as plain data, without its host name; a value that is unknown is None."""
     return {
         "kernel": platform.release(),
         "preemption": preemption(),
@@ -42,7 +42,7 @@ def environment() -> dict[str, Any]:
 
 
 def caveats(badge: dict[str, Any]) -> list[str]:
-    """What a reader of times from a machine with this badge should know, a sentence each."""
+    """Caveats about times from a machine with this badge, one sentence each."""
     said = []
     if badge["virtual_machine"] != "no":
         said.append(
@@ -73,13 +73,13 @@ def caveats(badge: dict[str, Any]) -> list[str]:
 
 
 class StealTime:
-    """Share of the processors' time that the host of a virtual machine took since the start, %."""
+    """Share of processor time that a virtual machine's host has stolen since the start, %."""
 
     def __init__(self) -> None:
         self._before = self._ticks()
 
     def percent(self) -> float | None:
-        """None where the kernel does not say."""
+        """The share; None if the kernel does not report it."""
         now = self._ticks()
         if self._before is None or now is None:
             return None
@@ -105,7 +105,7 @@ def preemption() -> str:
 
 
 def virtual_machine() -> str:
-    """``no``, or the hypervisor, as far as the kernel tells."""
+    """``no``, or the hypervisor, as reported by the kernel."""
     flags = re.search(r"^flags\s*:(.*)$", _read(Path("/proc/cpuinfo")) or "", re.M)
     inside = flags is not None and "hypervisor" in flags.group(1).split()
     kind = _read(Path("/sys/hypervisor/type")) or _read(Path("/sys/class/dmi/id/product_name"))
@@ -113,7 +113,7 @@ def virtual_machine() -> str:
 
 
 def may_sched_fifo() -> bool:
-    """Whether this thread may have a real-time priority; tried out and given back."""
+    """Whether this thread may have a real-time priority; tries it and restores the old one."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     return _done(lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))) and _done(
         lambda: os.sched_setscheduler(0, *before)

@@ -1,8 +1,8 @@
-"""A processor that does not rest while a loop in real time sleeps on it between its ticks.
+"""Keeps a processor from going idle while a real-time loop sleeps on it between ticks.
 
-What rests has to wake up. A virtual machine gives a resting processor back to its host, which
-returns it when it likes, so that a loop misses more ticks on an idle machine than on a busy one.
-A thread of idle priority, which runs only when nothing else would, keeps the processor busy.
+An idle processor takes time to wake. A virtual machine gives an idle processor back to its host,
+which may return it late, so that a loop misses more deadlines on an idle machine than on a busy
+one. A thread of idle priority, which runs only when nothing else does, keeps the processor busy.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 
 from gfm_hil.realtime.atomics import intrinsic, load_acquire, pause
 from gfm_hil.realtime.environment import virtual_machine
-from gfm_runtime.compiled import FREE
+from gfm_runtime.compiled import compiled
 
 _STOP, _BEGUN = range(2)
 _OTHER, _IDLE = 0, 5  # SCHED_OTHER, SCHED_IDLE of sched.h on Linux
-_BETWEEN_LOOKS = 1000  # pauses, some 20 µs
+_BETWEEN_LOOKS = 1000  # pauses between two polls of the flag, some 20 µs
 _PATIENCE_S = 1.0
 
 
 @intrinsic
 def _become(typingctx, policy):
-    """Give the calling thread a policy of ordinary priorities: 0, or -1 if it is refused."""
+    """Give the calling thread a non-real-time policy; returns 0, or -1 if refused."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         i32 = ir.IntType(32)
@@ -45,10 +45,10 @@ def _become(typingctx, policy):
     return types.int32(types.int64), make
 
 
-@njit("void(int64[::1])", **FREE)
+@compiled
 def _never_rest(flags):
-    """Spin at idle priority until told to stop. Here and not in Python: a thread of idle priority
-    that waits for its turn must not hold the interpreter's lock."""
+    """Spin at idle priority until told to stop. It is compiled because a thread of idle priority
+    that waits for the processor must not hold the interpreter's lock."""
     if _become(_IDLE) == 0:
         flags[_BEGUN] = 1
         while load_acquire(flags.ctypes.data) == 0:  # _STOP
@@ -57,12 +57,17 @@ def _never_rest(flags):
         _become(_OTHER)
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) the loop of the thread without running it."""
+    _never_rest.compile("void(int64[::1])")
+
+
 @contextmanager
 def kept_awake(processor: int | None, wanted: str) -> Iterator[bool]:
-    """Keep a processor awake meanwhile; whether it is.
+    """Keep a processor awake within this context; yields whether it is.
 
     Args:
-        processor: its number, of those that this thread may use; None: there is none to keep.
+        processor: its number, one that this thread may use; None: keep none awake.
         wanted: ``keep_awake`` of the scenario: "auto" (on a virtual machine), "always" or "never".
     """
     flags = np.zeros(2, np.int64)
@@ -71,6 +76,8 @@ def kept_awake(processor: int | None, wanted: str) -> Iterator[bool]:
     ):
         yield False
         return
+
+    warm_up()  # the thread has no time for it: it is waited for
 
     def work() -> None:
         os.sched_setaffinity(0, {processor})  # of this thread

@@ -1,4 +1,4 @@
-"""What a real-time side asks of the machine before it starts, and does without if refused."""
+"""What a real-time side requests from the system at its start; if refused, it runs without."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 from gfm_hil.core.roles import Side
 
-PRIORITY = 50  # of SCHED_FIFO: above what a desktop runs, below the kernel's own threads
+PRIORITY = 50  # of SCHED_FIFO: above desktop programs, below the kernel's threads
 _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 
 
-_before: set[int] = set()  # processors that this process might use before it chose one
+_before: set[int] = set()  # processors that this process could use before it chose one
 
 
 def ask_for_real_time(side: Side) -> dict[str, Any]:
-    """Ask for a processor, a real-time priority and memory that stays, for this thread.
+    """Request a processor, a real-time priority and locked memory for this thread.
 
-    Threads that it starts later inherit processor and priority; so this comes before the link is
+    Threads that it starts later inherit processor and priority, so call this before the link is
     opened. The loops sleep in every tick: the kernel throttles a SCHED_FIFO thread that only
     spins for 50 ms in each second.
 
@@ -35,9 +35,9 @@ def ask_for_real_time(side: Side) -> dict[str, Any]:
 
 
 def own_processor(side: Side) -> int | None:
-    """The controller takes the last processor it may use, the plant the first.
+    """The controller takes the last processor that it may use, the plant the first.
 
-    With a link's I/O thread beside its main thread a round trip does not wait for a migration.
+    A link's I/O thread shares the processor, so that a round trip does not wait for a migration.
     """
     if not hasattr(os, "sched_setaffinity"):
         return None
@@ -57,7 +57,7 @@ def _fifo() -> str:
 
 
 def ordinary_priority() -> str:
-    """The highest ordinary priority for this thread: for loops that do nothing but spin."""
+    """Give this thread the highest ordinary priority: for loops that only spin."""
     try:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.setpriority(os.PRIO_PROCESS, 0, -20)
@@ -67,7 +67,7 @@ def ordinary_priority() -> str:
 
 
 def _lock_memory() -> bool:
-    """Have every page stay where it is, so that no tick waits for one."""
+    """Lock all pages in memory, so that no tick waits for a page fault."""
     try:
         return bool(ctypes.CDLL(None).mlockall(_LOCK_NOW_AND_LATER) == 0)
     except (AttributeError, OSError):
@@ -75,7 +75,7 @@ def _lock_memory() -> bool:
 
 
 def stand_back() -> None:
-    """Give the calling thread ordinary priority on what processors it had: it only watches."""
+    """Give the calling thread, which only watches, ordinary priority on its former processors."""
     try:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         if _before:

@@ -64,6 +64,11 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return dict(content)
 
 
+def cause(reasons: list[str]) -> str:
+    """The first reason that is not just what one side heard of the other; the first if all are."""
+    return next((reason for reason in reasons if reason not in _HEARSAY), reasons[0])
+
+
 def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     """The outcome that counts among those the sides wrote and the one seen from outside: the most
     severe, and of two such the one seen from outside, or of the side that it happened to."""

@@ -1,4 +1,4 @@
-"""Figures of a run and of several side by side, like the paper's: one quantity a panel."""
+"""Figures of a run, and of several runs in common axes as in the paper: one quantity a panel."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.files import replacing
 from gfm_hil.results.metrics import Rows
-from gfm_hil.results.summary import Spread, nominal_frequency
+from gfm_hil.results.summary import Spread, controlled_by, nominal_frequency
+from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.scenario.model import Scenario
 
 Signals = Mapping[str, Rows]
 
-# Okabe and Ito's colours: told apart by everyone, and in print
+# Okabe and Ito's colours, which colour-blind readers can tell apart, and which print well
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# gaps wide enough to see an identical curve below
+_STYLES = ("-", (0, (5, 4)), (0, (6, 4, 1.5, 4)), (0, (1.5, 4)))
 _POINTS = 4000  # drawn a curve; each pixel column keeps its least and its largest value
 _PIECE = 1 << 18  # ticks read at a time
 _LABELS = 40  # events with a label
@@ -46,7 +49,10 @@ def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
         values = (x[first:last] * factor).reshape(-1, stretch)
         low, high = np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)  # past any NaN
         times = t[first:last].reshape(-1, stretch)
-        pairs.append(np.column_stack([low, high]).ravel())
+        falls = values[:, -1] < values[:, 0]  # a zigzag along a smooth curve would fill its dashes
+        pairs.append(
+            np.column_stack([np.where(falls, high, low), np.where(falls, low, high)]).ravel()
+        )
         moments.append(np.column_stack([times[:, 0], times[:, stretch // 2]]).ravel())
     return (
         np.concatenate([*moments, t[whole:ticks]]),
@@ -69,8 +75,9 @@ def draw_panel(
     axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
 ) -> None:
     """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
-    for t, x, colour, label in curves:
-        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, label=label)
+    for k, (t, x, colour, label) in enumerate(curves):
+        style = _STYLES[k % len(_STYLES)]
+        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, ls=style, label=label)
     dress(axes, title)
     axes.ticklabel_format(useOffset=False)
     low, high = axes.get_ylim()
@@ -79,13 +86,18 @@ def draw_panel(
         axes.set_ylim((low + high - least) / 2, (low + high + least) / 2)
 
 
-def _mark(axes: Sequence[Axes], events: Sequence[dict[str, Any]]) -> None:
-    """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one."""
+def _mark(
+    axes: Sequence[Axes], events: Sequence[dict[str, Any]], colour: str = _GREY, above: int = 20
+) -> None:
+    """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one.
+
+    The labels stand in three rows, the lowest of which is ``above`` points above the panel.
+    """
     if not events:
         return
     for a in axes:  # one artist a panel: thousands of lines take minutes to draw
         lines = LineCollection(
-            [[(e["t"], 0), (e["t"], 1)] for e in events], colors=_GREY, linewidths=0.8,
+            [[(e["t"], 0), (e["t"], 1)] for e in events], colors=colour, linewidths=0.8,
             linestyles=[(0, (4, 3))], zorder=0, transform=a.get_xaxis_transform(),
         )  # fmt: skip
         lines.set_in_layout(False)
@@ -94,10 +106,19 @@ def _mark(axes: Sequence[Axes], events: Sequence[dict[str, Any]]) -> None:
         a.autoscale_view(scaley=False)
     for k, event in enumerate(events[:: -(-len(events) // _LABELS)]):
         axes[0].annotate(
-            event["label"], (event["t"], 1.0), (3, 20 + 10 * (k % 3)),
+            event["label"], (event["t"], 1.0), (3, above + 10 * (k % 3)),
             xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
-            color="#444444",
+            color="#444444" if colour == _GREY else colour,
         )  # fmt: skip
+
+
+def _legend(axes: Axes, columns: int) -> None:
+    """A legend above the panel, where it covers no curve; matplotlib warns that it is slow to look
+    for a free place among many points."""
+    axes.legend(
+        fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), borderpad=0.2,
+        borderaxespad=0, ncols=columns,
+    )  # fmt: skip
 
 
 def _figure(size: tuple[float, float]) -> Figure:
@@ -153,7 +174,7 @@ def draw_signals(
         drawn = [(t, signals[n], c, label) for n, c, label in names if n in signals]
         draw_panel(axes, title, drawn, factor)
         if len(drawn) > 1:
-            axes.legend(fontsize=8, frameon=False, loc="best")
+            _legend(axes, len(drawn))
 
     panel(axes[0], "active power p [p.u.]", ("true_p", blue, "p"), ("ref_P_ref", _GREY, "P_ref"))
     panel(axes[1], "reactive power q [p.u.]", ("true_q", blue, "q"), ("ref_Q_ref", _GREY, "Q_ref"))
@@ -163,17 +184,21 @@ def draw_signals(
     )  # fmt: skip
     panel(axes[3], "voltage V [p.u.]", ("true_V", blue, "V"), ("u_E_u", red, "E_u"))
     panel(axes[4], "DC voltage v_dc [p.u.]", ("true_v_dc", blue, "v_dc"))
-    panel(axes[5], "currents [p.u.]", ("true_i", blue, "|i_dq|"), ("u_i_u", green, "i_u"))
-    _mark([axes[0], *axes[1:]], summary["events"])
-    figure.suptitle(
-        f"{scenario.title} — {' → '.join(summary['laws'])}", fontsize=11, x=0.01,
-        ha="left",
+    # a regulated source ignores i_u
+    i_u = [("u_i_u", green, "i_u")] if scenario.plant.dc_source.mode == "controlled" else []
+    panel(
+        axes[5], "currents [p.u.]", ("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *i_u
     )  # fmt: skip
+    _mark(axes, summary["events"])
+    trips = [{"t": x["t"], "label": reason_name(x["reason"])} for x in summary.get("trips", [])]
+    _mark(axes, trips, red, above=20 + 10 * min(3, len(summary["events"])))
+    title = f"{scenario.title} — {controlled_by(summary)}"
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     return axes
 
 
 def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict[str, Any]) -> Path:
-    """Draw into timing.png how long round trips took and when a fresh u was missing."""
+    """Draw into timing.png how long the round trips took, and when the plant had no fresh u."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
@@ -186,8 +211,12 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict
         beyond = 1 - before / max(1, int(spread.count.sum()))
         left.loglog(np.maximum(spread.ns / 1e3, 0.1), beyond, color=colour, lw=1.2, label=label)
     left.axvline(scenario.T_s * 1e6, color=_GREY, lw=0.8, ls=(0, (4, 3)))
+    left.text(
+        scenario.T_s * 1e6, 0.98, f" T_s = {scenario.T_s * 1e6:g} µs", fontsize=8, va="top",
+        color="#444444", transform=left.get_xaxis_transform(),
+    )  # fmt: skip
     left.set_title("share of ticks beyond a latency [µs]", loc="left", fontsize=9.5)
-    left.legend(fontsize=8, frameon=False)
+    left.legend(fontsize=8, frameon=False, loc="lower left")
     edges, counts = np.linspace(0, summary["duration_s"], _BINS + 1), np.zeros(_BINS)
     ticks = len(timing["plant_received"])
     for first in range(0, ticks, _PIECE):
@@ -217,6 +246,9 @@ def draw_laws(
     """Fill a figure with p, frequency, q and v_dc of several laws, like the paper's."""
     axes = _panels(figure, 4, 1)
     f_n = nominal_frequency(scenario)
+    whole = max(len(s["t"]) for s in runs.values())
+    if all(s["t"][0:1] == 0 for s in runs.values()):  # not only a window of each run
+        whole = scenario.ticks
     for a, (title, name, factor) in zip(
         axes,
         (
@@ -232,7 +264,10 @@ def draw_laws(
             for k, (law, s) in enumerate(runs.items())
         ]
         draw_panel(a, title, curves, factor)
-    axes[0].legend(fontsize=8.5, frameon=False, ncols=min(4, len(runs)), loc="lower right")
+        for t, x, colour, _ in curves:
+            if len(t) < whole:  # this run ended early
+                a.plot(t[len(t) - 1 :], x[len(t) - 1 :] * factor, "x", color=colour)
+    _legend(axes[0], min(4, len(runs)))
     _mark(axes, events)
     figure.suptitle(scenario.title, fontsize=11, x=0.01, ha="left")
     return axes
@@ -241,7 +276,7 @@ def draw_laws(
 def draw_comparison(
     path: Path, scenario: Scenario, runs: Mapping[str, Signals], events: Sequence[dict[str, Any]]
 ) -> None:
-    """Draw several laws side by side into a file, see ``draw_laws``."""
+    """Draw several laws into a file, see ``draw_laws``."""
     figure = _figure(SIZE_LAWS)
     draw_laws(figure, scenario, runs, events)
     _save(figure, path)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.files import write_text
+from gfm_hil.results.summary import END_METRICS, controlled_by
 from gfm_hil.scenario.model import Scenario
 
 _STYLE = """
@@ -18,7 +19,7 @@ table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem
 border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums} td.n,th.n{text-align:right}
 img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
 .status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
-.completed{background:#00734f} .tripped,.safe{background:#b34500}
+.completed,.expected{background:#00734f} .tripped,.safe{background:#b34500}
 .unmet{color:#b34500}
 pre{background:#f6f6f6;padding:1rem;overflow-x:auto;font-size:13px}
 """
@@ -38,11 +39,30 @@ EVENT_COLUMNS = (
     ("damping_ratio", "damping ratio"),
     ("oscillation_hz", "at [Hz]"),
     ("bump_pu", "bump [p.u.]"),
+    ("cut_short", "cut short by"),
 )
 
 
+def event_rows(events: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Keys and titles of ``EVENT_COLUMNS`` of which there is something to show.
+
+    A response that a trip cut short has no final value; its cells say so.
+    """
+    cut = any("cut_short" in e for e in events)
+    return [
+        (key, title)
+        for key, title in EVENT_COLUMNS
+        if any(e.get(key) is not None for e in events) or (cut and key in END_METRICS)
+    ]
+
+
+def as_expected(summary: dict[str, Any]) -> bool:
+    """Whether a run ended early as its scenario expects it to."""
+    return summary["status"] != "completed" and not summary["unmet"]
+
+
 def cell(value: Any) -> str:
-    """A value as people read it; – for none."""
+    """A value as people read it; – for one that is unknown or that there is not."""
     match value:
         case None:
             return "–"
@@ -58,7 +78,8 @@ def write_report(
 ) -> Path:
     """Write report.html into the run folder; returns its path."""
     status = html.escape(summary["status"])
-    columns = [c for c in EVENT_COLUMNS if any(e.get(c[0]) is not None for e in summary["events"])]
+    look, expected = ("expected", ", as expected:") if as_expected(summary) else (status, "")
+    columns = event_rows(summary["events"])
     head = "".join(
         f"<th class={'n' if k else 'l'}>{html.escape(v)}</th>" for k, (_, v) in enumerate(columns)
     )
@@ -72,7 +93,7 @@ def write_report(
         for e in summary["events"]
     )
     facts = [
-        ("laws", " → ".join(summary["laws"])),
+        ("controlled by", controlled_by(summary)),
         ("link, mode", f"{summary['link']}, {summary['mode']}"),
         (
             "simulated",
@@ -85,6 +106,10 @@ def write_report(
     if summary["round_trip_us"]:
         times = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         facts.append(("round trip [µs]", times))
+    facts.append(("date, version", f"{summary['date']}, gfmhil {summary['version']}"))
+    for machine, found in summary["machines"].items():
+        judged = f", doctor: {found['worst']} ({'; '.join(found['findings'])})" if found else ""
+        facts.append(("machine", machine + judged))
     if any(summary["faults"].values()):
         facts.append(("frames refused or lost", str(summary["faults"])))
     rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
@@ -100,7 +125,7 @@ def write_report(
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{html.escape(scenario.title)}</title><style>{_STYLE}</style>
 <h1>{html.escape(scenario.title)}</h1>
-<p><span class="status {status}">{status}</span> {html.escape(summary["reason"])}</p>
+<p><span class="status {look}">{status}</span>{expected} {html.escape(summary["reason"])}</p>
 {unmet}
 <p>{html.escape(scenario.description)}</p>
 <table>{rows}</table>

@@ -19,7 +19,7 @@ from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.recorder import read_recording
 from gfm_hil.results.export.columns import describe
 from gfm_hil.results.metrics import Rows
-from gfm_hil.results.summary import nominal_frequency
+from gfm_hil.results.summary import controlled_by, nominal_frequency
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_runtime.toml_file import read_toml
@@ -217,10 +217,9 @@ class Run:
 
     def __repr__(self) -> str:
         reason = f" ({self.summary['reason']})" if self.summary["reason"] else ""
-        laws = " → ".join(self.summary["laws"])
         where = f", {self.folder}" if self.folder is not None else ""
         return (
-            f"<Run {self.scenario.title!r}: {laws}, {self.status}{reason}, "
+            f"<Run {self.scenario.title!r}: {controlled_by(self.summary)}, {self.status}{reason}, "
             f"{self.summary['duration_s']:g} s in {self.summary['ticks']} ticks{where}>"
         )
 

@@ -1,7 +1,8 @@
-"""The folder of a run: whether it may be used, and what is in it in the end.
+"""The folder of a run: whether it may be used, and how its files are made.
 
-``summary.json`` is written last. While it is not there, the folder still holds all that the other
-files are made of, and ``recover`` can make them again.
+``summary.json`` is written last. While it is missing, the folder still holds all that the other
+files are made of, and ``recover`` can make them again. ``merge_sides`` makes one folder of the two
+that the sides of a run leave if they were started apart.
 """
 
 from __future__ import annotations
@@ -11,15 +12,21 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
+from gfm_hil.core.roles import OUR_CONTROLLER, SIDES, Side
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.log import Outcome, read_log, worst
+from gfm_hil.recording.npz import Column, Table, open_npz, write_npz
 from gfm_hil.recording.recorder import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
@@ -30,7 +37,7 @@ from gfm_hil.recording.recorder import (
     remove_parts,
 )
 from gfm_hil.results.run import Run, load_run
-from gfm_hil.results.summary import summarise
+from gfm_hil.results.summary import origin, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
@@ -189,29 +196,113 @@ def _complete(
     logs = sorted(folder.glob("events_*.jsonl"))
     log = read_log(*(logs or [folder / "events.jsonl"]))
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
-    faults, injected, one_clock = {}, {}, True
+    faults, injected, one_clock, controller, run_id = {}, {}, True, OUR_CONTROLLER, None
     for path in sorted(folder.glob("link_*.json")):
         content = json.loads(path.read_text())
         faults[content["side"]] = {k: v for k, v in content["faults"].items() if v}
         one_clock &= content["one_clock"]
+        controller, run_id = content.get("controller", OUR_CONTROLLER), content.get("run")
         if "injected" in content:
             injected[content["side"]] = content["injected"]
     outcome = worst(log, outside)
-    summary = summarise(scenario, signals, timing, log, outcome, faults, wall_s, one_clock)
+    summary = summarise(
+        scenario, signals, timing, log, outcome, faults, wall_s, one_clock, controller
+    )
+    summary |= origin(scenario, (folder / "scenario.toml").stat().st_mtime) | {"run": run_id}
     if injected:
         summary["injected"] = injected
-    if figures and len(signals["tick"]):
+    run = Run(scenario, summary, signals, labels, log, folder)
+    _conclude(run, timing, figures)
+    return run
+
+
+def merge_sides(first: Path, second: Path, folder: Path) -> Run:
+    """Put what the two sides of a run left, each in a folder of its own, into one run folder.
+
+    Rows end where the plant's recording does, as in a run whose sides were started together.
+
+    Args:
+        first, second: the finished folders of controller and plant, in any order; they stay.
+        folder: new or empty.
+
+    Raises:
+        UserError: a folder is not that of one side, they are not of the same run, or ``folder``
+            is in use or cannot be written.
+    """
+    sides: dict[Side, Run] = {}
+    for run in (load_run(first), load_run(second)):
+        recorded = [s for s, one in zip(SIDES, ("ref_P_ref", "true_p"), strict=True)
+                    if one in run.columns]  # fmt: skip
+        if len(recorded) != 1:
+            said = " and ".join(recorded) or "neither side"
+            raise UserError(f"{run.folder}: holds the recording of {said}, not of one side alone")
+        if recorded[0] in sides:
+            raise UserError(f"{first}, {second}: both are of the {recorded[0]}")
+        sides[recorded[0]] = run
+    plant, controller = sides["plant"], sides["controller"]
+    ids = [run.summary.get("run") for run in (plant, controller)]
+    if ids[0] is None or ids[0] != ids[1]:
+        raise UserError(f"{first}, {second}: are not of the same run: run = {ids[0]!r}, {ids[1]!r}")
+    done = plant.summary["ticks"]
+    check_free(folder, done)
+    log = read_log(*(run.file("events.jsonl") for run in sides.values()))
+    faults, injected, machines = (
+        controller.summary.get(key, {}) | plant.summary.get(key, {})
+        for key in ("faults", "injected", "machines")
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(plant.file("scenario.toml"), folder)
+        write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
+        own = {k: v for k, v in controller.columns.items() if k not in ("tick", "t")}
+        laws = Table.of(laws=np.array(controller.laws))
+        tables = [_padded(plant.columns, done, np.nan), _padded(own, done, np.nan), laws]
+        write_npz(folder / "signals.npz", tables)
+        times = [open_npz(run.file("timing.npz")) for run in (plant, controller)]
+        write_npz(folder / "timing.npz", [_padded(x, done, -1) for x in times])
+        signals, timing, labels = read_recording(folder)
+        summary = summarise(
+            plant.scenario, signals, timing, log, worst(log, None), faults,
+            plant.summary["wall_s"], "clock_drift_ppm" not in controller.summary,
+            plant.summary["controller"],
+        )  # fmt: skip
+        summary |= {key: plant.summary[key] for key in ("date", "version", "run")}
+        summary |= {"machines": machines} | ({"injected": injected} if injected else {})
+        whole = Run(plant.scenario, summary, signals, labels, log, folder)
+        _conclude(whole, timing, figures=True)
+    except OSError as problem:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise UserError(f"{folder}: {problem.strerror or problem}") from None
+    return whole
+
+
+def _padded(columns: Mapping[str, Any], rows: int, missing: float) -> Table:
+    """Columns of one side, cut or filled up with ``missing`` to ``rows``."""
+
+    def read(first: int, last: int) -> Iterator[NDArray[Any]]:
+        for column in columns.values():
+            found = column[first : min(last, len(column))]
+            rest = np.full(last - first - len(found), missing, found.dtype)
+            yield np.concatenate([found, rest])
+
+    return Table({name: column.dtype for name, column in columns.items()}, rows, read)
+
+
+def _conclude(run: Run, timing: Mapping[str, Column], figures: bool) -> None:
+    """Draw a run's figures, write its report and then its summary, and remove what is left over."""
+    assert run.folder is not None
+    folder, scenario, summary = run.folder, run.scenario, run.summary
+    if figures and summary["ticks"]:
         # a second of imports, which the sides' processes do without
         from gfm_hil.results.figures import draw_run
         from gfm_hil.results.report import write_report
 
-        pictures = draw_run(folder, scenario, signals, timing, summary)
+        pictures = draw_run(folder, scenario, run.columns, timing, summary)
         write_report(folder, scenario, summary, pictures)
     sync_folder(folder)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     sync_folder(folder)
     _clear(folder)
-    return Run(scenario, summary, signals, labels, log, folder)
 
 
 def _clear(folder: Path) -> None:

@@ -13,7 +13,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import SIDES
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.inproc import buffers, compile_loop, run_inproc
+from gfm_hil.engine.compiling import compiled_bench
+from gfm_hil.engine.inproc import buffers, run_inproc
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
@@ -22,12 +23,12 @@ from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part, 
 from gfm_hil.results.metrics import Rows
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
-from gfm_hil.results.summary import summarise
+from gfm_hil.results.summary import origin, summarise
 from gfm_hil.scenario.model import INPROC, Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_runtime.assembly import SPARE
 
-__all__ = ["Progress", "Run", "run_scenario"]
+__all__ = ["Notice", "Progress", "Run", "run_scenario"]
 
 Notice = Callable[[str], None]
 
@@ -56,7 +57,8 @@ def run_scenario(
             folder is then left as it was.
     """
     check_free(folder, scenario.ticks)
-    bench = make_bench(scenario)
+    # here, so that two processes do not compile the same at a time
+    bench = compiled_bench(scenario, notice, ("plant",) if controller_command else SIDES)
     folder.mkdir(parents=True, exist_ok=True)
     with in_use(folder):
         outside = None
@@ -67,7 +69,7 @@ def run_scenario(
                 except OSError as problem:
                     raise UserError(f"{folder}: {problem.strerror}") from None
                 if scenario.link.type == INPROC:
-                    began = _run_here(bench, folder, progress, notice, interrupt)
+                    began = _run_here(bench, folder, progress, interrupt)
                 else:
                     command = tuple(controller_command)
                     both = Processes(scenario, folder, progress, notice, interrupt, command)
@@ -80,14 +82,10 @@ def run_scenario(
         return finish(scenario, folder, bench.controller.labels, wall_s, figures, outside)
 
 
-def _run_here(
-    bench: Bench, folder: Path, progress: Progress, notice: Notice, interrupt: Interrupt
-) -> float:
+def _run_here(bench: Bench, folder: Path, progress: Progress, interrupt: Interrupt) -> float:
     """Run both sides in this process; returns when the first tick was run."""
     parts = {side: Part.create(folder, side, bench.scenario.ticks) for side in SIDES}
     timeline = Timeline(bench, folder / "events_both.jsonl", SIDES)
-    notice("compiling the loop (once a machine) …")
-    compile_loop(bench, parts["plant"], parts["controller"])
     began = time.monotonic()
 
     def go_on(ticks: int) -> bool:
@@ -113,7 +111,7 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
     plant, controller = parts or buffers(scenario.ticks)
     plant.signals[:] = np.nan
     timeline = TimelineInMemory(bench)
-    began = time.monotonic()
+    began, date = time.monotonic(), time.time()
     with np.errstate(all="ignore"):  # a diverging run is a result
         run_inproc(bench, plant, controller, timeline, lambda ticks: True)
     timeline.close()
@@ -125,6 +123,7 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
         columns |= {name: np.array(part.signals[:done, j]) for j, name in enumerate(names)}
     outcome = timeline.outcome or Outcome("safe", "ended without a word", done)
     summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
+    summary |= origin(scenario, date)
     return Run(scenario, summary, columns, _known_laws(columns, bench), timeline.lines)
 
 

@@ -2,26 +2,59 @@
 
 from __future__ import annotations
 
+import math
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.log import Outcome
+from gfm_hil.core.roles import OUR_CONTROLLER
+from gfm_hil.recording.log import Outcome, cause
+from gfm_hil.results.doctor import verdict
 from gfm_hil.results.metrics import Rows, blocks, event_metrics
-from gfm_hil.scenario.expectation import unmet
+from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 
 _BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
+_FAULTS = ("tripped", "safe")
+#: metrics of where a response ends, which a response that a trip cuts short does not have
+END_METRICS = ("p_final", "settling_s", "overshoot_pct")
+_STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
 
 
 def nominal_frequency(scenario: Scenario) -> float:
     """Nominal frequency of the scenario's converter, Hz."""
     return load_converter(scenario.plant.converter).bases.omega_b / (2 * np.pi)
+
+
+def origin(scenario: Scenario, began: float) -> dict[str, Any]:
+    """Where a recording comes from: date (UTC), version, this machine and the doctor's verdict.
+
+    Args:
+        scenario: in lockstep nothing depends on the machine, so there is no verdict.
+        began: when the run began, s since 1970.
+    """
+    judged = verdict() if scenario.mode == "realtime" else None
+    return {
+        "date": datetime.fromtimestamp(began, UTC).isoformat(timespec="seconds"),
+        "version": version("gfmhil"),
+        "machines": {platform.node(): judged},
+    }
+
+
+def controlled_by(summary: Mapping[str, Any]) -> str:
+    """The laws of a run, or what a controller that is not ours calls itself."""
+    name = summary.get("controller", OUR_CONTROLLER)
+    if name == OUR_CONTROLLER:
+        return " → ".join(summary["laws"])
+    return name or "a controller that gave no name"
 
 
 def summarise(
@@ -33,27 +66,47 @@ def summarise(
     faults: dict[str, dict[str, int]],
     wall_s: float,
     one_clock: bool = True,
+    controller: str | None = OUR_CONTROLLER,
 ) -> dict[str, Any]:
-    """The summary of one run as plain data.
+    """The summary of one run as plain data; None where the recording does not say.
 
-    ``signals`` and ``timing`` are the columns of the files of these names, shape (ticks,): arrays,
-    or columns of a file, which are read piece by piece.
+    Args:
+        scenario, outcome, log: of the run.
+        signals, timing: the columns of the files of these names, shape (ticks,): arrays, or
+            columns of a file, which are read piece by piece. A side that recorded nothing has no
+            columns.
+        faults: counts of refused frames, by side.
+        wall_s: how long the run took, s.
+        one_clock: both sides ran on one machine.
+        controller: what the controller calls itself; None if it gave no name.
     """
     done = len(signals["tick"])
+    plant, ours = "true_p" in signals, "ref_P_ref" in signals
+    trips = _trips(log, outcome, done, scenario.T_s)
     changes = [e for e in log if e["event"] == "law-active"]
     happened = [e for e in log if "label" in e]
     bumps = {e["tick"]: e["bump_pu"] for e in changes}
     starts = np.array([e["tick"] for e in happened])  # in order, as the log is
     ends = [*np.searchsorted(starts, starts, side="right").tolist()]
     f_n = nominal_frequency(scenario)
+    laws = [scenario.law, *[e["law"] for e in changes]]
     events = []
     for k, e in enumerate(happened):
         stop = int(starts[ends[k]]) if ends[k] < len(starts) else done
         entry = {"t": e["t"], "tick": e["tick"], "type": e["event"], "label": e["label"]}
         if e["event"] == "law":
             entry["bump_pu"] = bumps.get(e["tick"])
-        if "true_p" in signals:
-            entry.update(event_metrics(signals, e["tick"], min(stop, done), scenario.T_s, f_n))
+        if plant:
+            stop = min(stop, done)
+            trip = next((x for x in trips if x["until"] > e["tick"]), None)
+            if trip is not None and (trip["tick"] < stop or stop == done):
+                stop = min(stop, trip["tick"])
+                entry["cut_short"] = f"{reason_name(trip['reason'])} at {trip['t']:g} s"
+            entry.update(event_metrics(signals, e["tick"], stop, scenario.T_s, f_n))
+            if "cut_short" in entry:
+                entry.update(dict.fromkeys(END_METRICS))
+            if e["event"] not in _STEPS:
+                entry["overshoot_pct"] = None
         events.append(entry)
     summary = {
         "title": scenario.title,
@@ -61,22 +114,53 @@ def summarise(
         "reason": outcome.reason,
         "expected": scenario.expect,
         "unmet": unmet(scenario, outcome, log, done),
-        "laws": [scenario.law, *[e["law"] for e in changes]],
+        "controller": controller,
+        "laws": laws if controller == OUR_CONTROLLER else [],
         "link": scenario.link.type,
         "mode": scenario.mode,
         "T_s": scenario.T_s,
         "ticks": done,
         "duration_s": done * scenario.T_s,
         "wall_s": wall_s,
-        "misses": misses(timing, done),
+        "misses": misses(timing, done) if plant else None,
         "round_trip_us": round_trip(timing),
         "faults": faults,
-        "bump_pu": [e["bump_pu"] for e in changes],
+        "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
+        "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
         "events": events,
     }
     if not one_clock and scenario.mode == "realtime":
         summary["clock_drift_ppm"] = clock_drift(timing, scenario.T_s)
     return summary
+
+
+def _trips(
+    log: list[dict[str, Any]], outcome: Outcome, done: int, T_s: float
+) -> list[dict[str, Any]]:
+    """Every trip and safe state of a run: tick, t in s, reason, and the tick ``until`` which it
+    lasted. The reason is that of the side to which it happened."""
+    found: list[dict[str, Any]] = []
+    open_sides: set[str] = set()
+    for e in log:
+        begins = e["event"] in _FAULTS or (e["event"] == "end" and e["status"] in _FAULTS)
+        if begins and open_sides:
+            found[-1]["reason"] = cause([found[-1]["reason"], e["reason"]])
+        elif begins:
+            found.append({"tick": e["tick"], "reason": e["reason"], "until": math.inf})
+        if begins:
+            open_sides.add(e.get("side", ""))
+        elif e["event"] == "recovered":
+            open_sides.discard(e.get("side", ""))
+            if not open_sides:
+                found[-1]["until"] = e["tick"]
+    if outcome.status in _FAULTS:
+        if not open_sides:  # no side lived to write it down
+            found.append({"tick": done, "until": math.inf})
+        found[-1]["reason"] = outcome.reason
+    for trip in found:
+        trip["tick"] = min(trip["tick"], done)
+        trip["t"] = round(trip["tick"] * T_s, 9)
+    return found
 
 
 def misses(timing: Mapping[str, Rows], done: int) -> int:

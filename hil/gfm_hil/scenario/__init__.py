@@ -1,4 +1,4 @@
-"""A scenario: its model and events, loading and checking, and writing it as TOML."""
+"""A scenario: its model and events, loading, checking, and writing as TOML."""
 
 import lazy_loader
 

@@ -1,7 +1,7 @@
-"""What can happen in a scenario, as one pydantic model an event.
+"""The events of a scenario, one pydantic model per kind.
 
-An event is given at a time ``t`` [s] or at a ``tick``. References and law changes are carried out
-by the controller, everything that begins with ``grid`` by the plant; each side takes its own.
+An event has a time ``t`` [s] or a ``tick``. The controller carries out references and law changes,
+the plant all events of the grid; each side selects its own.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
 
 
 class _Event(BaseModel):
-    """When; each kind adds what, and a ``label`` of a few words for figures and reports."""
+    """The time of an event; each kind adds its fields and a short ``label`` for figures and
+    reports."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    t: float | None = Field(None, ge=0, le=86400, description="s")
-    tick: int | None = Field(None, ge=0, le=86_400_000_000)  # 86400 s of 1 us
+    t: float | None = Field(None, ge=0, le=86400, description="time of the event, s")
+    tick: int | None = Field(
+        None, ge=0, le=86_400_000_000, description="tick of the event, in place of t"
+    )
 
     @model_validator(mode="after")
     def _one_time(self) -> _Event:
@@ -35,16 +38,22 @@ class _Event(BaseModel):
         return self.tick if self.tick is not None else round((self.t or 0.0) / T_s)
 
 
+def reference_field(name: str, default: float | None) -> Any:
+    """A field for a reference, described as in the signal table."""
+    s = _REFERENCE[name]
+    return Field(default, description=f"{s.description}, {s.low:g} to {s.high:g} {s.unit}")
+
+
 class Reference(_Event):
     """New references; ``ramp_s`` spreads the change over a time instead of one tick."""
 
-    type: Literal["reference"]
-    V_dcref: float | None = None
-    P_ref: float | None = None
-    omega_g: float | None = None
-    Q_ref: float | None = None
-    V_ref: float | None = None
-    ramp_s: float = Field(0.0, ge=0)
+    type: Literal["reference"] = Field(description="kind of event")
+    V_dcref: float | None = reference_field("V_dcref", None)
+    P_ref: float | None = reference_field("P_ref", None)
+    omega_g: float | None = reference_field("omega_g", None)
+    Q_ref: float | None = reference_field("Q_ref", None)
+    V_ref: float | None = reference_field("V_ref", None)
+    ramp_s: float = Field(0.0, ge=0, description="spreads the change evenly over so many seconds")
 
     @model_validator(mode="after")
     def _in_range(self) -> Reference:
@@ -70,29 +79,32 @@ def check_reference(name: str, value: float) -> None:
 
 
 class LawChange(_Event):
-    """Change to another law, bumpless."""
+    """Change to another law, without a bump."""
 
-    type: Literal["law"]
-    law: str
+    type: Literal["law"] = Field(description="kind of event")
+    law: str = Field(description="catalogue name or law file")
 
     def label(self) -> str:
         return f"law {self.law}"
 
 
 class Gains(_Event):
-    """Other gains of the active law, by the names in its file; bumpless. What is tied follows."""
+    """New gains of the active law, by the names in its file, without a bump. Tied parameters
+    follow."""
 
-    type: Literal["gains"]
-    values: dict[str, float] = Field(min_length=1)
+    type: Literal["gains"] = Field(description="kind of event")
+    values: dict[str, float] = Field(
+        min_length=1, description="a table of names and numbers, e.g. { D_p = 0.02 }"
+    )
 
     def label(self) -> str:
         return ", ".join(f"{name} = {value:g}" for name, value in self.values.items())
 
 
 class Reset(_Event):
-    """Back to the scenario's start from a trip or the safe state, for runs that wait there."""
+    """Return from a trip or the safe state to the scenario's start, for runs that wait there."""
 
-    type: Literal["reset"]
+    type: Literal["reset"] = Field(description="kind of event")
 
     def label(self) -> str:
         return "reset"
@@ -101,9 +113,9 @@ class Reset(_Event):
 class GridFrequency(_Event):
     """Grid frequency: a step, or a ramp at ``rate`` [Hz/s]."""
 
-    type: Literal["grid-frequency"]
-    f_hz: float = Field(gt=0, le=1000)
-    rate: float | None = Field(None, gt=0)
+    type: Literal["grid-frequency"] = Field(description="kind of event")
+    f_hz: float = Field(gt=0, le=1000, description="Hz")
+    rate: float | None = Field(None, gt=0, description="Hz/s; a step if none")
 
     def label(self) -> str:
         return f"grid {self.f_hz:g} Hz" + (f" at {self.rate:g} Hz/s" if self.rate else "")
@@ -112,10 +124,10 @@ class GridFrequency(_Event):
 class GridVoltage(_Event):
     """Grid voltage [p.u.]: a step, a ramp at ``rate`` [p.u./s], or a sag of ``duration`` [s]."""
 
-    type: Literal["grid-voltage"]
-    V_g: float = Field(ge=0, le=1.5)
-    rate: float | None = Field(None, gt=0)
-    duration: float | None = Field(None, gt=0)
+    type: Literal["grid-voltage"] = Field(description="kind of event")
+    V_g: float = Field(ge=0, le=1.5, description="p.u.")
+    rate: float | None = Field(None, gt=0, description="p.u./s; a step if none")
+    duration: float | None = Field(None, gt=0, description="s; then the voltage returns (a sag)")
 
     @model_validator(mode="after")
     def _ramp_or_sag(self) -> GridVoltage:
@@ -130,8 +142,8 @@ class GridVoltage(_Event):
 class PhaseJump(_Event):
     """The grid's angle jumps ahead by ``degrees``."""
 
-    type: Literal["grid-phase-jump"]
-    degrees: float = Field(ge=-180, le=180)
+    type: Literal["grid-phase-jump"] = Field(description="kind of event")
+    degrees: float = Field(ge=-180, le=180, description="by which the grid's angle jumps ahead")
 
     def label(self) -> str:
         return f"phase jump {self.degrees:g}°"
@@ -140,9 +152,9 @@ class PhaseJump(_Event):
 class GridImpedance(_Event):
     """The line becomes ``L_g`` and ``R_g`` times its nominal elements."""
 
-    type: Literal["grid-impedance"]
-    L_g: float = Field(gt=0, le=1e12)
-    R_g: float = Field(ge=0, le=1e12)
+    type: Literal["grid-impedance"] = Field(description="kind of event")
+    L_g: float = Field(gt=0, le=1e12, description="factor on the converter file's line inductor")
+    R_g: float = Field(ge=0, le=1e12, description="factor on the converter file's line resistor")
 
     def label(self) -> str:
         return f"line L × {self.L_g:g}, R × {self.R_g:g}"
@@ -151,8 +163,8 @@ class GridImpedance(_Event):
 class Breaker(_Event):
     """The grid breaker opens onto the local load, or closes again."""
 
-    type: Literal["grid-breaker"]
-    closed: bool
+    type: Literal["grid-breaker"] = Field(description="kind of event")
+    closed: bool = Field(description="false opens it onto the local load")
 
     def label(self) -> str:
         return "grid breaker " + ("closes" if self.closed else "opens")
@@ -175,7 +187,7 @@ CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 
 def apply_grid_event(event: Any, par: Any, st: Any) -> None:
-    """Carry out one of the plant's events on its records, between two ticks."""
+    """Apply one of the plant's events to its records, between two ticks."""
     from gfm_plant import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
 
     f_b = float(par[0]["omega_b"]) / (2 * math.pi)

@@ -1,16 +1,16 @@
-"""What a scenario expects of a run's end: status, reason and time, and whether that came.
+"""The end of a run that a scenario expects, status, reason and time, and the check of it.
 
-The reason of an end begins with its name, as the lists of the plant and the controller give it;
-what follows the name's colon (quantity, value, threshold, time) is for people.
+The reason of an end begins with its name, from the lists of the plant and the controller; the text
+after the colon (quantity, value, threshold, time) is for the reader.
 """
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from gfm_plant.names import CONTROLLER, CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS
+from gfm_runtime.errors import meant
 from gfm_runtime.states import OK, OPERATOR, PLANT_TRIP, REASONS
 
 if TYPE_CHECKING:
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 CONTROLLER_GONE = "the controller's process is gone"
 
-#: the names of the reasons that a run may end for, by its status
+#: names of the possible reasons of a run's end, by its status
 END_REASONS: dict[str, tuple[str, ...]] = {
     "completed": (),
     "tripped": (
         *(name for code, name in TRIP_REASONS.items() if code not in (0, CONTROLLER)),
-        REASONS[PLANT_TRIP],  # all that the controller's side alone comes to know
+        REASONS[PLANT_TRIP],  # the controller's side knows no more than this
     ),
     "safe": (
         *(name for k, name in enumerate(REASONS) if k not in (OK, PLANT_TRIP, OPERATOR)),
@@ -36,12 +36,12 @@ END_REASONS: dict[str, tuple[str, ...]] = {
 
 
 def reason_name(reason: str) -> str:
-    """The name with which the reason of an end begins."""
+    """The name at the beginning of the reason of an end."""
     return reason.split(":")[0]
 
 
 def check_expectation(scenario: Scenario) -> list[str]:
-    """What is wrong with ``expect_reason`` and ``expect_after``, one line a mistake."""
+    """The mistakes in ``expect_reason`` and ``expect_after``, one line each."""
     problems = []
     names, reason = END_REASONS[scenario.expect], scenario.expect_reason
     given = {"expect_reason": reason, "expect_after": scenario.expect_after}
@@ -52,11 +52,9 @@ def check_expectation(scenario: Scenario) -> list[str]:
             if value is not None
         ]
     elif reason is not None and reason not in names:
-        close = difflib.get_close_matches(reason, names, n=1)
-        meant = f"did you mean {close[0]!r}? " if close else ""
         problems.append(
-            f"expect_reason = {reason!r:.80}: {meant}expect = {scenario.expect!r} takes "
-            f"one of {list(names)}"
+            f"expect_reason = {reason!r:.80}: expect = {scenario.expect!r} takes "
+            f"one of {list(names)}{meant(reason, names)}"
         )
     if scenario.expect_after is not None and scenario.expect_after >= scenario.duration:
         problems.append(
@@ -72,11 +70,11 @@ def unmet(
     """The parts of the expectation that a run did not meet, one sentence each; empty if it met all.
 
     Args:
-        scenario: with what it expects.
+        scenario: the scenario with its expectation.
         outcome: how the run ended.
-        log: every line of the run's log. A run that waits after a trip says there when it
-            tripped, which counts rather than the end of the waiting.
-        done: ticks recorded, the time of an end that no side lived to write down.
+        log: every line of the run's log. If the run waits after a trip, the time of the trip in
+            the log counts, not the end of the wait.
+        done: ticks recorded: the time of the end if both sides died before they could log it.
     """
     if outcome.status != scenario.expect:
         return [f"expect = {scenario.expect!r}, but the run ended as {outcome.status!r}"]
@@ -95,7 +93,7 @@ def unmet(
 
 
 def _ended_at(outcome: Outcome, log: Sequence[dict[str, Any]], done: int) -> int:
-    """The tick of what ended the run, or of what it waited for to its end."""
+    """The tick of the event that ended the run, or after which the run waited to its end."""
     of_it = [e for e in log if e.get("reason") == outcome.reason]
     waited = [e["tick"] for e in of_it if e["event"] == outcome.status]
     ended = [e["tick"] for e in of_it if e["event"] == "end" and e["status"] == outcome.status]

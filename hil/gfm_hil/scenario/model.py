@@ -1,11 +1,13 @@
-"""What a scenario consists of, as pydantic models: all that can be said without trying it out."""
+"""The parts of a scenario as pydantic models, with all checks that need no plant or laws."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -21,11 +23,12 @@ from gfm_hil.scenario.events import (
     Reset,
     apply_grid_event,
     check_reference,
+    reference_field,
 )
 from gfm_hil.scenario.expectation import check_expectation
-from gfm_plant import Plant, load_converter, make_plant
-from gfm_runtime import LawError, discretise, law_file, load_law
-from gfm_runtime.errors import printable
+from gfm_plant import ConverterParameters, Plant, load_converter, make_plant
+from gfm_runtime import Law, LawError, discretise, law_file, load_law
+from gfm_runtime.errors import meant, printable
 from gfm_runtime.signals import REF_NAMES, table_hash
 from gfm_runtime.toml_file import read_toml
 
@@ -59,11 +62,12 @@ class Link(_Model):
 
     @model_validator(mode="after")
     def _known(self) -> Link:
-        if self.type == INPROC:  # endpoint and options wait for the day there is a link again
+        if self.type == INPROC:  # ignore endpoint and options: another link may need them
             return self
         if self.type not in link_names():
+            known = sorted([INPROC, *link_names()])
             raise ValueError(
-                f"type = {self.type!r}: must be one of {sorted([INPROC, *link_names()])}"
+                f"type = {self.type!r}: must be one of {known}{meant(self.type, known)}"
             )
         kind = link_kind(self.type)
         if self.endpoint is not None:
@@ -71,7 +75,8 @@ class Link(_Model):
         try:
             options = kind.options.model_validate(self.options)
         except ValidationError as problem:
-            raise ValueError("; ".join(f"options.{line}" for line in lines(problem))) from None
+            wrong = lines(problem, kind.options)
+            raise ValueError("; ".join(f"options.{line}" for line in wrong)) from None
         kind.check_both(self.endpoint, options)
         return self
 
@@ -83,11 +88,11 @@ def _hash(content: Any) -> str:
 class References(_Model):
     """Y_ref at the start, p.u."""
 
-    V_dcref: float = 1.0
-    P_ref: float = 0.5
-    omega_g: float = 1.0
-    Q_ref: float = 0.0
-    V_ref: float = 1.0
+    V_dcref: float = reference_field("V_dcref", 1.0)
+    P_ref: float = reference_field("P_ref", 0.5)
+    omega_g: float = reference_field("omega_g", 1.0)
+    Q_ref: float = reference_field("Q_ref", 0.0)
+    V_ref: float = reference_field("V_ref", 1.0)
 
     @model_validator(mode="after")
     def _in_range(self) -> References:
@@ -96,12 +101,12 @@ class References(_Model):
         return self
 
     def vector(self) -> list[float]:
-        """In the order of the signal table."""
+        """The references in the order of the signal table."""
         return [getattr(self, name) for name in REF_NAMES]
 
 
 class LatePolicy(_Model):
-    """Real time: what to do about frames that are not there at their deadline."""
+    """Real time: what to do if a frame misses its deadline."""
 
     hold: int = Field(
         200, ge=0, le=10**9, description="ticks in a row to hold the last value, then SAFE"
@@ -125,11 +130,13 @@ class LatePolicy(_Model):
 class Scenario(_Model):
     """One experiment."""
 
-    title: str
-    description: str = ""
+    title: str = Field(description="of figures and reports")
+    description: str = Field("", description="for people")
     duration: float = Field(gt=0, le=86400, description="s")
     T_s: float = Field(1e-4, ge=1e-6, le=0.1, description="sampling time, s")
-    mode: Literal["lockstep", "realtime"] = "lockstep"
+    mode: Literal["lockstep", "realtime"] = Field(
+        "lockstep", description="lockstep: simulated time; realtime: the clock"
+    )
     law: str = Field("mimo-gfm", description="catalogue name or path of a law file")
     seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
     expect: Literal["completed", "tripped", "safe"] = Field(
@@ -158,11 +165,17 @@ class Scenario(_Model):
         description="laws made ready besides those that events name, for an operator to change to",
     )
     compare: list[str] = Field(default_factory=list, description="laws that `compare` puts beside")
-    references: References = References()
-    link: Link = Link()
-    late_policy: LatePolicy = LatePolicy()
-    plant: Plant = Plant()
-    events: list[Event] = Field(default_factory=list, max_length=10_000)
+    references: References = Field(References(), description="references Y_ref at the start")
+    link: Link = Field(Link(), description="how the two sides exchange frames")
+    late_policy: LatePolicy = Field(
+        LatePolicy(), description="real time: what happens to late frames"
+    )
+    plant: Plant = Field(Plant(), description="converter, grid and instruments")
+    events: list[Event] = Field(
+        default_factory=list,
+        max_length=10_000,
+        description="what happens in the run, each at its time",
+    )
 
     @property
     def ticks(self) -> int:
@@ -170,17 +183,17 @@ class Scenario(_Model):
         return round(self.duration / self.T_s)
 
     def laws(self) -> list[str]:
-        """Names of every law that the run uses, the first one first, each once."""
+        """Names of all laws that the run uses, each once, the initial law first."""
         changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
         return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
 
     def sorted_events(self) -> list[Event]:
-        """Events in order of their tick; those of one tick in the order of the file."""
+        """Events in order of their tick; within a tick in the order of the file."""
         return sorted(self.events, key=lambda e: e.at(self.T_s))
 
     def digest(self) -> str:
-        """Hash over what both sides must agree on: scenario, signal table, and what is in the
-        law and converter files, wherever each machine keeps them."""
+        """Hash of all that both sides must agree on: scenario, signal table, and the content of
+        the law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "compare"}
         about |= {"expect", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
@@ -193,7 +206,7 @@ class Scenario(_Model):
         return _hash([content, events, self.laws_digest(), table_hash()])
 
     def laws_digest(self) -> str:
-        """Hash over the content of every law that the run uses."""
+        """Hash of the content of every law that the run uses."""
         return _hash([law_file(name).model_dump() for name in self.laws()])
 
     @model_validator(mode="after")
@@ -237,8 +250,8 @@ __all__ = [
 ]
 
 SCENARIO_FOLDERS = (
-    Path(__file__).resolve().parents[1] / "scenarios",  # a wheel carries them here
-    Path(__file__).resolve().parents[3] / "scenarios",  # a checkout has them here
+    Path(__file__).resolve().parents[1] / "scenarios",  # in a wheel
+    Path(__file__).resolve().parents[3] / "scenarios",  # in a checkout
 )
 
 
@@ -252,7 +265,7 @@ def find_scenario(name: str) -> Path:
 
 
 def find_file(kind: str, name: str, pattern: str) -> Path:
-    """The file of that path, or the shipped one of that name; ``kind`` is for the message.
+    """The file at that path, or the shipped file of that name; ``kind`` is for the message.
 
     Raises:
         UserError: neither exists.
@@ -260,14 +273,15 @@ def find_file(kind: str, name: str, pattern: str) -> Path:
     given, shipped = Path(name), _shipped(pattern)
     try:
         is_file, exists = given.is_file(), given.exists()
-    except OSError as problem:  # such as a name of 300 characters
+    except OSError as problem:  # for example a name of 300 characters
         raise UserError(printable(f"{kind} {name}: {problem.strerror}")) from None
     if is_file:
         return given
     if given.name.removesuffix(".toml") in shipped:
         return shipped[given.name.removesuffix(".toml")]
     what = "is not a regular file" if exists else "no such file"
-    raise UserError(printable(f"{kind} {name}: {what}; shipped are {sorted(shipped)}"))
+    known = f"shipped are {sorted(shipped)}{meant(given.stem, shipped)}"
+    raise UserError(printable(f"{kind} {name}: {what}; {known}"))
 
 
 def _shipped(pattern: str) -> dict[str, Path]:
@@ -279,17 +293,23 @@ def shipped_scenarios() -> list[str]:
     return sorted(_shipped("*.toml"))
 
 
-def load_scenario(given: str | Path | Scenario | dict[str, Any], **changed: Any) -> Scenario:
+def load_scenario(
+    given: str | Path | Scenario | dict[str, Any],
+    options: Mapping[str, str] = MappingProxyType({}),
+    **changed: Any,
+) -> Scenario:
     """Read, override and check a scenario, its laws and its plant.
 
     Args:
         given: path or shipped name; content of a file; or a checked scenario.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
-            None leaves the file's value. Another link than the file's forgets its endpoint
+            None leaves the file's value. A link other than the file's drops the file's endpoint
             and options.
+        options: what a person calls an override, by its name in ``changed``, e.g.
+            ``{"link__type": "--link"}``; messages name it in place of the file.
 
     Raises:
-        UserError: one line a mistake, each with its path, the value and what is allowed.
+        UserError: one line per mistake, each with its path, the value and what is allowed.
     """
     where, content = "scenario", {}
     if isinstance(given, str | Path):
@@ -304,7 +324,7 @@ def load_scenario(given: str | Path | Scenario | dict[str, Any], **changed: Any)
         content = copy.deepcopy(given)
     link, chosen = content.get("link"), changed.get("link__type")
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
-        link.pop("endpoint", None)  # they are of the file's own link
+        link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
     for key, value in changed.items():
         if value is not None:
@@ -312,34 +332,70 @@ def load_scenario(given: str | Path | Scenario | dict[str, Any], **changed: Any)
             *parents, last = key.split("__")
             for parent in parents:
                 table = table.setdefault(parent, {}) if isinstance(table, dict) else None
-            if isinstance(table, dict):  # else the check says what the file has instead
+            if isinstance(table, dict):  # else the check reports what the file has instead
                 table[last] = value
-    return check_scenario(content, where)
+    overrides = {
+        tuple(key.split("__")): f"{options.get(key, key.replace('__', '.'))} {value}"
+        for key, value in changed.items()
+        if value is not None
+    }
+    return check_scenario(content, where, overrides)
 
 
-def check_scenario(content: dict[str, Any], where: str) -> Scenario:
+def check_scenario(
+    content: dict[str, Any],
+    where: str,
+    overrides: Mapping[tuple[str, ...], str] = MappingProxyType({}),
+) -> Scenario:
     """The scenario of a dict, with its laws and its plant tried out.
+
+    Args:
+        content: plain data.
+        where: the file it comes from.
+        overrides: what does not come from there, by its path: an option with its value.
 
     Raises:
         UserError: as ``load_scenario``.
     """
-    where = printable(where)
+
+    def source(path: tuple[str | int, ...]) -> str:
+        """Where the value at a path comes from; a table may come from several places."""
+        for part, option in overrides.items():
+            if path[: len(part)] == part:
+                return option
+        inside = [option for part, option in overrides.items() if part[: len(path)] == path]
+        return " with ".join([where, ", ".join(inside)] if inside else [where])
+
     try:
         scenario = Scenario.model_validate(content)
     except ValidationError as problem:
-        raise UserError("\n".join(f"{where}: {line}" for line in lines(problem))) from None
-    try:
-        for law in [*scenario.laws(), *scenario.compare]:
+        raise UserError("\n".join(lines(problem, Scenario, source))) from None
+    wrong: list[str] = []
+    for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
+        ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
+        try:
             for stage in load_law(law).laws:
-                discretise(stage, scenario.T_s)
+                _try_law(law, stage, scenario.T_s)
+        except LawError as problem:
+            wrong += [ours + line for line in problem.lines]
+    try:
         _try_plant(scenario)
-    except (LawError, UserError) as problem:
-        raise UserError(f"{where}: {problem}") from None
+    except UserError as problem:
+        wrong.append(f"{source(('plant',))}: {problem}")
+    if wrong:
+        raise UserError("\n".join(map(printable, wrong)))
     return scenario
 
 
+def _try_law(name: str, stage: Law, T_s: float) -> None:
+    try:
+        discretise(stage, T_s)
+    except LawError as problem:
+        raise problem.within(f"law {name}") from None
+
+
 def _try_plant(scenario: Scenario) -> None:
-    """Make the plant and every line that its events give it, which may be too fast to resolve."""
+    """Build the plant with every line of its events; a line may be too fast to simulate."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
     if scenario.plant.converter.endswith(".toml"):
         try:
@@ -349,7 +405,8 @@ def _try_plant(scenario: Scenario) -> None:
     try:
         par, st = make_plant(scenario.plant, scenario.T_s)
     except ValidationError as problem:
-        raise UserError("; ".join(f"{converter}: {line}" for line in lines(problem))) from None
+        wrong = lines(problem, ConverterParameters)
+        raise UserError("; ".join(f"{converter}: {line}" for line in wrong)) from None
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):

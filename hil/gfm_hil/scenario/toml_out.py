@@ -1,4 +1,4 @@
-"""A scenario as TOML text, with every default written out (the standard library only reads it)."""
+"""A scenario as TOML text with every default (the standard library only reads TOML)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gfm_hil.scenario.model import Scenario
 
 
 def scenario_toml(scenario: Scenario) -> str:
-    """The resolved scenario; ``load_scenario`` reads it back to an equal one."""
+    """The resolved scenario as TOML; ``load_scenario`` reads it back to an equal one."""
     return toml_text(scenario.model_dump(mode="json", exclude_none=True))
 
 

@@ -1,4 +1,4 @@
-"""Who may see a scope, and who may touch: hosts, origins, the token, and the page's policy."""
+"""Access to a scope: hosts, origins, the token for control, and the page's security policy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 from websockets.datastructures import Headers
 
-#: sent with every answer: nothing from elsewhere, nothing inline, in nobody's frame
+#: headers of every answer: no foreign content, no inline code, no embedding in frames
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -29,11 +29,11 @@ _AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d+)?")  # of RFC 3986
 
 
 class Access:
-    """The rules of one server.
+    """Access rules of one server.
 
     Args:
-        names: hosts, beside addresses, localhost and this machine's name, by which it is reached.
-        operators: names of those who may control; each gets a token of his own.
+        names: host names of the server besides addresses, localhost and this machine's name.
+        operators: names of the operators who may control; each gets a token.
 
     Attributes:
         tokens: by the name of the operator.
@@ -44,11 +44,11 @@ class Access:
         self.tokens = {name: secrets.token_urlsafe(16) for name in operators}
 
     def refusal(self, headers: Headers) -> str:
-        """Why a request is refused; empty if it is not.
+        """Why a request is refused; empty if it is accepted.
 
-        A page of somebody else's must not reach the scope through the browser of whoever looks at
-        it: not by its own address (the origin differs) and not by a name of its own that it lets
-        point here (a name that is not ours). Addresses cannot be made to point elsewhere.
+        A foreign page in a user's browser must not reach the scope: not from its own address (the
+        origin differs), and not through DNS rebinding, a foreign name that resolves to this server
+        (the host is not ours). An address in place of a name cannot be rebound.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._ours(hosts[0]):
@@ -70,11 +70,11 @@ class Access:
 
     @property
     def token(self) -> str:
-        """Of the first operator."""
+        """The first operator's token."""
         return next(iter(self.tokens.values()))
 
     def operator(self, token: str) -> str:
-        """The name of the operator who was given this token; empty if there is none."""
+        """The name of the operator with this token; empty if there is none."""
         given = token.encode()
         names = [
             n for n, known in self.tokens.items() if hmac.compare_digest(given, known.encode())

@@ -1,4 +1,4 @@
-"""What a scope can show: recorded columns, named, with units, and figures of the loop itself."""
+"""The channels of a scope: recorded columns with names and units, and figures of the loop."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Channel:
 
     Attributes:
         name: in messages between page and server.
-        group: what it belongs to: y, u, ref, grid, plant or loop.
-        symbol, unit, description: for people.
-        least: the smallest range of values worth the full height of a plot, in ``unit``.
-        needs: columns of the recording that it is made of.
-        of: its values from those columns' rows; NaN where there is none.
+        group: y, u, ref, grid, plant or loop.
+        symbol, unit, description: for display.
+        least: the smallest range of values that fills the height of a plot, in ``unit``.
+        needs: columns of the recording from which it is computed.
+        of: computes its values from those columns' rows; NaN if there is none.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Channel:
     of: Callable[..., Values]
 
     def about(self) -> dict[str, Any]:
-        """Plain data for the page."""
+        """The channel as plain data for the page."""
         content = asdict(self)
         del content["needs"], content["of"]
         return content
@@ -58,7 +58,7 @@ def make_channels(T_s: float, f_b: float) -> tuple[Channel, ...]:
 
     Args:
         T_s: sampling time, s.
-        f_b: frequency that 1 p.u. stands for, Hz.
+        f_b: base frequency, Hz.
     """
     found = [
         *(_of_table(s, "y", f"y_{s.name}", f_b) for s in group("y")),
@@ -90,7 +90,7 @@ def _as_is(values: Values) -> Values:
 
 
 def _loop(T_s: float) -> tuple[Channel, ...]:
-    """Figures of the loop from the plant's clock; -1 in a column means that it never happened."""
+    """Figures of the loop from the plant's clock; -1 in a column: the event did not happen."""
     period = T_s * 1e9
 
     def slack(scheduled: Values, received: Values) -> Values:

@@ -1,8 +1,8 @@
-"""Least and greatest values of every channel over ever longer stretches of ticks.
+"""Minima and maxima of every channel over blocks of ticks of increasing length.
 
-Whatever a plot leaves out, it must not leave out a peak. Level l holds the extremes of stretches of
-8^l ticks, made once as ticks come in; level 0 is the recording itself. Any window of any length is
-then read from the level that is just fine enough.
+A decimated plot must not miss a peak. Level l holds the extremes of blocks of 8^l ticks, computed
+once as ticks arrive; level 0 is the recording itself. A window of any length is read from the
+coarsest level that resolves it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gfm_hil.scope.channels import Channel
 from gfm_hil.scope.record import Record
 
-STEP = 8  # stretches of one level in one of the next
-_AT_ONCE = STEP**5  # ticks taken in between two looks at something else
+STEP = 8  # blocks of one level in one block of the next
+_AT_ONCE = STEP**5  # most ticks processed per update
 
 Extremes = NDArray[np.float32]
 
@@ -25,17 +25,17 @@ class Pyramid:
     """The extremes of a recording.
 
     Args:
-        record: to read from.
-        channels: all that may be asked for.
+        record: the recording.
+        channels: all channels that can be requested.
     """
 
     def __init__(self, record: Record, channels: Sequence[Channel]) -> None:
         self.record, self.channels = record, tuple(channels)
         self._index = {channel.name: k for k, channel in enumerate(self.channels)}
         self._levels: list[tuple[Extremes, Extremes]] = []
-        self._full: list[int] = []  # stretches done, by level
+        self._full: list[int] = []  # blocks done, by level
         size = record.capacity // STEP
-        while size:  # memory that is not touched is not taken
+        while size:  # untouched memory is not allocated
             shape = (len(self.channels), size)
             self._levels.append((np.empty(shape, np.float32), np.empty(shape, np.float32)))
             self._full.append(0)
@@ -51,11 +51,11 @@ class Pyramid:
         return self.channels[self._index[name]].read(self.record.columns, first, last)
 
     def misses(self, before: int) -> int:
-        """Ticks without a fresh u among those before this one."""
+        """Number of ticks before ``before`` that had no fresh u."""
         return int(np.searchsorted(self._missed, before))
 
     def update(self) -> bool:
-        """Take in what has been recorded since; False if there is more than was taken."""
+        """Process ticks recorded since the last call; False if more are left."""
         there = self.record.done()
         self.done = min(there, self.done + _AT_ONCE)
         if self._levels:
@@ -85,7 +85,7 @@ class Pyramid:
             self._full[level] += n
 
     def width(self, ticks: int, bins: int) -> int:
-        """Ticks in each bin so that ``ticks`` make at least ``bins`` of them, if there are."""
+        """Ticks per bin so that ``ticks`` give at least ``bins`` bins, if there are enough."""
         width = max(1, ticks // bins)
         level = STEP ** min(len(self._levels), int(np.log(width) / np.log(STEP) + 1e-9))
         return width // level * level
@@ -93,14 +93,14 @@ class Pyramid:
     def bins(self, name: str, first: int, last: int, width: int) -> tuple[Extremes, Extremes]:
         """Extremes over bins first … last-1 of ``width`` ticks each, bin k from tick k·width.
 
-        The last one may be incomplete; it must not be empty.
+        The last bin may be incomplete; it must not be empty.
         """
         channel, level, unit = self._index[name], -1, 1
         while width % (unit * STEP) == 0 and level + 1 < len(self._levels):
             level, unit = level + 1, unit * STEP
         each = width // unit
         end = self.done if level < 0 else self._full[level] * unit
-        whole = max(first, min(last, end // width))  # bins of which this level has all
+        whole = max(first, min(last, end // width))  # bins before it are complete on this level
         if level < 0:
             low = high = self.values(name, first * width, whole * width)
         else:
@@ -117,7 +117,7 @@ class Pyramid:
         return lows, highs
 
     def _extremes(self, channel: int, first: int, last: int, level: int) -> tuple[float, float]:
-        """Of ticks first … last-1, first a multiple of the level's stretch, from ``level`` down."""
+        """Extremes of ticks first … last-1, from ``level`` down; first is a multiple of a block."""
         low = high = np.float32(np.nan)
         while first < last:
             if level < 0:

@@ -1,4 +1,4 @@
-"""The recording behind a scope: of a run that is going on, or of one that is over."""
+"""The recording behind a scope: of a run in progress or of a finished one."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from gfm_hil.scope.channels import Columns
 from gfm_plant import load_converter
 from gfm_runtime import LawError, load_law
 
-Law = dict[str, str]  #: label and name of a law, and in words what of it is not as in its file
+Law = dict[str, str]  #: label and name of a law, and in words its changes against its file
 
-_BEHIND = 2000  # ticks that the controller's rows may be behind before they are not waited for
+_BEHIND = 2000  # ticks: wait for the side that is behind, up to this lag
 _COLUMNS = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
 _TIMES = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
 
@@ -41,10 +41,10 @@ class Record:
 
     Attributes:
         folder: of the run.
-        scenario: as resolved; plain data, so that a run can be looked at without its law files.
-        columns: of what has been recorded so far.
-        laws: what the indices in column ``law`` mean, see ``_law``.
-        live: the run may still go on.
+        scenario: the resolved one; plain data, so that a run can be shown without its law files.
+        columns: all rows recorded so far.
+        laws: the laws by the indices in column ``law``, see ``_law``.
+        live: the run may still be in progress.
     """
 
     folder: Path
@@ -58,14 +58,14 @@ class Record:
         self.capacity = round(self.scenario["duration"] / self.T_s)
         self._parts: dict[str, Part] = {}
         self._done = 0
-        self._met = False  # the run's desks
+        self._met = False  # whether the run's desks have been seen
 
     @property
     def f_b(self) -> float:
-        """Frequency that 1 p.u. stands for, Hz.
+        """Base frequency, Hz.
 
         Raises:
-            UserError: the scenario's converter is not to be had.
+            UserError: the scenario's converter cannot be loaded.
         """
         name = self.scenario["plant"]["converter"]
         try:
@@ -74,7 +74,7 @@ class Record:
             raise UserError(f"plant.converter = {name!r}: {problem}") from None
 
     def done(self) -> int:
-        """Ticks that can be read; also finds the parts of a run that has just begun."""
+        """Number of ticks that can be read; also opens the parts of a run that has just begun."""
         if not self.live:
             return self._done
         for side in ("plant", "controller"):
@@ -82,34 +82,34 @@ class Record:
                 self._parts[side] = part
                 self.columns = {**self.columns, **_columns(side, part)}
         counts = [int(part.progress[0]) for part in self._parts.values()]
-        if counts:  # rows of both, unless one side is not there or has stopped recording
+        if counts:  # rows of both sides, unless one has none or has stopped recording
             least, most = min(counts), max(counts)
             self._done = max(self._done, least if most - least < _BEHIND else most - _BEHIND)
         return self._done
 
     def finish(self) -> None:
-        """The run is over: nothing is appended any more."""
+        """Note that the run is over: nothing is appended any more."""
         counts = [int(part.progress[0]) for part in self._parts.values()]
         self._done, self.live = max([self._done, *counts]), False
 
     def look_up_laws(self) -> None:
-        """See what indices in column ``law`` mean now: gains may have been changed."""
+        """Read the laws behind the indices in column ``law`` again: gains may have changed."""
         desk = announced(self.folder, "controller")
-        if desk is None:  # no controller of ours, or it is over
+        if desk is None:  # a foreign controller, or it has ended
             return
         self.laws = [_law(law["label"], law["name"], law["gains"]) for law in desk["laws"]]
 
     def events(self) -> list[dict[str, Any]]:
-        """What has happened so far, in order of time."""
+        """The events so far, in order of time."""
         whole = self.folder / "events.jsonl"
         return read_log(whole) if whole.is_file() else read_log(*self.folder.glob("events_*.jsonl"))
 
     def ended(self) -> dict[str, str] | None:
-        """How the run ended, once it has: ``status`` and ``reason``.
+        """How the run ended, ``status`` and ``reason``; None while it is in progress.
 
         Raises:
             OSError: the summary cannot be read.
-            UserError: it cannot be told whether the run goes on.
+            UserError: it is unknown whether the run is still in progress.
         """
         try:
             content = read_summary(self.folder)
@@ -118,7 +118,7 @@ class Record:
         return {key: str(content[key]) for key in ("status", "reason")}
 
     def _gone(self) -> dict[str, str] | None:
-        """A run of which only the recording is left: both desks were there and are no more."""
+        """The end of a run without a summary: its desks were seen and exist no more."""
         there = bool(present(self.folder))
         self._met |= there
         if self._met and not there:
@@ -127,7 +127,7 @@ class Record:
 
 
 def begun(folder: Path) -> bool:
-    """There is something to look at: a run that has begun to record, or one that is over."""
+    """Whether there is a recording: of a run that has begun to record, or of a finished one."""
     return (folder / "signals.npz").is_file() or any(
         (folder / "parts" / f"{side}_progress.npy").is_file() for side in _COLUMNS
     )
@@ -137,7 +137,7 @@ def open_record(folder: Path) -> Record:
     """The recording in a run folder.
 
     Raises:
-        UserError: it is no run folder, or one without a recording.
+        UserError: it is not a run folder, or has no recording.
     """
     scenario = _resolved(folder)
     if (folder / "summary.json").is_file():
@@ -148,7 +148,7 @@ def open_record(folder: Path) -> Record:
 
 
 def _resolved(folder: Path) -> dict[str, Any]:
-    """The scenario of a run as plain data with every default; its law files may be gone."""
+    """The scenario of a run as plain data with all defaults; its law files may be gone."""
     try:
         content = tomllib.loads((folder / "scenario.toml").read_text("utf-8"))
         return Scenario.model_validate(content).model_dump(mode="json", exclude_none=True)
@@ -173,20 +173,20 @@ def _finished(folder: Path, scenario: dict[str, Any]) -> Record:
 
 
 def _columns(side: str, part: Part) -> dict[str, NDArray[Any]]:
-    """Columns of a side under the names that they have in signals.npz and timing.npz."""
+    """Columns of a side under their names in signals.npz and timing.npz."""
     signals, times = np.asarray(part.signals), np.asarray(part.times)
     found = {name: signals[:, j] for j, name in enumerate(_COLUMNS[side])}
     return found | {f"{side}_{name}": times[:, j] for j, name in enumerate(_TIMES[side])}
 
 
 def ready(scenario: dict[str, Any]) -> list[str]:
-    """Names of the laws that a run can change to, the first one first."""
+    """Names of the laws that a run can switch to; its first law comes first."""
     changes = [e["law"] for e in scenario.get("events", []) if e["type"] == "law"]
     return list(dict.fromkeys([scenario["law"], *changes, *scenario.get("ready_laws", [])]))
 
 
 def _laws(scenario: dict[str, Any]) -> list[Law]:
-    """The laws as the controller numbers them: a scheduled one has several stages."""
+    """The laws as the controller numbers them: each stage of a scheduled law has a number."""
     laws: list[Law] = []
     for name in ready(scenario):
         try:

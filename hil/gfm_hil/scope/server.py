@@ -1,4 +1,4 @@
-"""The scope's server: one port for page and WebSocket, one look at the run 30 times a second."""
+"""The scope's server: one port for page and WebSocket; it polls the run 30 times a second."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from gfm_runtime.signals import group
 from gfm_runtime.states import STATES
 
 FRAMES_PER_S = 30
-_LOG_S = 0.25  # between two looks at what has happened
+_LOG_S = 0.25  # poll interval of the event log
 _LARGEST = 16384  # bytes of a message from a page
-_PAGES = 16  # at a time that look, and as many that control
-WAITING = 64  # connections that are no page yet, or fetch a file
-HALF_OPEN_S = 10.0  # in which a connection must become a page
-_PING_S = 10.0  # between two pings, and for their answer: a page that does not live is dropped
-_EVENTS = 500  # of the newest, told to pages
+_PAGES = 16  # most pages that look, and as many that control
+WAITING = 64  # most connections that are not a page yet or fetch a file
+HALF_OPEN_S = 10.0  # timeout for a connection to become a page
+_PING_S = 10.0  # interval and timeout of pings: a dead page is dropped
+_EVENTS = 500  # newest events that are sent to pages
 
 _STATIC = Path(__file__).resolve().parent / "static"
 _TYPES = {
@@ -51,14 +51,14 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _SOCKET = "/socket"
-_CONTROL = "control"  # query of a page that will say a token at once, and waits for the answer
+_CONTROL = "control"  # query of a page that sends its token first and waits for the answer
 
-_LOG = logging.getLogger("gfmhil.scope")  # what comes to the port and is no browser is no error
+_LOG = logging.getLogger("gfmhil.scope")  # clients other than browsers are no error
 _LOG.addFilter(lambda record: "handshake" not in record.getMessage())
 
 
 def static_files() -> dict[str, tuple[str, bytes]]:
-    """Everything that is served, by its path: content type and content."""
+    """All served files by path: content type and content."""
     found = {
         f"/{path.relative_to(_STATIC).as_posix()}": (_TYPES[path.suffix], path.read_bytes())
         for path in _STATIC.rglob("*")
@@ -97,12 +97,12 @@ class Scope:
 
         Args:
             host: address to listen at.
-            ports: to try, in this order; 0 is any that is free.
-            encryption: for https, if it is to be.
-            ready: told the port.
+            ports: ports to try, in this order; 0 is any free port.
+            encryption: TLS context for https; None: plain http.
+            ready: called with the port.
 
         Raises:
-            UserError: none of the ports is to be had.
+            UserError: none of the ports can be bound.
         """
         with _listen(host, ports) as listener:
 
@@ -122,7 +122,7 @@ class Scope:
                 )
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The files; None for the WebSocket."""
+        """The answer to a request for a file; None for the WebSocket."""
         refusal = self.access.refusal(request.headers)
         if refusal:
             return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", refusal)
@@ -138,15 +138,15 @@ class Scope:
         return _response(http.HTTPStatus.OK, kind, content)
 
     def _full(self, control: bool) -> str:
-        """Why there is no room for one more page that may control, or may only look; or ""."""
+        """Why there is no room for another page that controls, or that only looks; or ""."""
         if sum(bool(s.operator) == control for s in self._sessions) < _PAGES:
             return ""
         return f"{_PAGES} pages {'control' if control else 'look'} already"
 
     async def _page(self, connection: ServerConnection, listener: Listener) -> None:
-        """One page's connection, to its end. One that says that it will control takes no place
-        among those that look: until its token was right it is one of those that wait, of which
-        the listener drops the oldest."""
+        """Serve one page's connection to its end. A page that announces that it will control
+        takes no place of the pages that look: until its token is accepted it counts as waiting,
+        and the listener drops the oldest waiting connection."""
         session = Session(connection, self._pyramid, self.access, self._tell)
         with contextlib.suppress(ConnectionClosed):
             request = connection.request
@@ -165,7 +165,7 @@ class Scope:
                 self._sessions.discard(session)
 
     async def _frames(self) -> None:
-        """Take in what is new and show it, at a steady pace."""
+        """Read new ticks and send pictures, at a constant rate."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
@@ -177,7 +177,7 @@ class Scope:
             await asyncio.sleep(due - loop.time())
 
     async def _follow_log(self) -> None:
-        """Tell pages what has happened, and see when the run is over."""
+        """Send new events to the pages, and detect the end of the run."""
         said = self._happened()
         while True:
             self._events = await asyncio.to_thread(self.record.events)
@@ -201,7 +201,7 @@ class Scope:
         }
 
     def _about(self) -> dict[str, Any]:
-        """What a page needs to know about the run; no names of files but the scenario's title."""
+        """The run's data that a page needs; no file names, only the scenario's title."""
         s = self.record.scenario
         return {
             "title": s["title"],

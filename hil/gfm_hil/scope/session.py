@@ -1,4 +1,4 @@
-"""One page's connection: what it asks for, what it is told, and what it may do."""
+"""One page's connection: its requests, its messages, and its rights."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from gfm_hil.scope.access import Access
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.view import Look, View
 
-#: carries an event out, says at which tick; raises UserError with the reason of a refusal
+#: carries out an event and returns its tick; raises UserError with the reason of a refusal
 Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
 
-SEND_S = 5.0  # in which a page must take a message
-PER_S, BURST = 20.0, 40  # commands from one page
+SEND_S = 5.0  # timeout of a page that does not read a message
+PER_S, BURST = 20.0, 40  # rate limit of a page's commands
 
 _LOG = logging.getLogger("gfmhil.scope")
 
 
 def in_words(kind: str, **content: Any) -> str:
-    """A message in words, as it is sent."""
+    """A text message (JSON), as it is sent."""
     return json.dumps({"kind": kind, **content})
 
 
@@ -40,15 +40,15 @@ class _Message(BaseModel):
 
 
 class Hello(_Message):
-    """The first message: with the right token the page may control."""
+    """The first message; with a valid token the page may control."""
 
     kind: Literal["hello"]
     token: str = Field(max_length=200)
 
 
 class Play(_Message):
-    """A run that is over goes on as it did, from ``start`` [s] at ``speed`` times real time; with
-    no speed all of it is there again."""
+    """Replay a finished run from ``start`` [s] at ``speed`` times real time; without a speed show
+    all of it again."""
 
     kind: Literal["play"]
     start: float = Field(0.0, ge=0, le=1e6)
@@ -56,10 +56,10 @@ class Play(_Message):
 
 
 class Tell(_Message):
-    """An event for the run."""
+    """An event that the run shall carry out."""
 
     kind: Literal["tell"]
-    id: int = Field(ge=-(2**53), le=2**53)  # what a number of JavaScript can hold
+    id: int = Field(ge=-(2**53), le=2**53)  # integers that JavaScript represents
     event: dict[str, Any]
 
 
@@ -71,19 +71,19 @@ _MESSAGE: TypeAdapter[Hello | Look | Play | Tell] = TypeAdapter(
 class Session:
     """State of one connection.
 
-    Three things go out to a page, each in its own way, so that a page that is slow, or that does
-    not read at all, keeps nothing from another page: answers wait for the page, which alone waits
-    for them; of news and of pictures only the newest is kept, and ``run`` sends it when there is
-    room. A page that does not take a message in ``SEND_S`` is dropped.
+    A page gets three kinds of messages, each sent so that a slow page, or one that does not read
+    at all, does not delay other pages: an answer waits for the page, and only that page waits; of
+    news and of pictures only the newest is kept, and ``run`` sends it when there is room. A page
+    that does not read a message within ``SEND_S`` is dropped.
 
     Args:
         socket: to the page.
         pyramid: of the recording.
-        access: the rules.
-        tell: for commands.
+        access: the access rules.
+        tell: carries out commands.
 
     Attributes:
-        operator: the name that belongs to the page's token; empty: the page may only look.
+        operator: the operator with the page's token; empty: the page may only look.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Session:
         self.operator = ""
         self._rate = Rate("this page", PER_S, BURST)
         self._view: View | None = None
-        self._played: tuple[float, float, float] | None = None  # start [ticks], speed, since when
+        self._played: tuple[float, float, float] | None = None  # start [ticks], speed, begin
         self._news: str | None = None
         self._picture: bytes | None = None
         self._wake = asyncio.Event()
@@ -104,7 +104,7 @@ class Session:
         return address(self._socket.remote_address)
 
     def head(self) -> int:
-        """Ticks that this page considers done."""
+        """Number of ticks that this page shows as done."""
         if self._played is None:
             return self._pyramid.done
         start, speed, since = self._played
@@ -112,9 +112,9 @@ class Session:
         return min(self._pyramid.done, int(start + gone))
 
     def picture(self) -> None:
-        """Send the next frame soon, unless there is none or the page has not taken the last one
-        yet: a slow page sees fewer pictures, never older ones. A page whose picture cannot be made
-        is dropped."""
+        """Queue the next frame, unless there is none or the page has not read the last one yet: a
+        slow page sees fewer pictures, never old ones. A page whose picture cannot be made is
+        dropped."""
         if self._view is None or self._picture is not None:
             return
         try:
@@ -127,12 +127,12 @@ class Session:
             self._wake.set()
 
     def post(self, news: str) -> None:
-        """Send a message soon; a newer one takes the place of one that has not been sent yet."""
+        """Queue a message; a newer one replaces one that has not been sent yet."""
         self._news = news
         self._wake.set()
 
     async def say(self, kind: str, **content: Any) -> None:
-        """A message in words, at once."""
+        """Send a text message at once."""
         await self._send(in_words(kind, **content))
 
     async def _send(self, message: str | bytes) -> None:
@@ -146,7 +146,7 @@ class Session:
             self._socket.transport.abort()
 
     async def run(self) -> None:
-        """Deal with messages, and send what is to be seen, until the page has gone."""
+        """Process messages and send queued ones until the page disconnects."""
         sending = asyncio.create_task(self._keep_sending())
         try:
             async for text in self._socket:
@@ -166,7 +166,7 @@ class Session:
                     self._picture = None
 
     async def hear(self, text: str | bytes) -> None:
-        """Deal with one message."""
+        """Process one message."""
         try:
             message = _MESSAGE.validate_json(text)
             match message:
@@ -194,7 +194,7 @@ class Session:
         try:
             if not self.operator:
                 raise UserError("this page may look, not touch: open the address with the token")
-            if message.event.get("type") != "stop":  # which always passes
+            if message.event.get("type") != "stop":  # a stop always passes
                 self._rate.take()
             by = Identity(through="scope", name=self.operator, peer=self.peer)
             done = await self._tell(message.event, by)

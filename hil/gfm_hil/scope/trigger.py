@@ -1,4 +1,4 @@
-"""The trigger of a scope: finds an edge at the very tick, and holds the picture around it."""
+"""The trigger of a scope: finds the exact tick of an edge and holds the picture around it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from gfm_hil.scope.pyramid import Pyramid
 
-_AT_ONCE = 200_000  # ticks searched between two pictures; older ones are passed over
-_AUTO_S = 0.5  # without an edge for so long, or a whole picture, AUTO shows what there is
+_AT_ONCE = 200_000  # most ticks searched between two pictures; older ones are skipped
+_AUTO_S = 0.5  # or a picture's length, if longer: without an edge, AUTO then shows the newest
 
-#: what an acquisition is doing
+#: states of an acquisition
 IDLE, ARMED, FILLING, AUTO, HELD = range(5)
 
 
 class Trigger(BaseModel):
-    """What to wait for, and what to do then."""
+    """The trigger condition and mode."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -40,11 +40,11 @@ def edges(values: NDArray[np.float32], trigger: Trigger) -> NDArray[np.intp]:
 
 
 class Acquisition:
-    """One scope's trigger at work.
+    """The running trigger of one view.
 
     Args:
-        pyramid: what to search.
-        trigger, span: what to look for; ticks in a picture.
+        pyramid: to search.
+        trigger, span: the condition; ticks in a picture.
         start: the first tick that may be an edge.
     """
 
@@ -52,13 +52,13 @@ class Acquisition:
         self._pyramid, self._trigger = pyramid, trigger
         self._span, self._before = span, round(span * trigger.before)
         self._searched = self._since = start
-        self._at = -1  # of the picture that is filling
-        self.shown = -1  # edge of the picture to be seen, or -1
+        self._at = -1  # edge of the picture that is filling
+        self.shown = -1  # edge of the displayed picture, or -1
         self.doing = ARMED
         self._auto = max(round(_AUTO_S / pyramid.record.T_s), span)
 
     def window(self, head: int) -> tuple[int, int]:
-        """The ticks to be seen when ``head`` ticks are done."""
+        """The displayed ticks when ``head`` ticks are done."""
         self._look(head)
         if self.shown >= 0:
             first = self.shown - self._before
@@ -67,7 +67,7 @@ class Acquisition:
         return last - self._span, last
 
     def _look(self, head: int) -> None:
-        if self._at >= 0 and head >= self._at - self._before + self._span:  # it is full
+        if self._at >= 0 and head >= self._at - self._before + self._span:  # the picture is full
             self._since = head
             if self._trigger.mode == "single":
                 self.doing = HELD

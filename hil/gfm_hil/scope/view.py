@@ -1,8 +1,8 @@
-"""One picture of a scope: which ticks, in which bins, and as the bytes that the page takes apart.
+"""One picture of a scope: its ticks, its bins, and the bytes that the page decodes.
 
 A frame is little-endian: the numbers of ``HEAD`` as float64; then, for each channel of the view in
-its order, float32 least and greatest of every bin; then float32 the mean, over the last 20 ms, of
-each of them and of those that are only watched.
+order, float32 minimum and maximum of every bin; then float32 mean, over the last 20 ms, of each of
+them and of the watched channels.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ChannelName = Annotated[str, Field(max_length=40)]
 
 
 class Look(BaseModel):
-    """What a page wants to see."""
+    """A page's request for pictures."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -59,11 +59,11 @@ class View:
 
     Args:
         pyramid: of the recording.
-        look: what is wanted.
-        head: ticks done when it was asked for.
+        look: the request.
+        head: ticks done at the request.
 
     Raises:
-        ValueError: a channel that there is none of, or no trigger to wait for.
+        ValueError: a channel does not exist, or the trigger is missing.
     """
 
     def __init__(self, pyramid: Pyramid, look: Look, head: int) -> None:
@@ -86,7 +86,7 @@ class View:
         self._sent: tuple[float, ...] = ()
 
     def frame(self, head: int) -> bytes | None:
-        """The picture when ``head`` ticks are done; None if it is the one sent last."""
+        """The picture when ``head`` ticks are done; None if it equals the last one."""
         start, stop, doing, edge = self._window(head)
         first = max(0, int(start // self._width))
         last = int(-(-min(stop, head) // self._width))
@@ -120,7 +120,7 @@ class View:
         return max(0, head - self._span), max(head, self._span), IDLE, -1
 
     def _last(self, column: str, head: int) -> float:
-        """A column at the newest tick; -1 if it is not known."""
+        """A column at the newest tick; -1 if unknown."""
         rows = self._pyramid.record.columns.get(column)
         value = float(rows[head - 1 : head][0]) if rows is not None and head > 0 else np.nan
         return value if np.isfinite(value) else -1

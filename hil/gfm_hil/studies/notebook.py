@@ -160,7 +160,7 @@ def campaign(
         axes, place = find_axes(made, None, None), None if folder is None else Path(folder)
         store = Store(place, made, resume)
         if jobs := store.missing(made):
-            compile_once(made)
+            compile_once(made, lambda text: None)  # silent, as all of this module
             with nullcontext(Here()) if workers == 1 else processes(workers) as pool:
                 execute(made, jobs, pool, workers, store.append, lambda: False)
         found = CampaignResult(made, store.sorted(made), place)

@@ -1,6 +1,6 @@
-"""What a run records, sent on while it goes on: to PlotJuggler, to tools of our own, to Prometheus.
+"""Streams a run's recording while it grows: to PlotJuggler, to our own tools, to Prometheus.
 
-A process of its own reads the files that the loop appends to; nothing of it is in the loop's way.
+A separate process reads the files to which the loop appends, and does not disturb the loop.
 """
 
 from gfm_hil.telemetry.blocks import Block, BlockReader

@@ -1,9 +1,9 @@
-"""Every tick as blocks, for tools of our own: on the wire a block is a ``.npy`` file.
+"""Blocks of all ticks, for our own tools: on the wire a block is a ``.npy`` file.
 
-Two parts a message: the topic ``gfmhil/plant`` or ``gfmhil/controller``, and a record array with
-the field ``tick``, the signals (float64) and the times (int64, ns, under their names with ``_ns``).
-They travel by a port of their own: who subscribes to everything, as PlotJuggler does by default,
-gets samples only.
+A message has two parts: the topic ``gfmhil/plant`` or ``gfmhil/controller``, and a record array
+with the field ``tick``, the signals (float64) and the times (int64, ns, names with ``_ns``). Blocks
+have a separate port: a client that subscribes to everything, as PlotJuggler does by default, gets
+samples only.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from gfm_hil.telemetry.follow import COLUMNS, TIMES, Rows
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
 _TOPIC = "gfmhil/"
-_MOST = 5000  # rows a message: about 1 MB
-_HEAD = 4096  # bytes of a .npy file before its rows, at most
-ROOM = 500  # messages that wait for a slow reader, on either side: 5 s of a run in real time
+_MOST = 5000  # most rows per message: about 1 MB
+_HEAD = 4096  # most bytes of a .npy file before its rows
+ROOM = 500  # queued messages for a slow reader, at each end: 5 s of a run in real time
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Block:
 
     Attributes:
         side: ``"plant"`` or ``"controller"``.
-        rows: record array, shape (n,); ``rows["tick"]`` tells of gaps.
+        rows: record array, shape (n,); ``rows["tick"]`` shows gaps.
     """
 
     side: str
@@ -40,7 +40,7 @@ class Block:
 
 
 def block_dtype(side: str) -> np.dtype:
-    """One row of a side."""
+    """The dtype of one row of a side."""
     signals, times = COLUMNS[side], TIMES[side]
     return np.dtype(
         [("tick", "<i8"), *((n, "<f8") for n in signals), *((f"{n}_ns", "<i8") for n in times)]
@@ -67,8 +67,8 @@ class BlockReader:
     """Receives blocks; use as a context manager.
 
     Args:
-        endpoint: where ``gfmhil stream`` says that blocks are.
-        side: ``"plant"`` or ``"controller"`` alone; both if empty.
+        endpoint: the endpoint of blocks that ``gfmhil stream`` prints.
+        side: ``"plant"`` or ``"controller"``; both if empty.
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, side: str = "") -> None:
@@ -93,7 +93,7 @@ class BlockReader:
         self._context.destroy(linger=0)
 
     def receive(self, timeout_s: float) -> Block | None:
-        """The next block, or None if none came in time."""
+        """The next block, or None on timeout."""
         if not self._socket.poll(round(timeout_s * 1e3)):
             return None
         topic, payload = self._socket.recv_multipart()

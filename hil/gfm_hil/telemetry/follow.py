@@ -1,4 +1,4 @@
-"""Following the recording of a run that is going on, row by row, from now on."""
+"""Follows the recording of a run in progress, row by row, from now on."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from gfm_hil.recording.recorder import (
 COLUMNS = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
 TIMES = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
 
-_LAST = 1  # rows not looked at yet: a tick's last time is written after it counts as done
+_LAST = 1  # newest rows not read yet: a tick's last time is written after it counts as done
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one side, as they are in ``recording.Part``.
+    """Rows of one side, as in ``recording.Part``.
 
     Attributes:
-        side: whose.
-        first: tick of the first one.
+        side: ``"plant"`` or ``"controller"``.
+        first: tick of the first row.
         signals: shape (n, columns), the units of the recording; NaN in ticks never recorded.
         times: shape (n, columns), int64, ns.
     """
@@ -43,18 +43,18 @@ class Rows:
     times: NDArray[np.int64]
 
     def time(self, name: str) -> NDArray[np.int64]:
-        """A column of ``times`` by its name."""
+        """A column of ``times`` by name."""
         return self.times[:, TIMES[self.side].index(name)]
 
 
 class Follower:
-    """The parts of a run as they grow.
+    """Reads the growing parts of a run.
 
     Args:
         folder: of a run that has begun.
 
     Raises:
-        UserError: it is no run folder, or the run is over.
+        UserError: it is not a run folder, or the run is over.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -81,13 +81,13 @@ class Follower:
                 self._next[side] = int(part.progress[0]) if from_now else 0
 
     def news(self) -> list[Rows]:
-        """What has been recorded since the last call that returned; ``over`` tells that there will
-        be no more.
+        """Rows recorded since the last call that returned; afterwards ``over`` says whether these
+        were the last.
 
         Raises:
-            OSError: it cannot be told what there is; the next call finds it.
+            OSError: the recording cannot be read now; the next call returns its rows.
         """
-        over = not (self.folder / "parts").is_dir()  # put together, and gone
+        over = not (self.folder / "parts").is_dir()  # the parts were merged and removed
         self._find(from_now=False)
         found = []
         for side, part in self.parts.items():
@@ -101,7 +101,7 @@ class Follower:
         return found
 
     def misses_before(self) -> int:
-        """Misses in the ticks before those that the next call of ``news`` will find."""
+        """Number of misses before the rows that the next call of ``news`` returns."""
         part = self.parts.get("plant")
         if part is None:
             return 0
@@ -110,14 +110,14 @@ class Follower:
 
 
 def missed(rows: Rows) -> NDArray[np.bool_]:
-    """Ticks of the plant, in real time, whose u did not come in time."""
+    """Which of the plant's rows, in real time, got no u in time."""
     return (rows.time("scheduled") >= 0) & (rows.time("received") < 0)
 
 
 def slack_us(rows: Rows, T_s: float) -> NDArray[np.float64]:
     """Time left between the arrival of u[k] at the plant and the next deadline, µs.
 
-    NaN where there is no deadline or u was not in time.
+    NaN if there is no deadline or u was late.
     """
     due, received = rows.time("scheduled"), rows.time("received")
     left = (due + round(T_s * 1e9) - received) * 1e-3
@@ -125,6 +125,6 @@ def slack_us(rows: Rows, T_s: float) -> NDArray[np.float64]:
 
 
 def begun(folder: Path) -> bool:
-    """A run that has begun to record, and of which it is known what."""
+    """Whether the run has begun to record and its scenario is written."""
     recorded = any((folder / f"parts/{side}_progress.npy").is_file() for side in SIDES)
     return recorded and (folder / "scenario.toml").is_file()

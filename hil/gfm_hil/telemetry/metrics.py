@@ -1,4 +1,4 @@
-"""The metrics there are, for who serves them and who describes them."""
+"""The list of metrics, for the server and the documentation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class About:
-    """A metric's label, if it has one, and what it is in a few words."""
+    """A metric's label, if any, and a short description."""
 
     label: str
     text: str

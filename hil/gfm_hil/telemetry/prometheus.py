@@ -1,4 +1,4 @@
-"""A run as metrics that Prometheus collects, computed from the recording when it asks."""
+"""Prometheus metrics of a run, computed from the recording at each scrape."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from gfm_hil.telemetry.follow import Follower, Rows, slack_us
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_runtime.states import STATES
 
-_WINDOW_S = 10.0  # of the run's time, over which quantiles are taken
-_SLACK = (0.0, 0.001, 0.01, 0.5)  # little slack is bad
-_ROUND_TRIP = (0.5, 0.99, 0.999, 1.0)  # long round trips are
+_WINDOW_S = 10.0  # window of the quantiles, in the run's time
+_SLACK = (0.0, 0.001, 0.01, 0.5)  # low slack is bad
+_ROUND_TRIP = (0.5, 0.99, 0.999, 1.0)  # long round trips are bad
 
 
 class RunCollector(Collector):
     """The metrics of one run.
 
     Attributes:
-        follower: of the run; None, and nothing to collect, before it begins.
+        follower: of the run; None before the run begins: there is nothing to collect.
     """
 
     def __init__(self, follower: Follower | None = None) -> None:
@@ -35,12 +35,12 @@ class RunCollector(Collector):
         self._operator: Operator | None = None
 
     def close(self) -> None:
-        """Let go of what was opened on the way."""
+        """Close what ``collect`` has opened."""
         if self._operator is not None:
             self._operator.close()
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics as they are now."""
+        """The present metrics."""
         if self.follower is not None:
             yield from self._counts(self.follower)
             yield from self._times(self.follower)
@@ -56,7 +56,7 @@ class RunCollector(Collector):
         yield misses
 
     def _times(self, follower: Follower) -> Iterator[Metric]:
-        """Quantiles of slack and round trip over the newest ticks; none in lockstep of slack."""
+        """Quantiles of slack and round trip over the newest ticks; in lockstep no slack."""
         part = follower.parts.get("plant")
         if part is None:
             return
@@ -83,9 +83,9 @@ class RunCollector(Collector):
                 yield metric
 
     def _seen(self, follower: Follower) -> dict[str, Any]:
-        """The newest tick in words; laws by their index where no desk tells their names."""
+        """The newest tick in words; laws by index if no desk gives their names."""
         seen: dict[str, Any] = {}
-        with contextlib.suppress(UserError):  # no desk: in process, or not yet, or not to be read
+        with contextlib.suppress(UserError):  # no desk: in process, not open yet, or not readable
             self._operator = self._operator or Operator(follower.folder)
             seen = self._operator.snapshot()
         part = follower.parts.get("controller")
@@ -113,7 +113,7 @@ def _quantiles(
 
 
 def _say_nothing(*_: object) -> None:
-    """What is printed about a connection that failed."""
+    """Print nothing about a failed connection."""
 
 
 @contextlib.contextmanager
@@ -121,7 +121,7 @@ def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int
     """Serve metrics at ``/metrics`` while in this context; yields the port.
 
     Raises:
-        UserError: the port is not to be had.
+        UserError: the port cannot be bound.
     """
     registry = CollectorRegistry()
     registry.register(collector)
@@ -129,7 +129,7 @@ def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int
         server, thread = start_http_server(port, addr=host, registry=registry)
     except OSError as problem:
         raise UserError(f"--prometheus {port}: {host}: {problem.strerror}") from None
-    # A client that hangs up is no fault of ours; socketserver would print a traceback.
+    # A client that disconnects is not an error; socketserver would print a traceback.
     setattr(server, "handle_error", _say_nothing)  # noqa: B010 (mypy takes it for a method)
     try:
         yield int(server.server_port)

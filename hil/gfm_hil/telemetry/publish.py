@@ -1,4 +1,4 @@
-"""The publisher beside a run: looks what is new, and sends it to whoever listens."""
+"""The publisher beside a run: polls for new rows and sends them to subscribers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.samples import Sampler
 
 _LOOK_S = 0.02
-_LINGER_MS = 500  # for what is still to leave in the end
+_LINGER_MS = 500  # to send the last messages
 _LONGEST = 256  # bytes of a subscription; ours have 17
-_WAITING = 100  # subscriptions of one subscriber that are still to be read
+_WAITING = 100  # queued subscription messages per subscriber
 
 
 @dataclass(frozen=True)
 class Ports:
-    """Where to be found: address, and ports of samples and blocks (0: a free one)."""
+    """Address, and ports of samples and blocks (0: a free one)."""
 
     host: str
     samples: int
@@ -37,7 +37,7 @@ class Publisher:
         ports: to listen on.
 
     Raises:
-        UserError: a port is not to be had.
+        UserError: a port cannot be bound.
     """
 
     def __init__(self, ports: Ports) -> None:
@@ -59,15 +59,15 @@ class Publisher:
         self._context.destroy(linger=_LINGER_MS)
 
     def follow(self, follower: Follower, rate: float, stopped: Callable[[], bool]) -> int:
-        """Send on what a run records, to its end.
+        """Send a run's rows until it ends.
 
         Args:
             follower: of the run.
-            rate: samples a second.
-            stopped: whether to end before the run does.
+            rate: samples per second.
+            stopped: whether to end before the run ends.
 
         Returns:
-            How many ticks of the plant or, without it, of the controller were sent.
+            How many ticks of the plant (without a plant: of the controller) were sent.
         """
         sampler = Sampler(follower.T_s, rate, follower.misses_before())
         count: dict[Side, int] = dict.fromkeys(SIDES, 0)

@@ -1,9 +1,9 @@
-"""Decimated samples as PlotJuggler's ZeroMQ subscriber reads them with its defaults.
+"""Decimated samples in the format that PlotJuggler's ZeroMQ subscriber reads by default.
 
-Two parts a message, topic and payload; the payload is one JSON object, one sample, whose numbers
-become series by their path, as ``gfmhil/plant/y/p``. The time is the number ``timestamp`` in it:
-PlotJuggler takes it for the sample's time if told to use the field, else the time of arrival. A
-third part may be the time, too, but spoils the payload in PlotJuggler (its pull request 1416).
+A message has two parts, topic and payload. The payload is one sample, a JSON object, whose numbers
+become series named by their path, such as ``gfmhil/plant/y/p``. Its number ``timestamp`` is the
+sample's time if PlotJuggler is set to use the field; else it uses the time of arrival. A third part
+could hold the time too, but corrupts the payload in PlotJuggler (its pull request 1416).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _GROUPS = ("y", "u", "true", "ref")  # prefixes that become objects
 
 
 def _place(column: str) -> tuple[str, str]:
-    """Object and name of a column in a sample; no object for one that stands by itself."""
+    """Object and name of a column in a sample; the object is empty for a top-level column."""
     group, _, rest = column.partition("_")
     return (group, rest) if group in _GROUPS else ("", column)
 
@@ -33,24 +33,25 @@ class Sampler:
 
     Args:
         T_s: sampling time of the run, s.
-        rate: samples a second, of the run's time and of ours.
-        misses: before the first row.
+        rate: samples per second, both of the run's time and of real time.
+        misses: number of misses before the first row.
     """
 
     def __init__(self, T_s: float, rate: float, misses: int) -> None:
         self.T_s = T_s
         self._every = max(1, round(1 / (T_s * rate)))
         self._misses = misses
-        self._least = math.nan  # slack since the last sample, µs
+        self._least = math.nan  # least slack since the last sample, µs
 
     def messages(self, rows: Rows, seconds: float) -> list[list[bytes]]:
         """The messages of some rows.
 
         Args:
-            rows: new ones.
-            seconds: that they took to be recorded; a run faster than real time is thinned out.
+            rows: new rows.
+            seconds: the time in which they were recorded; for a run faster than real time fewer
+                samples are sent.
         """
-        faster = round(len(rows.signals) * self.T_s / seconds)  # than real time
+        faster = round(len(rows.signals) * self.T_s / seconds)  # factor against real time
         every = self._every * max(1, faster)
         plant, out, begin = rows.side == "plant", [], 0
         if plant:
@@ -74,7 +75,7 @@ class Sampler:
         return out
 
     def _sample(self, rows: Rows, k: int, values: list[float]) -> dict[str, Any]:
-        """One tick's numbers; JSON has none that are not finite."""
+        """One tick's numbers; JSON cannot hold NaN or infinity."""
         tick = rows.first + k
         sample: dict[str, Any] = {"timestamp": round(tick * self.T_s, 9), "tick": tick}
         for (group, name), value in zip(_PLACES[rows.side], values, strict=True):

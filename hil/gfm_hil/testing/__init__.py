@@ -1,4 +1,4 @@
-"""The bench in somebody's own tests: steps as calls, assertions that say why they fail."""
+"""The bench in users' tests: steps as calls, assertions that say why they fail."""
 
 from gfm_hil.testing.experiment import Experiment
 from gfm_hil.testing.setting import Setting, make_setting

@@ -1,4 +1,4 @@
-"""What an assertion looks for in one signal: None, or what is wrong and where to see it."""
+"""The checks of one signal behind the assertions: each returns None, or what is wrong and where."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gfm_hil.testing.signals import unit
 Vector = NDArray[np.float64]
 
 _COLUMNS = ("t", "low", "high")
-_TAIL = 0.05  # the last part of a window, whose mean is the final value
+_TAIL = 0.05  # fraction at the end of a window whose mean is the final value
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Window:
     Attributes:
         name: of the signal.
         t: time, s, shape (n,).
-        x: its values, shape (n,).
-        before: its value just before the step.
+        x: values, shape (n,).
+        before: value just before the step.
         since: time of the step, s.
     """
 
@@ -44,12 +44,12 @@ class Window:
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong.
+    """A failed check.
 
     Attributes:
-        text: in a sentence or two.
+        text: what is wrong, in a sentence or two.
         at: time of the worst point, s.
-        t, low, high: the band that the signal should have kept to, each of shape (n,); NaN: none.
+        t, low, high: the band that the signal should have kept, each of shape (n,); NaN: no limit.
     """
 
     text: str
@@ -89,7 +89,7 @@ def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | 
 
 
 def overshoot(w: Window, percent: float, to: float | None) -> Finding | None:
-    """Beyond ``to`` (or the final value) the signal goes by at most ``percent`` of the step."""
+    """The signal exceeds ``to`` (or its final value) by at most ``percent`` of the step."""
     final = float(np.mean(w.x[-max(1, round(_TAIL * len(w.x))) :])) if to is None else to
     step = final - w.before
     if abs(step) < 1e-3:
@@ -142,11 +142,11 @@ def damped(w: Window, min_ratio: float, T_s: float) -> Finding | None:
 def read_envelope(path: Path, t: Vector) -> tuple[Vector, Vector]:
     """The limits of a CSV file with the columns t, low, high at the times ``t`` after the step.
 
-    Between its lines it is interpolated; before the first and after the last there is no limit,
-    nor where a field is empty.
+    They are interpolated between lines; there is no limit before the first line, after the last
+    line, and where a field is empty.
 
     Raises:
-        UserError: no such file, or not of this form.
+        UserError: the file does not exist or does not have this form.
     """
     try:
         with path.open(encoding="utf-8", newline="") as file:

@@ -1,4 +1,4 @@
-"""What a test says about an experiment: assertions that explain how they fail, with a figure."""
+"""A test's assertions about an experiment; they explain how they fail and draw a figure."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from gfm_hil.testing import checks
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps
 
-_NEAR = 0.02  # s, what a figure shows on each side of a moment
+_NEAR = 0.02  # s that a figure shows on each side of a moment
 
 
 class Experiment(Steps):
-    """What the fixture ``bench`` gives a test: steps, results, and assertions.
+    """The object of the fixture ``bench``: steps, results, and assertions.
 
-    An assertion about a signal looks at it from the last step on, or from ``since`` (s), to the
-    end, and fails where the run did not come to its end.
+    An assertion about a signal checks it from the last step, or from ``since`` (s), to the end, and
+    fails if the run did not complete.
     """
 
     def assert_settles(
@@ -29,7 +29,7 @@ class Experiment(Steps):
         tolerance: float = 0.02,
         since: float | None = None,
     ) -> None:
-        """From ``within`` s after the last step (or ``since``, s) on, to the end, the signal is
+        """From ``within`` s after the last step (or ``since``, s) to the end, the signal is
         ``to`` ± ``tolerance``."""
         __tracebackhide__ = True
         w = self._window(signal, since)
@@ -42,8 +42,8 @@ class Experiment(Steps):
         to: float | None = None,
         since: float | None = None,
     ) -> None:
-        """After the last step the signal goes beyond ``to`` (by default, its final value) by at
-        most ``percent`` of its step."""
+        """After the last step the signal exceeds ``to`` (by default its final value) by at most
+        ``percent`` of its step."""
         __tracebackhide__ = True
         w = self._window(signal, since)
         self._judge(w.name, "overshoot", checks.overshoot(w, percent, to))
@@ -56,8 +56,8 @@ class Experiment(Steps):
         csv: str | Path | None = None,
         since: float | None = None,
     ) -> None:
-        """After the last step the signal stays between two numbers, or two curves of a file with
-        the columns t (s after the step), low, high."""
+        """After the last step the signal stays between two numbers, or between two curves of a
+        file with the columns t (s after the step), low, high."""
         __tracebackhide__ = True
         w = self._window(signal, since)
         if (csv is None) == (low is None and high is None):
@@ -96,8 +96,8 @@ class Experiment(Steps):
             )  # fmt: skip
 
     def assert_no_miss(self, at_most: int = 0) -> None:
-        """In real time at most so many ticks went without a fresh u; in lockstep, which has no
-        deadlines, none is ever missed."""
+        """In real time, at most ``at_most`` ticks had no fresh u; lockstep has no deadlines, so
+        that it never misses one."""
         __tracebackhide__ = True
         missed = self.summary["misses"]
         self.assert_no_trip()
@@ -111,7 +111,7 @@ class Experiment(Steps):
             )  # fmt: skip
 
     def assert_no_trip(self) -> None:
-        """The run came to its end."""
+        """The run completed."""
         __tracebackhide__ = True
         s = self.summary
         if s["status"] != "completed":
@@ -123,7 +123,7 @@ class Experiment(Steps):
             )  # fmt: skip
 
     def _window(self, signal: str, since: float | None) -> checks.Window:
-        """The signal after the last step, of a run that came to its end."""
+        """The signal after the last step, of a completed run."""
         __tracebackhide__ = True
         self.assert_no_trip()
         signals, T_s = self.signals, self.setting.scenario.T_s
@@ -152,7 +152,7 @@ class Experiment(Steps):
         finding: checks.Finding | None = None,
         around: tuple[float, float] | None = None,
     ) -> None:
-        """Draw why, and say where."""
+        """Draw the figure of a failure and fail with its path."""
         __tracebackhide__ = True
         run, T_s = self.result, self.setting.scenario.T_s
         steps = [(e.at(T_s) * T_s, e.label()) for e in self._plan.events(self._ran)]
@@ -160,7 +160,7 @@ class Experiment(Steps):
         link, mode = run.summary["link"], run.summary["mode"]
         lines = [text, f"run: {' → '.join(run.summary['laws'])} over {link}, {mode}; steps: {done}"]
         if len(run.signals["tick"]):
-            # half a second of imports, which only failures need
+            # takes half a second to import, and only failures need it
             from gfm_hil.testing.picture import draw, draw_times
 
             figure = run.file(f"{what}_{signal}.png")

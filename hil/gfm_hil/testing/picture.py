@@ -1,4 +1,4 @@
-"""The figure that a failing assertion leaves: the signal beside what was wanted, and the rest."""
+"""The figure of a failed assertion: the signal with its limits, and other signals."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def draw(
 
     Args:
         path: of the picture.
-        text: what failed, for the head.
-        signal, signals: the one it is about, and all of them.
-        steps: time in s and a few words each.
-        finding: its band and worst point, if it is about a curve.
-        around: of which times [s] the large panel is, all by default.
+        text: what failed, for the title.
+        signal, signals: the checked one, and all of them.
+        steps: time in s and a short text each.
+        finding: band and worst point, if the check is about a curve.
+        around: time range [s] of the large panel, all by default.
     """
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     FigureCanvasAgg(figure)
@@ -81,7 +81,7 @@ def draw(
 
 
 def draw_times(path: Path, run: Run, scenario: Scenario) -> None:
-    """Draw when a run in real time was late, as its report would."""
+    """Draw when a run in real time was late, as in its report."""
     with np.load(run.file("timing.npz")) as timing:
         draw_timing(path.parent, scenario, dict(timing), run.summary).rename(path)
 
@@ -95,7 +95,7 @@ def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _band(axes: Axes, finding: Finding, x: NDArray[Any]) -> None:
-    """The band, green; a limit on one side only is shaded as far as the curve goes."""
+    """Draw the band in green; a one-sided limit is shaded up to the range of the curve."""
     low, high = finding.low, finding.high
     if not (np.isfinite(low).any() or np.isfinite(high).any()):
         return

@@ -1,7 +1,7 @@
-"""The steps of a test as a scenario: gathered tick by tick, carried out whole.
+"""The steps of a test as a scenario: collected tick by tick, run as a whole.
 
-A plan is what makes a test exact: each step belongs to a tick, on every link and in real time
-too, and what a test does can be run again from its scenario file.
+The plan makes a test exact: each step belongs to a tick, on every link and in real time too, and
+the scenario file repeats the test's run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _EVENT: TypeAdapter[Any] = TypeAdapter(Event)
 
 
 class Plan:
-    """Events and how long to run, on top of a scenario's own events.
+    """Events and duration of a test, in addition to a scenario's own events.
 
     Args:
         base: the scenario without steps.
@@ -26,31 +26,31 @@ class Plan:
 
     def __init__(self, base: Scenario) -> None:
         self.base = base
-        self.tick = 0  # the next step's
+        self.tick = 0  # of the next step
         self._steps: list[Any] = []
 
     def step(self, kind: str, **fields: Any) -> None:
-        """Have an event happen now: between the ticks run so far and the next one.
+        """Add an event at the present tick, after the ticks planned so far.
 
         Raises:
-            UserError: it is none that a scenario could have.
+            UserError: a scenario cannot have such an event.
         """
         given = {name: value for name, value in fields.items() if value is not None}
         try:
             event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
         except ValidationError as problem:
             raise UserError(
-                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem))
+                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, Event))
             ) from None
         self._steps.append(event)
         try:
-            self.scenario(self.tick + 1)  # sees that laws, lines and the breaker are to be had
+            self.scenario(self.tick + 1)  # checks laws, lines and breaker
         except UserError:
             self._steps.pop()
             raise
 
     def run(self, seconds: float | None) -> None:
-        """Go on for a time, rounded to whole ticks; without one, to the base scenario's end."""
+        """Continue for a time, rounded to whole ticks; without one, to the base scenario's end."""
         T_s = self.base.T_s
         ticks = self.base.ticks - self.tick if seconds is None else round(seconds / T_s)
         if ticks < 1:
@@ -58,16 +58,16 @@ class Plan:
         self.tick += ticks
 
     def events(self, ticks: int) -> list[Any]:
-        """What happens within so many ticks, in order; of one tick the scenario's own first."""
+        """The events of the first ``ticks`` ticks in order; within a tick the scenario's first."""
         T_s = self.base.T_s
         every = [*self.base.sorted_events(), *self._steps]
         return sorted((e for e in every if e.at(T_s) < ticks), key=lambda e: e.at(T_s))
 
     def scenario(self, ticks: int) -> Scenario:
-        """The first so many ticks as a scenario of its own.
+        """The first ``ticks`` ticks as a scenario.
 
         Raises:
-            UserError: a step cannot be had, as a law that is not to be found.
+            UserError: a step is impossible, for example its law does not exist.
         """
         content = self.base.model_dump(exclude_none=True)
         content["duration"] = ticks * self.base.T_s

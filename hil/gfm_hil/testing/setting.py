@@ -1,4 +1,4 @@
-"""What a test runs on: the scenario to begin with, as the test and the command line want it."""
+"""The setting of a test: its initial scenario, changed by the test and the command line."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
 
-_PLAIN = "pref_step"  # of which the grid and the converter are meant, not the step
-_PATIENCE_S = 10.0  # in lockstep a busy machine is no reason to fail
+_PLAIN = "pref_step"  # used for its grid and converter; its step is dropped
+_PATIENCE_S = 10.0  # in lockstep a busy machine must not fail a test
 
 
 class Unfit(UserError):
-    """A test that cannot be run over the link that the command line asks for."""
+    """The test cannot run over the link of the command line."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Setting:
 
     Attributes:
         scenario: checked, with its own events.
-        controller_command: program and arguments of somebody's own controller process, or empty;
+        controller_command: program and arguments of the user's controller process, or empty;
             ``{endpoint}`` and ``{scenario}`` in it are replaced.
-        near: folder in which files are looked for first.
+        near: folder that is searched first for files.
     """
 
     scenario: Scenario
@@ -35,12 +35,12 @@ class Setting:
 
     @property
     def realtime(self) -> bool:
-        """Whether the run keeps pace with the clock."""
+        """Whether the run is in real time."""
         return self.scenario.mode == "realtime"
 
 
 def beside(near: Path, name: str) -> str:
-    """A file beside the test by its name, or the name as it is: a path, or one of the catalogue."""
+    """The path of a file beside the test, or the name unchanged: a path or a catalogue name."""
     found = near / name
     return str(found) if found.is_file() else name
 
@@ -56,19 +56,19 @@ def make_setting(
     link_wanted: str | None = None,
     **changed: Any,
 ) -> Setting:
-    """Read and check what a test asks for.
+    """Read and check the setting of a test.
 
     Args:
-        near: folder of the test; scenario and law files are looked for there first.
+        near: folder of the test, searched first for scenario and law files.
         scenario: shipped name or file; by default the paper's grid and converter, without events.
-        law, link, mode: instead of the scenario's law, of in process, of lockstep.
-        controller_command: of somebody's own controller; the link is then zmq by default.
-        link_wanted: of the command line; replaces the link of the test.
-        changed: any other key of a scenario by its path with ``__`` for the dot, as
+        law, link, mode: by default the scenario's law, in process, lockstep.
+        controller_command: of the user's controller; the link is then zmq by default.
+        link_wanted: link of the command line; replaces the test's link.
+        changed: any other key of a scenario by its path with ``__`` for the dot, for example
             ``references__P_ref=0.2`` or ``events=[]``.
 
     Raises:
-        UserError: one line a mistake. ``Unfit`` where only ``link_wanted`` does not fit the test.
+        UserError: one line per mistake. ``Unfit`` if only ``link_wanted`` does not fit the test.
     """
     chosen = link or ("zmq" if controller_command else INPROC)
     if controller_command and chosen == INPROC:
@@ -78,7 +78,7 @@ def make_setting(
             raise Unfit(f"the controller of this test is a process that talks {chosen}")
         if link_wanted == INPROC and mode == "realtime":
             raise Unfit("this test is about real time, which a run in process has not")
-        if chosen != INPROC:  # they are of the test's own link
+        if chosen != INPROC:  # they belong to the test's link
             changed = {k: v for k, v in changed.items() if not k.startswith("link__")}
         chosen = str(link_wanted)
     if scenario is None:

@@ -1,4 +1,4 @@
-"""A run's signals by the names that a test uses."""
+"""A run's signals by their names in tests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def unit(name: str) -> str:
-    """The unit of a signal for people, with a space before it; none for numbers without."""
+    """The unit of a signal with a space before it; empty if it has none."""
     bare = name.rpartition("_")[0] and name.removeprefix("true_")
     known = {"f_hz": " Hz", "t": " s", "delta": " rad"}
     if name in ("tick", "law", "state", "trip") or bare == "trip":
@@ -19,7 +19,7 @@ def unit(name: str) -> str:
 
 
 def same(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
-    """Whether both hold the same values as far as the shorter one goes."""
+    """Whether both hold the same values up to the end of the shorter one."""
     length = min(len(one["tick"]), len(other["tick"]))
     return all(
         np.array_equal(one[name][:length], other[name][:length], equal_nan=True)

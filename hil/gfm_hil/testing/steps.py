@@ -1,4 +1,4 @@
-"""An experiment's steps as calls, gathered until something is asked of it, and its results."""
+"""An experiment's steps as calls, collected until a result is needed, and its results."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _REFERENCES = {name.lower(): name for name in REF_NAMES}
 class Steps:
     """Steps and results of an experiment.
 
-    Steps (``set``, ``grid``, ``phase_jump``, ``switch``, …, ``run``) are gathered; the whole
-    experiment is run from its beginning when something is first asked of it. Each step thereby
-    happens at its tick exactly, on every link. Steps after that are run again from the beginning
-    too, which in lockstep gives the same ticks again (it is checked); in real time it would be
-    another run, and is refused.
+    Steps (``set``, ``grid``, ``phase_jump``, ``switch``, …, ``run``) are collected; the first
+    access to a result runs the whole experiment from its beginning. So each step happens at its
+    exact tick on every link. Steps after a result run the experiment from the beginning again: in
+    lockstep this repeats the same ticks (which is checked); in real time it would be another run,
+    and is refused.
 
     Args:
-        near: folder of the test, where scenario and law files are looked for first.
+        near: folder of the test, searched first for scenario and law files.
         new_folder: called for the folder of each run.
-        link_wanted: link of the command line, instead of the test's.
-        notice: told of each figure that an assertion leaves.
-        skip: told why a test cannot be run over ``link_wanted``; must not return.
+        link_wanted: link of the command line, replaces the test's.
+        notice: called with each figure that an assertion draws.
+        skip: called with the reason why a test cannot run over ``link_wanted``; must not return.
     """
 
     def __init__(
@@ -47,10 +47,10 @@ class Steps:
         self._setting: Setting | None = None
 
     def start(self, scenario: str | None = None, **setting: Any) -> None:
-        """Begin anew; the arguments are those of ``make_setting`` and of the marker.
+        """Start a new experiment; the arguments are those of ``make_setting`` and of the marker.
 
         Raises:
-            UserError: one line a mistake.
+            UserError: one line per mistake.
         """
         __tracebackhide__ = True
         try:
@@ -63,7 +63,7 @@ class Steps:
             self._skip(f"--gfmhil-link {self._link_wanted}: {problem}")
         self._plan = Plan(self._setting.scenario)
         self._run: Run | None = None
-        self._ran = 0  # ticks of the plan that ``_run`` was to have
+        self._ran = 0  # planned ticks of ``_run``
 
     # steps
 
@@ -93,8 +93,8 @@ class Steps:
         self._planned.step("grid-phase-jump", degrees=degrees)
 
     def grid_impedance(self, L_g: float, R_g: float | None = None) -> None:
-        """The line becomes so many times its nominal elements; without ``R_g`` it is the same
-        line, longer or shorter."""
+        """The line gets ``L_g`` and ``R_g`` times its nominal elements; without ``R_g`` both get
+        the factor ``L_g``: the same line, longer or shorter."""
         self._planned.step("grid-impedance", L_g=L_g, R_g=L_g if R_g is None else R_g)
 
     def breaker(self, closed: bool) -> None:
@@ -102,33 +102,33 @@ class Steps:
         self._planned.step("grid-breaker", closed=closed)
 
     def switch(self, law: str) -> None:
-        """Change to another law, of the catalogue or a file, bumpless."""
+        """Change to another law, of the catalogue or a file, without a bump."""
         plan = self._planned
         if self.setting.controller_command:
             raise UserError(f"law = {law!r}: a controller of one's own has laws of its own")
         plan.step("law", law=beside(self._near, law))
 
     def gains(self, **values: float) -> None:
-        """Other gains of the law in force, by the names in its file, bumpless: ``D_p=0.02``."""
+        """New gains of the active law, by the names in its file, without a bump: ``D_p=0.02``."""
         if self.setting.controller_command:
             raise UserError("gains: a controller of one's own has gains of its own")
         self._planned.step("gains", values={name: float(v) for name, v in values.items()})
 
     def reset(self) -> None:
-        """Back from a trip or the safe state to the start; begin with ``after_trip="wait"``."""
+        """Return from a trip or the safe state to the start; needs ``after_trip="wait"``."""
         if self.setting.controller_command:
             raise UserError("reset: a controller of one's own is not ours to reset")
         self._planned.step("reset")
 
     def run(self, seconds: float | None = None) -> None:
-        """Go on for a time [s]; without one, to the scenario's end."""
+        """Continue for a time [s]; without one, to the scenario's end."""
         self._planned.run(seconds)
 
     # results
 
     @property
     def setting(self) -> Setting:
-        """What the experiment runs on."""
+        """The setting of the experiment."""
         if self._setting is None:
             self.start()
         assert self._setting is not None
@@ -141,12 +141,12 @@ class Steps:
 
     @property
     def pending(self) -> bool:
-        """There are ticks planned that were never run."""
+        """Whether planned ticks were never run."""
         return self._setting is not None and self._plan.tick > self._ran
 
     @property
     def signals(self) -> Signals:
-        """What was recorded, by name; see ``Signals``."""
+        """The recorded signals by name; see ``Signals``."""
         return self.result.signals
 
     @property
@@ -164,7 +164,7 @@ class Steps:
         """The run of all steps so far.
 
         Raises:
-            UserError: nothing to run, or nothing that could be run again.
+            UserError: there is nothing to run, or the run cannot be repeated.
         """
         plan, before = self._planned, self._run
         if before is not None and self._ran == plan.tick:

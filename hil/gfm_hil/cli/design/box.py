@@ -9,7 +9,6 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
@@ -21,6 +20,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.robust import Loops, paper_problem
 from gfm_hil.cli.design.box_options import add_box, read_box
 from gfm_hil.cli.design.common import channels_as_json
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.box import STEP, step_run
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import LawFile
@@ -98,7 +98,7 @@ def _gamma(file: LawFile, dc: Source) -> dict[str, Any]:
 def _bench(law: str, box: Box, quiet: bool) -> list[dict[str, Any]]:
     """Worst overshoot of each L_g on the nonlinear bench, and how many runs ended early."""
     points = replace(box, P_ref=(STEP[0],)).corners()
-    console = Console(stderr=True, quiet=quiet)
+    console = terminal(stderr=True, quiet=quiet)
     runs = [step_run(p, law) for p in track(points, "P_ref steps", console=console, transient=True)]
     rows = []
     for L_g in box.L_g:
@@ -121,7 +121,7 @@ def _row(dc: str, what: str, count: int, worst: float | None, at: Point) -> dict
 
 
 def _print(result: dict[str, Any]) -> None:
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     gamma = "none" if result["gamma"] is None else f"{result['gamma']:.4f}"
     console.print(f"[bold]{result['law']}[/]: γ = {gamma} of the paper's problem")
     table = Table("DC source", "what", "points", "worst", "at", box=None, pad_edge=False)

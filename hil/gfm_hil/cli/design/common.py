@@ -7,11 +7,11 @@ import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from gfm_design.norms.performance import Channel
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
 from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
 
@@ -68,6 +68,6 @@ def print_channels(name: str, channels: Sequence[Channel]) -> None:
     table = Table("channel", "‖W T‖∞", "at \\[rad/s]", box=None, pad_edge=False, title=None)
     for c in channels:
         table.add_row(f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", cell(c.omega))
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}")
     console.print(table)

@@ -7,8 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from gfm_design.margins.delays import overall_delay
 from gfm_design.model.box import Box, Point, Source
 from gfm_design.tuning.deployable import Round, deploy
@@ -19,6 +17,7 @@ from gfm_hil.cli.design.box import margin_text
 from gfm_hil.cli.design.box_options import add_box, read_box, wanted
 from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import LawFile
@@ -45,7 +44,7 @@ def call(options: argparse.Namespace) -> int:
     gains = free_gains(file, read_gains(options.gains), only)
     box = read_box(options.box)
     demands = wanted(read_gains(options.want, "--want"), box)
-    console = Console(stderr=True, highlight=False)
+    console = terminal(stderr=True, highlight=False)
 
     def tell(found: Round) -> None:
         console.print(

@@ -6,8 +6,6 @@ import argparse
 import json
 from typing import Any
 
-from rich.console import Console
-
 from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_hil.cli.common import EXIT_OTHERWISE
@@ -18,6 +16,7 @@ from gfm_hil.cli.design.common import (
     read_gains,
     singular_is_users,
 )
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.design import gamma
 from gfm_hil.studies.law import Law
 
@@ -46,7 +45,7 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(found)}))
         else:
-            Console().print(f"{law.name}: no gamma, {found}", highlight=False)
+            terminal().print(f"{law.name}: no gamma, {found}", highlight=False)
         return EXIT_OTHERWISE
     if options.json:
         print(json.dumps({"law": law.name, **channels_as_json(channels)}, indent=2))

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from gfm_design.margins.all_margins import UnstableLoop
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, mode_as_json
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
@@ -60,7 +60,7 @@ def call(options: argparse.Namespace) -> int:
     loop, label = scenario_loop(scenario)
     if options.out:
         _save(options.out, lambda: options.draw(loop, options))
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     try:
         content, table = options.find(loop, options)
     except UnstableLoop as problem:

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import Progress
 
 from gfm_design.margins.all_margins import UnstableLoop, margins
@@ -15,6 +14,7 @@ from gfm_design.margins.tolerance import POINTS, Region, stable_region
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.results.loop_delay import check_run, read_loop_delay
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
@@ -45,7 +45,7 @@ def call(options: argparse.Namespace) -> int:
     else:
         scenario = load_scenario(options.scenario, law=options.law)
     loop, label = scenario_loop(scenario)
-    console = Console(highlight=False)
+    console = terminal(highlight=False)
     try:
         found = margins(loop)
     except UnstableLoop as problem:
@@ -82,7 +82,7 @@ def _draw(folder: Path, loop: Loop, label: str, margin: float) -> Region:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise UserError(f"--figures {folder}: {problem.strerror}") from None
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with Progress(console=terminal(stderr=True), transient=True) as bar:
         task = bar.add_task("stable region", total=POINTS)
         region = stable_region(loop, POINTS, lambda rows: bar.update(task, completed=rows))
     draw_region(folder / "region.png", loop, label, region)

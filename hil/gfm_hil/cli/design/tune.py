@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
@@ -20,6 +19,7 @@ from gfm_hil.cli.design.common import (
     singular_is_users,
 )
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.design import NotTuned, Tuning, tune
 from gfm_hil.studies.law import Law
 from gfm_hil.studies.tuned_law import write_law
@@ -57,7 +57,7 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
         else:
-            Console(stderr=True).print(f"{law.name}: {none}", highlight=False, soft_wrap=True)
+            terminal(stderr=True).print(f"{law.name}: {none}", highlight=False, soft_wrap=True)
         return EXIT_OTHERWISE
     named, channels = found.gains, found.gamma.channels
     result = {
@@ -82,13 +82,13 @@ def call(options: argparse.Namespace) -> int:
         + (f"; law file: {options.out}" if options.out else ""),
         said,
     ]
-    Console(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
+    terminal(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
     return 0
 
 
 def _searched(law: Law, options: argparse.Namespace) -> Tuning:
     """The search, with a bar on stderr."""
-    console = Console(stderr=True, quiet=options.quiet)
+    console = terminal(stderr=True, quiet=options.quiet)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -119,7 +119,7 @@ def _bound(tuning: Tuning, result: dict[str, Any]) -> str:
     try:
         found = tuning.bound()
     except UserError as missing:
-        Console(stderr=True).print(str(missing), highlight=False, soft_wrap=True)
+        terminal(stderr=True).print(str(missing), highlight=False, soft_wrap=True)
         return ""
     if found is None:
         return "full order: the solver came to no result in time"

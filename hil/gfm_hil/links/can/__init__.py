@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import socket
-from importlib.util import find_spec
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
@@ -12,30 +11,30 @@ from gfm_hil.core.roles import Side
 from gfm_hil.links.base import Link, LinkKind
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
 
-_PLACES = 4  # of a loopback bus, UDP ports in a row
-
-
-_NEEDS = "link.type = 'can' needs cantools: pip install 'gfmhil[can]'"
+_PLACES = 4  # places of a loopback bus: consecutive UDP ports
 
 
 def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
-    if find_spec("cantools") is None:
-        raise UserError(_NEEDS)
     from gfm_hil.links.can.link import CanLink
 
     return CanLink(side, endpoint, options)
 
 
+def _warm_up(options: CanOptions) -> None:
+    from gfm_hil.links.can.layout import load_plan
+    from gfm_hil.links.can.link import warm_up
+
+    warm_up(load_plan(options))
+
+
 def _check(options: CanOptions, T_s: float) -> None:
-    if find_spec("cantools") is None:
-        raise ValueError(_NEEDS)
     from gfm_hil.links.can.bus_budget import check_budget
 
     check_budget(options, T_s)
 
 
 def _refuse_unused(endpoint: str | None, options: CanOptions) -> None:
-    """See that a backend that is asked for is the one that carries the frames.
+    """Check that the backend named in the options is the one that carries the frames.
 
     Raises:
         ValueError: it is not.
@@ -50,8 +49,8 @@ def _refuse_unused(endpoint: str | None, options: CanOptions) -> None:
 
 
 def _fresh(folder: Path) -> str:
-    """A loopback bus of free ports, below those that the kernel gives to others."""
-    begin = secrets.randbelow(2500)  # two runs that start at a time shall not meet
+    """A loopback bus on free ports below the kernel's ephemeral range."""
+    begin = secrets.randbelow(2500)  # so that two runs that start together take different ports
     for k in range(2500):
         first = 20_000 + _PLACES * ((begin + k) % 2500)
         probes = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(_PLACES)]
@@ -79,5 +78,6 @@ KIND = LinkKind(
     options=CanOptions,
     check=_check,
     check_both=_refuse_unused,
+    warm_up=_warm_up,
     exact=False,
 )

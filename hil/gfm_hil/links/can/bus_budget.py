@@ -1,7 +1,7 @@
-"""Whether y and u fit the period: what both keep the bus at worst, against every × T_s.
+"""Whether y and u fit the period: their worst-case bus time against every × T_s.
 
-Both vectors share one bus, so that an exchange takes the sum of their frames. What is sent besides
-them (a state that changed, see ``vectors``) makes one exchange late on a bus that is almost full.
+Both vectors share one bus, so that an exchange takes the sum of their frames. On a bus that is
+almost full, an additional frame (a state that changed, see ``vectors``) makes one exchange late.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from gfm_hil.links.can.frame_time import classic_time, fd_time
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.options import CanOptions
 
-DATA_RATES = (2_000_000, 5_000_000, 8_000_000)  # that transceivers are made for
+DATA_RATES = (2_000_000, 5_000_000, 8_000_000)  # bit/s of common transceivers
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What an exchange of y and u costs, at worst.
+    """Worst-case cost of an exchange of y and u.
 
     Attributes:
         y, u: time on the bus, s.
@@ -32,15 +32,15 @@ class Budget:
 
     @property
     def exchange(self) -> float:
-        """Both, s."""
+        """Bus time of y and u together, s."""
         return self.y + self.u
 
     def load(self, period: float) -> float:
-        """Share of a period (s) for which they keep the bus."""
+        """Share of a period (s) for which y and u occupy the bus."""
         return self.exchange / period
 
     def every(self, T_s: float) -> int:
-        """Least number of ticks to an exchange that fits."""
+        """Smallest number of ticks per exchange that fits."""
         return max(1, math.ceil(self.exchange / T_s - 1e-9))
 
 
@@ -58,11 +58,11 @@ def budget(plan: Plan, bitrate: float, data_bitrate: float) -> Budget:
 
 
 def check_budget(options: CanOptions, T_s: float) -> None:
-    """See that every exchange fits.
+    """Check that every exchange fits the period.
 
     Raises:
-        ValueError: it does not; says by how much, and the nearest that does. Or the DBC that the
-            options name is not to be used.
+        ValueError: it does not fit; the message says by how much, and the nearest settings that
+            do. Or the DBC that the options name cannot be used.
     """
     plan = load_plan(options)
     need = budget(plan, options.bitrate, options.data_bitrate)

@@ -1,10 +1,9 @@
-"""The DBC: what travels on the bus, written from the signal table.
+"""The DBC: all frames on the bus, generated from the signal table.
 
-Every frame that carries values begins with two bytes of end-to-end protection (``e2e``), then
-values as int16, little-endian. A value travels in counts of its ``scale``; -32768 stands for one
-that is not a number. CAN FD takes a vector in one frame, classic CAN in as many as it needs.
-A lower identifier wins the bus: states first, then commands, then measurements, then messages of
-the handshake, cut into segments.
+Every frame that carries values begins with two bytes of end-to-end protection, then values as
+int16, little-endian. A value travels in counts of its ``scale``; -32768 stands for NaN.
+CAN FD sends a vector in one frame, classic CAN in as many as it needs. The lower identifier wins
+the bus: states first, then commands, then measurements, then segments of handshake messages.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from gfm_runtime.states import REASONS, STATES
 INT16 = 32767  # largest count; the range is symmetric
 INVALID = -32768
 SENDERS: dict[Group, Side] = {"y": "plant", "u": "controller"}
-#: names of the frames of each vector; a vector in several frames appends _1, _2 …
+#: frame name of each vector; if a vector needs several frames, they append _1, _2 …
 VECTORS: dict[Group, str] = {"y": "Measurements", "u": "Commands"}
 STATUS: dict[Side, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
 SEGMENT: dict[Side, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
@@ -40,7 +39,7 @@ _NODES = {"plant": "Plant", "controller": "Controller"}
 
 
 def offset(row: Row) -> float:
-    """Value of count 0: 0 where the range fits about it, else the middle of the range.
+    """Value of count 0: 0 if the range then fits 16 bits, else the middle of the range.
 
     Raises:
         ValueError: the range does not fit 16 bits at this scale.
@@ -139,7 +138,7 @@ def write_dbc(fd: bool) -> str:
 
 
 def _bus_type(value: str) -> DbcSpecifics:
-    """Without this attribute the file would silently describe classic CAN."""
+    """The attribute without which the file would silently describe classic CAN."""
     definition = DbcAttributeDefinition(
         "BusType", default_value="CAN", kind=None, type_name="STRING"
     )
@@ -150,7 +149,7 @@ def _bus_type(value: str) -> DbcSpecifics:
 
 
 def read_dbc(text: str) -> Database:
-    """A database as a tool that is given the file has it."""
+    """The database as another tool reads it from the file."""
     database = load_string(text, "dbc")
     assert isinstance(database, Database)
     return database

@@ -1,10 +1,10 @@
-"""Frames that have arrived and wait to be read, on a virtual bus as late as on a real one.
+"""The queue of received frames; on a virtual bus it delays them as a real bus would.
 
-Every node keeps the same account: it knows when it sent and sees what others send within
-microseconds. While a frame is on the bus, others wait; of those that wait, the lowest identifier
-goes next; each takes its longest time (``frame_time``), and is delivered no earlier than at its
-end. It is the time of the wall clock, so that it matters in real time: a run in lockstep takes
-longer and gives the same. Where nothing is emulated a frame is delivered as it comes.
+Every node computes the same schedule: it knows when it sent, and it sees the others' frames within
+microseconds. While a frame is on the bus, the others wait. The lowest waiting identifier goes
+next; each frame takes its longest time (``frame_time``) and is delivered no earlier than at its
+end. The clock is the wall clock, so the delay matters only in real time: a run in lockstep takes
+longer and gives the same results. Without emulation a frame is delivered as it arrives.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gfm_hil.links.can.frame_time import PAYLOADS, classic_time, fd_time
 from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
 from gfm_hil.realtime.atomics import copy
 
-PLACES = 128  # for frames that wait for the bus, and again for those that have had it
+PLACES = 128  # for frames that wait for the bus, and as many again for frames that were sent
 _LONGEST = PAYLOADS[-1]
 
 bus_dtype = np.dtype(
@@ -24,20 +24,20 @@ bus_dtype = np.dtype(
         ("emulate", "i8"),
         ("free", "i8"),  # when the frame on the bus ends, ns
         ("waiting", "i8"),  # frames
-        ("first", "i8"),  # place of the frame to be delivered next
-        ("through", "i8"),  # frames to be delivered
-        ("time", "i8", (_LONGEST + 1,)),  # of a frame on the bus by its bytes, ns
+        ("first", "i8"),  # index of the next frame to deliver
+        ("through", "i8"),  # frames ready for delivery
+        ("time", "i8", (_LONGEST + 1,)),  # time on the bus by number of data bytes, ns
     ]
 )
 
-#: a frame in one of 2 PLACES: since when it waits or when it is through (ns), and whether it is
-#: of another node and so to be delivered
+#: a frame in one of 2 PLACES: since when it has waited or when it leaves the bus (ns), and whether
+#: another node sent it, so that it must be delivered
 place_dtype = np.dtype([("at", "i8"), ("deliver", "i8"), *frame_dtype.descr])
 _FRAME_AT = 16
 
 
 def set_bus(bus: np.ndarray, fd: bool, bitrate: int, data_bitrate: int) -> None:
-    """Have one record of ``bus_dtype`` emulate a bus of these bit rates, bit/s."""
+    """Make one record of ``bus_dtype`` emulate a bus with these bit rates, bit/s."""
     bus["emulate"] = 1
     for length in range(_LONGEST + 1 if fd else 9):
         sent = next(n for n in PAYLOADS if n >= length)
@@ -59,7 +59,7 @@ def busy(bus):
 
 @njit(cache=True, nogil=True)
 def arrive(bus, places, frame, deliver, now):
-    """Take a frame that somebody sent; one of ours (``deliver`` = 0) keeps the bus and no more.
+    """Queue a frame; one of our own (``deliver`` = 0) only occupies the bus.
 
     Args:
         bus: one record of ``bus_dtype``.
@@ -71,7 +71,7 @@ def arrive(bus, places, frame, deliver, now):
     if not b.emulate:
         _fill(places, PLACES + (b.first + b.through) % PLACES, frame, 1, 0)
         b.through += 1
-    elif frame[0].id & ERROR:  # tells of the node itself, takes no part in arbitration
+    elif frame[0].id & ERROR:  # an error frame concerns this node only: no arbitration
         b.first = (b.first - 1) % PLACES
         _fill(places, PLACES + b.first, frame, 1, 0)
         b.through += 1
@@ -88,7 +88,7 @@ def _fill(places, k, frame, deliver, at):
 
 @njit(cache=True, nogil=True)
 def _arbitrate(b, places, now):
-    """Give the bus to all that have had their turn by now."""
+    """Move every frame that has won arbitration by now from waiting to delivery."""
     while b.waiting > 0 and b.through < PLACES:
         start = places[0].at
         for k in range(1, b.waiting):
@@ -107,13 +107,13 @@ def _arbitrate(b, places, now):
             places[to].at = b.free
             b.through += 1
         b.waiting -= 1
-        for k in range(best, b.waiting):  # in the order in which they came
+        for k in range(best, b.waiting):  # keep the order of arrival
             places[k] = places[k + 1]
 
 
 @njit(cache=True, nogil=True)
 def is_through(bus, places, now):
-    """Whether there is a frame to be delivered."""
+    """Whether a frame is ready for delivery."""
     b = bus[0]
     if b.waiting > 0:
         _arbitrate(b, places, now)
@@ -122,7 +122,7 @@ def is_through(bus, places, now):
 
 @njit(cache=True, nogil=True)
 def deliver(bus, places, frame):
-    """Write the frame that ``is_through`` to the one in an array of ``wire.frame_dtype``."""
+    """Copy the frame that ``is_through`` found into ``frame``, an array of ``wire.frame_dtype``."""
     b = bus[0]
     copy(
         frame.ctypes.data, places[PLACES + b.first : PLACES + b.first + 1].ctypes.data + _FRAME_AT,

@@ -1,11 +1,11 @@
-"""How long a frame keeps the bus at worst: exact, over every identifier and payload (ISO 11898-1).
+"""Worst-case bus time of a frame: exact, over every identifier and payload (ISO 11898-1).
 
-A stuff bit follows five equal bits, itself counted as the first of the next five. What is asked
-for is the content with the most of them, bit by bit: of all contents that end in the same bit, the
-same run of it and, in classic CAN, the same CRC, only the longest matters. In CAN FD the CRC comes
-with stuff bits at fixed places, so that its value does not matter; stuff bits in the part that is
-sent faster count for less. Interframe space included. A recessive ESI, sent by a node in trouble,
-makes no frame longer.
+A stuff bit follows five equal bits and counts as the first of the next five. The search finds the
+content with the most stuff bits by dynamic programming, bit by bit: of all contents that end in
+the same bit, the same run of it and, in classic CAN, the same CRC, it keeps only the longest. In
+CAN FD the CRC has stuff bits at fixed positions, so that its value does not matter; stuff bits at
+the data bit rate take less time. The interframe space is included. A recessive ESI, which an
+error-passive node sends, makes no frame longer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes; the index is the DL
 _TAIL = 12  # ACK, its delimiter, end of frame, interframe space
 _NEVER = -9999
 _RUN = 5
-#: a bit to send: its value, or None where any may stand
+#: bits to send: each a value, or None for any value
 _Bits = list[int | None]
 
 
@@ -34,12 +34,12 @@ def _identifier(number: int | None) -> _Bits:
 
 @cache
 def fd_time(length: int, bitrate: float, data_bitrate: float, number: int | None = None) -> float:
-    """Longest CAN FD frame of ``length`` bytes with 11-bit identifier, bit rate switched, s.
+    """Longest time of a CAN FD frame of ``length`` bytes, 11-bit identifier, with BRS, s.
 
     Args:
         length: payload in bytes, one of 0 … 8, 12, 16, 20, 24, 32, 48, 64.
         bitrate, data_bitrate: bit/s.
-        number: the identifier; None for the worst of all.
+        number: the identifier; None for the worst case over all identifiers.
     """
     slow, fast = 1.0 / bitrate, 1.0 / data_bitrate
     # SOF, identifier, RRS, IDE, FDF, res, BRS; then ESI, DLC, data
@@ -49,12 +49,12 @@ def fd_time(length: int, bitrate: float, data_bitrate: float, number: int | None
     best = {(1, 0): 0.0}  # (bit, run): longest time so far
     for k, bit in enumerate([*head, *body]):
         after: dict[tuple[int, int], float] = {}
-        last = k == len(times) - 1  # there the CRC's first fixed stuff bit takes the place
+        last = k == len(times) - 1  # here the CRC's first fixed stuff bit replaces a stuff bit
         for (before, run), time in best.items():
             for value in (0, 1) if bit is None else (bit,):
                 now, length_now = time + times[k], run + 1 if value == before else 1
                 state = (value, length_now)
-                if length_now == _RUN and not last:  # after BRS it is already a fast one
+                if length_now == _RUN and not last:  # a stuff bit after BRS has the fast rate
                     state, now = (1 - value, 1), now + times[k + 1]
                 after[state] = max(after.get(state, 0.0), now)
         best = after
@@ -66,7 +66,7 @@ def fd_time(length: int, bitrate: float, data_bitrate: float, number: int | None
 
 @cache
 def classic_time(length: int, bitrate: float, number: int | None = None) -> float:
-    """Longest classic frame of ``length`` bytes with 11-bit identifier, s."""
+    """Longest time of a classic CAN frame of ``length`` bytes with 11-bit identifier, s."""
     # SOF, identifier, RTR, IDE, r0, DLC, data
     bits: _Bits = [0, *_identifier(number), 0, 0, 0, *_dlc(length), *[None] * (8 * length)]
     wire = np.array([-1 if bit is None else bit for bit in bits])
@@ -76,12 +76,12 @@ def classic_time(length: int, bitrate: float, number: int | None = None) -> floa
 @njit(cache=True)
 def _most_stuffed(bits):
     """Most stuff bits that a classic frame's bits (-1: any) and their CRC can need."""
-    # by CRC, last bit and its run 1 … 4: on a fifth follows a stuff bit
+    # by CRC, last bit and its run 1 … 4: a stuff bit follows the fifth
     most = np.full((1 << 15, 2, _RUN), _NEVER, np.int16)
-    most[0, 1, 0] = 0  # before the start, with a run of none
+    most[0, 1, 0] = 0  # before the start of frame: run 0
     for k in range(len(bits) + 15):
         after = np.full_like(most, _NEVER)
-        place = len(bits) + 14 - k  # of the CRC's bit that is sent, if it is one
+        place = len(bits) + 14 - k  # below 15: the number of the CRC bit being sent
         for crc in range(1 << 15):
             for value in range(2):
                 to = crc

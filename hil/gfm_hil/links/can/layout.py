@@ -1,4 +1,4 @@
-"""Where each value lies in each frame, taken from a loaded DBC, and packing by it, compiled.
+"""Where each value lies in each frame, from a loaded DBC; compiled packing and unpacking.
 
 cantools reads the DBC once, at the start; the loop never calls it.
 """
@@ -39,10 +39,10 @@ class Layout:
 
     Attributes:
         name, number, length: as in the DBC; the length in bytes.
-        dtype: a record with a field a signal.
-        data_id: 16 bits that depend on all of the definition.
-        index: which elements of the vector it carries, shape (n,); none for other frames.
-        start: their first bytes, shape (n,).
+        dtype: a record with one field per signal.
+        data_id: 16 bits of a hash over the whole definition.
+        index: which elements of the vector it carries, shape (n,); empty for other frames.
+        start: the first byte of each, shape (n,).
         scale, offset: value = count × scale + offset, shape (n,), p.u.
     """
 
@@ -63,8 +63,8 @@ class Plan:
 
     Attributes:
         vectors: the frames of each vector, in the order of their identifiers.
-        status, segment: of each sender.
-        digest: over all definitions; both sides compare it.
+        status, segment: the frame of each sender.
+        digest: hash of all definitions; both sides compare it.
         fd: CAN FD rather than classic.
     """
 
@@ -88,10 +88,10 @@ def _digest(text: str, size: int) -> int:
 
 
 def dtype_of(message: Message) -> np.dtype:
-    """A record that lies as the DBC says.
+    """A record with the layout of the DBC.
 
     Raises:
-        ValueError: a signal is not whole bytes, little-endian.
+        ValueError: a signal is not made of whole bytes, little-endian.
     """
     for s in message.signals:
         if s.start % 8 or s.length not in (8, 16, 32) or s.byte_order != "little_endian":
@@ -129,10 +129,10 @@ def _layout(message: Message, vector: tuple[str, ...] = ()) -> Layout:
 
 
 def plan_of(database: Database) -> Plan:
-    """What the link needs of a DBC.
+    """The frames of a DBC that the link uses.
 
     Raises:
-        ValueError: a frame or a signal is missing or lies where it may not.
+        ValueError: a frame or a signal is missing or misplaced.
     """
     messages = {m.name: m for m in database.messages}
     missing = sorted({*STATUS.values(), *SEGMENT.values()} - set(messages))
@@ -161,15 +161,16 @@ def plan_of(database: Database) -> Plan:
 
 @njit(cache=True, nogil=True)
 def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
-    """Write values in counts, to the nearest, and protect them.
+    """Write values rounded to counts, and add the end-to-end protection.
 
     Args:
-        values: the whole vector, p.u.; the rest as in ``Layout``.
+        values: the whole vector, p.u.
+        index, start, scale, offset, data_id: as in ``Layout``.
         counter: the frame's second byte.
         payload: bytes of the frame, written.
 
     Returns:
-        How many values lay outside what 16 bits can say and were set to the end they passed.
+        How many values exceeded the 16-bit range and were saturated.
     """
     saturated = 0
     for k in range(len(index)):
@@ -190,7 +191,7 @@ def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
 
 @njit(cache=True, nogil=True)
 def unpack_vector(payload, index, start, scale, offset, values):
-    """Write the values that a frame carries into the vector; NaN for an invalid one."""
+    """Write a frame's values into the vector; an invalid count becomes NaN."""
     for k in range(len(index)):
         count = np.int64(payload[start[k]]) | np.int64(payload[start[k] + 1]) << 8
         if count >= 0x8000:
@@ -200,10 +201,10 @@ def unpack_vector(payload, index, start, scale, offset, values):
 
 @cache
 def load_plan(options: CanOptions) -> Plan:
-    """The frames of that DBC.
+    """The frames of the DBC that the options name, or of the generated one.
 
     Raises:
-        ValueError: it cannot be read, or does not describe what the link needs.
+        ValueError: the DBC cannot be read, or lacks what the link needs.
     """
     if options.dbc is None:
         return plan_of(read_dbc(write_dbc(options.fd)))
@@ -212,7 +213,7 @@ def load_plan(options: CanOptions) -> Plan:
         plan = plan_of(read_dbc(Path(options.dbc).read_text(encoding="utf-8")))
     except OSError as problem:
         raise ValueError(f"{where}: {problem.strerror}") from None
-    except Exception as problem:  # cantools has no common base of what its parser raises
+    except Exception as problem:  # cantools' parser errors have no common base class
         said = " ".join(str(problem).split())
         raise ValueError(f"{where}: {said}") from None
     if plan.fd != options.fd:

@@ -1,4 +1,4 @@
-"""The CAN link: one side's node on a bus of python-can, or on a socket that python-can opened."""
+"""The CAN link: one side's node on a python-can bus, or on the socket that python-can opened."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
 from gfm_runtime.signals import Group, names
 
-# what python-can logs is in what it raises, which is told in a line of ours
+# python-can also raises what it logs, and we print that in one line: silence its log
 logging.getLogger("can").addHandler(logging.NullHandler())
 
-_ROOM_S = 0.2  # how long a segment waits for room: a kernel's queue takes ten frames
-_LOOK_S = 20e-6  # while something is on the bus, how long to wait for more
+_ROOM_S = 0.2  # how long a segment waits for room: the kernel's queue holds ten frames
+_LOOK_S = 20e-6  # poll interval while a frame is on the emulated bus
 
 
 class CanLink:
@@ -61,10 +61,10 @@ class CanLink:
         options: checked.
 
     Attributes:
-        port: for a bus that is a socket, unless the options leave the frames to python-can.
+        port: set if the bus is a socket, unless the options leave the frames to python-can.
 
     Raises:
-        UserError: the bus or the DBC is not to be had.
+        UserError: the bus or the DBC cannot be used.
     """
 
     port: Port | None = None
@@ -79,13 +79,13 @@ class CanLink:
         self._node = Node(plan, side, options)
         self._cut = SegmentSender(plan, side)
         self._message, self._frame = np.zeros(LONGEST, np.uint8), np.zeros(1, frame_dtype)
-        _compile(plan)
+        warm_up(plan)
         self._bus = _open_bus(side, endpoint, options)
         if not options.portable:
             self._reach(self._bus, options)
 
     def _reach(self, bus: Any, options: CanOptions) -> None:
-        """Have the node use the bus itself, if it is a socket."""
+        """Let the node use the bus directly, if it is a socket."""
         if isinstance(bus, LoopbackBus):
             set_socket(self._node.sockets, UDP, bus.fileno(), bus.others())
         elif options.interface == "socketcan":
@@ -96,7 +96,7 @@ class CanLink:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What happened on the bus besides the faults that the reader of frames counts."""
+        """Counts of bus events, besides the faults that the frame reader counts."""
         n = self._node
         counted = {
             "foreign": n.state["foreign"],
@@ -109,7 +109,7 @@ class CanLink:
         return {name: int(count[0]) for name, count in counted.items()}
 
     def send(self, message: bytes) -> bool:
-        """Hand a message over; False if the bus has no room for all of it.
+        """Send a message; False if the bus has no room for all of it.
 
         Raises:
             PeerLost: the bus is down.
@@ -165,7 +165,7 @@ class CanLink:
         return None if size == NOTHING else self._message[:size].tobytes()
 
     def _bring(self, timeout: float) -> bool:
-        """Take a frame from python-can to the node, if one comes."""
+        """Pass one frame from python-can to the node; False on timeout."""
         try:
             message = self._bus.recv(timeout)
         except can.CanOperationError as problem:
@@ -178,12 +178,12 @@ class CanLink:
         return True
 
     def _gone(self, said: str = "") -> PeerLost:
-        """Why the bus is of no more use."""
+        """The error that says why the bus is lost."""
         lost, self._node.state["lost"] = int(self._node.state["lost"][0]), 0
         if lost == WENT_BUS_OFF:
             return PeerLost(f"the CAN controller of {self._where} went bus off")
         if lost == ANOTHER_DBC:
-            for segment in self._cut.frames(b""):  # so that both sides see the misfit
+            for segment in self._cut.frames(b""):  # so that the peer also detects the mismatch
                 self._put_segment(*segment)
             theirs = int(self._node.joiner["theirs"][0])
             return PeerLost(
@@ -192,7 +192,7 @@ class CanLink:
         return PeerLost(f"the CAN bus {self._where} is gone: {said or os.strerror(lost)}")
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a frame is there, ours or not, at most ``seconds``."""
+        """Sleep until any frame has arrived, ours or foreign, at most ``seconds``."""
         node = self._node
         until = time.monotonic() + seconds
         while not fetch(node.handle):
@@ -209,14 +209,14 @@ class CanLink:
         return True
 
     def close(self) -> None:
-        """Leave the bus; frames handed over leave by themselves."""
+        """Leave the bus; the kernel still sends the frames that it has accepted."""
         self._node.state["open"] = 0
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
 
 
-def _compile(plan: Plan) -> None:
-    """Compile (or load from cache) what a tick calls, before the other side waits for it."""
+def warm_up(plan: Plan) -> None:
+    """Compile (or load from the cache) what a tick calls, before the other side waits for it."""
     ends = {side: Node(plan, side, CanOptions(fd=plan.fd)) for side in SIDES}
     message = np.zeros(LONGEST, np.uint8)
     groups: tuple[tuple[Side, Group], ...] = (("plant", "y"), ("controller", "u"))
@@ -229,6 +229,7 @@ def _compile(plan: Plan) -> None:
         fetch(theirs)
         receive(theirs, message)
         room_to_send(mine)
+        can_port(ends[side])
 
 
 def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:
@@ -250,7 +251,7 @@ def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:
 
 
 def _check_mtu(channel: str, fd: bool) -> None:
-    """See that a SocketCAN interface is set up for CAN FD, which sending would find too late."""
+    """Check that a SocketCAN interface is set up for CAN FD; sending would fail too late."""
     with contextlib.suppress(OSError):
         mtu = int(Path(f"/sys/class/net/{channel}/mtu").read_text(encoding="ascii"))
         if fd and mtu < 72:

@@ -1,9 +1,9 @@
 """A CAN bus between processes of one machine whose kernel has no CAN: UDP on 127.0.0.1.
 
 A python-can backend (``interface="gfmhil-udp"``, ``channel="127.0.0.1:port"``). The bus has four
-places, UDP ports ``port`` to ``port + 3``; a node takes one and sends each frame to the others
-that are there, as one datagram that holds Linux' ``struct canfd_frame``. Like ``vcan`` it takes no
-time and loses nothing but what overflows a receiver's buffer; it never leaves the machine.
+places, UDP ports ``port`` to ``port + 3``. A node takes one place and sends each frame to the
+other nodes, as one datagram that holds Linux' ``struct canfd_frame``. Like ``vcan`` the bus takes
+no time and loses frames only when a receiver's buffer overflows; it never leaves the machine.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from gfm_hil.links.can.wire import pack, unpack
 
 NODES = 4
 _HOST = "127.0.0.1"
-_BUFFER = 1 << 20  # bytes, or as many as the kernel allows
-_RECHECK_S = 0.05  # how long a place found empty is passed over
+_BUFFER = 1 << 20  # bytes; the kernel may grant fewer
+_RECHECK_S = 0.05  # how long to skip a place that was empty
 
 
 class LoopbackBus(can.BusABC):
@@ -30,10 +30,10 @@ class LoopbackBus(can.BusABC):
 
     Args:
         channel: ``"127.0.0.1:port"``.
-        place: which of the places to take; None takes the last free one.
+        place: index of the place to take; None takes the last free one.
 
     Raises:
-        can.CanInitializationError: the place is occupied, or all of them are.
+        can.CanInitializationError: the place is occupied, or all are.
     """
 
     def __init__(self, channel: Any, place: int | None = None, **more: Any) -> None:
@@ -58,7 +58,7 @@ class LoopbackBus(can.BusABC):
         raise can.CanInitializationError(f"occupied: {_HOST}:{first}")
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send to every other node that is there."""
+        """Send a frame to every other node on the bus."""
         datagram = pack(msg)
         for peer in self._peers:
             peer.send(datagram)
@@ -74,11 +74,11 @@ class LoopbackBus(can.BusABC):
         return unpack(datagram), False
 
     def fileno(self) -> int:
-        """For select."""
+        """File descriptor for select."""
         return self._socket.fileno()
 
     def others(self) -> list[int]:
-        """Descriptors of the sockets connected to the other places."""
+        """File descriptors of the sockets that are connected to the other places."""
         return [peer.fileno() for peer in self._peers]
 
     def shutdown(self) -> None:
@@ -91,7 +91,7 @@ class LoopbackBus(can.BusABC):
 
 
 class _Peer:
-    """Another place of the bus; one that is empty is asked again only every now and then."""
+    """Another place of the bus; after an empty one, sends are skipped for ``_RECHECK_S``."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -105,9 +105,9 @@ class _Peer:
         try:
             self._socket.send(datagram)
             self._empty_until = 0.0
-        except ConnectionRefusedError:  # says so of the datagram before this one
+        except ConnectionRefusedError:  # reports the previous datagram, not this one
             self._empty_until = time.monotonic() + _RECHECK_S
-        except OSError as problem:  # its buffer is full: what a controller's overrun is
+        except OSError as problem:  # a full buffer is like a CAN controller's overrun: drop
             if problem.errno not in (errno.EAGAIN, errno.ENOBUFS):
                 raise can.CanOperationError(str(problem), problem.errno) from problem
 

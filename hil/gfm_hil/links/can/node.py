@@ -1,8 +1,8 @@
-"""One side's node on a bus, compiled: from messages to frames, and from frames to messages.
+"""One side's node on a bus, compiled: it turns messages into frames, and frames into messages.
 
-All that a node remembers lies in one int64 array, which is the ``handle`` of its port, so that
-Python and compiled loops use the same node by the same code. Frames come from a socket (see
-``sockets``), or Python brings and takes them.
+All state of a node lies in one int64 array, which is the ``handle`` of its port, so that Python
+and compiled loops use the same node through the same code. The node reads and writes a socket
+(see ``sockets``), or Python moves the frames.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ from gfm_hil.links.can.wire import BUS_OFF, ERROR, EXTENDED, REMOTE, frame_dtype
 from gfm_hil.links.port import Port, port_function
 from gfm_hil.realtime.clock import now_ns
 
-NOTHING, LOST = -1, -2  # no message; the bus is gone, see ``lost``
+NOTHING, LOST = -1, -2  # no message; the bus is lost, see ``lost``
 
-_AT_ONCE = 64  # frames looked at in one call, so that a flood of others' frames cannot hold it
+_AT_ONCE = 64  # frames processed per call, so that a flood of foreign frames cannot block it
 
 #: ``lost`` says why: an errno, or one of these
 WENT_BUS_OFF, ANOTHER_DBC = -1, -2
@@ -59,14 +59,14 @@ WENT_BUS_OFF, ANOTHER_DBC = -1, -2
 state_dtype = np.dtype(
     [
         ("open", "i8"),
-        ("lost", "i8"),  # 0: it is there
-        ("foreign", "i8"),  # frames with identifiers that are not of this link
+        ("lost", "i8"),  # 0: the bus works
+        ("foreign", "i8"),  # frames whose identifiers this link does not use
         ("error_frames", "i8"),
-        ("dropped", "i8"),  # frames of ours, for want of room
+        ("dropped", "i8"),  # our frames dropped for lack of room
     ]
 )
 
-FRAMES = PARTS + 1  # that a message of the loops becomes, at most
+FRAMES = PARTS + 1  # most CAN frames that one message of the loops becomes
 _WORD = 8
 _SIZES = {
     "state": (state_dtype, 1),
@@ -81,16 +81,16 @@ _SIZES = {
     "into": (frame_dtype, 1),
 }
 _ENDS = np.cumsum([dtype.itemsize * count for dtype, count in _SIZES.values()]) // _WORD
-# where each begins, the first at 0
+# where each part after the first begins (the first begins at 0), and the end
 _SOCKETS, _SENDER, _RECEIVER, _JOINER, _SUBRATE, _BUS, _PLACES, _OUT, _INTO, _END = _ENDS.tolist()
 
 
 class Node:
-    """The array and, for Python, what lies in it; see the dtypes.
+    """The array and, for Python, views of its parts; see the dtypes.
 
     Args:
         plan: of the DBC.
-        side: ours.
+        side: our side.
         options: of the link.
     """
 
@@ -151,8 +151,8 @@ def _into(handle):
 
 @njit(cache=True, nogil=True)
 def compose(handle, message):
-    """Make the frames of a message of the loops, in ``out``; returns how many, or NOTHING if it
-    is another message, which has to be cut."""
+    """Write the CAN frames of a message to ``out``; returns how many, or NOTHING if the message is
+    not a frame of the loops and must be sent in segments."""
     subrate = _subrate(handle)
     if subrate[0].every > 1 and not goes(subrate, message):
         return 0
@@ -161,7 +161,7 @@ def compose(handle, message):
 
 @njit(cache=True, nogil=True)
 def room_to_send(handle):
-    """Whether another frame may be sent; one that may not is counted."""
+    """Whether there is room to send another frame; if not, count it as dropped."""
     if _bus(handle)[0].waiting < PLACES:
         return True
     _state(handle)[0].dropped += 1
@@ -170,7 +170,7 @@ def room_to_send(handle):
 
 @njit(cache=True, nogil=True)
 def account(handle, frame):
-    """A frame of ours has been sent: it keeps an emulated bus."""
+    """Let a frame that we have sent occupy the emulated bus."""
     bus = _bus(handle)
     if bus[0].emulate:
         arrive(bus, _places(handle), frame, 0, now_ns())
@@ -178,14 +178,14 @@ def account(handle, frame):
 
 @njit(cache=True, nogil=True)
 def bring(handle, frame):
-    """A frame of another node has come."""
+    """Queue a frame that another node sent."""
     bus = _bus(handle)
     arrive(bus, _places(handle), frame, 1, now_ns())
 
 
 @njit(cache=True, nogil=True)
 def put(handle, frame):
-    """Send the frame in an array; False if it was dropped or the bus is gone."""
+    """Send the frame in an array; False if it was dropped or the bus is lost."""
     if not room_to_send(handle):
         return False
     problem = write_frame(_sockets(handle), frame)
@@ -202,7 +202,7 @@ def put(handle, frame):
 
 @njit(cache=True, nogil=True)
 def send(handle, message):
-    """Send a message of the loops: 1, or 0 if some of it was dropped."""
+    """Send a message of the loops: 1, or 0 if any part of it was dropped."""
     if _state(handle)[0].open == 0:
         return 0
     count = compose(handle, message)
@@ -216,11 +216,11 @@ def send(handle, message):
 
 @njit(cache=True, nogil=True)
 def fetch(handle):
-    """Take in what has come by the socket; returns whether there is a frame to be looked at."""
+    """Read the frames that the socket has; returns whether one is ready to be processed."""
     sockets, bus = _sockets(handle), _bus(handle)
     places, into = _places(handle), _into(handle)
     if sockets[0].kind != PORTABLE:
-        # all of them, where it matters when they came
+        # an emulated bus needs every frame's time of arrival: read them all now
         while has_room(bus) and (bus[0].emulate or bus[0].through == 0):
             came = read_frame(sockets, into)
             if came < 0:
@@ -237,8 +237,7 @@ def receive(handle, message):
 
     Args:
         handle: of the node.
-        message: bytes, at least those of a frame of the bench, written; of a longer message only
-            the beginning.
+        message: bytes, with room for a frame of the bench, written; a longer message is cut off.
 
     Returns:
         Its length, NOTHING, or LOST.
@@ -259,7 +258,7 @@ def receive(handle, message):
 
 @njit(cache=True, nogil=True)
 def _from_bus(handle, message):
-    """The next message that the bus itself brought."""
+    """The next message that came over the bus."""
     state = _state(handle)
     bus, places = _bus(handle), _places(handle)
     frame = _into(handle)
@@ -280,7 +279,7 @@ def _from_bus(handle, message):
 
 @njit(cache=True, nogil=True)
 def _take(handle, state, frame, message):
-    """Look at a frame; returns the length of the message that it completes, NOTHING, or LOST."""
+    """Process a frame; returns the length of the message that it completes, NOTHING, or LOST."""
     receiver = handle[_RECEIVER:_JOINER].view(receiver_dtype)
     joiner = handle[_JOINER:_SUBRATE].view(joiner_dtype)
     if frame.id & ERROR:
@@ -305,12 +304,12 @@ def _take(handle, state, frame, message):
 
 @njit(cache=True, nogil=True)
 def sleep(handle, ms):
-    """Sleep until a frame comes by the socket, at most that long; not while one is on the bus."""
+    """Sleep until the socket has a frame, at most ``ms``; not while a frame is on the bus."""
     if _state(handle)[0].open != 0 and not busy(_bus(handle)):
         sleep_for_frame(_sockets(handle), ms)
 
 
-_SPINS = 200  # looks, about 0.1 ms: the call that sends a frame also delivers it
+_SPINS = 200  # polls, about 0.1 ms: the call that sends a frame also delivers it
 _PATIENCE = 1  # ms
 
 

@@ -12,8 +12,8 @@ LOOPBACK = "can+udp"
 class CanOptions(LinkOptions):
     """How to reach the bus and how fast it is.
 
-    SocketCAN takes the bit rates that its interface was set up with (``ip link``); they are given
-    here so that the period can be checked against what the bus needs.
+    SocketCAN uses the bit rates that its interface was set up with (``ip link``); they are
+    repeated here to check the period against the bus time.
     """
 
     interface: str = Field("socketcan", description="python-can's name of the backend")

@@ -1,9 +1,9 @@
-"""Messages longer than a CAN frame, as those of the handshake: cut into segments, whole or not.
+"""Messages longer than a CAN frame, such as the handshake's, travel in segments, whole or not.
 
-Each begins with a digest of the sender's DBC and a CRC-32 of what follows. There is no flow
-control (ISO-TP has it): a message has a few hundred bytes, and one that is lost is said again.
-Cutting is Python, for only the handshake does it; joining is compiled, for a late one may come in
-the midst of a run.
+Each message begins with a digest of the sender's DBC and a CRC-32 of the rest. There is no flow
+control (ISO-TP has it): a message has a few hundred bytes, and the sender repeats a lost one.
+Python cuts messages, since only the handshake sends them; joining is compiled, since a late
+message may arrive during a run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NOTHING, OTHER_DBC = -1, -2
 
 _HEAD = struct.Struct("<II")  # digest of the DBC, CRC-32 of the message
 _HEAD_BYTES = 8
-_DATA = 4  # first byte of data in a segment: Message, Index, Segments, Used lie before
+_DATA = 4  # first data byte in a segment, after Message, Index, Segments and Used
 _MOST = 255  # segments
 LONGEST = _MOST * (64 - _DATA)  # bytes of a message
 
@@ -33,11 +33,11 @@ joiner_dtype = np.dtype(
         ("length", "i8"),
         ("at", "i8", (_DATA,)),  # where Message, Index, Segments and Used lie
         ("digest", "i8"),  # of our DBC
-        ("theirs", "i8"),  # of the DBC of the message last joined
-        ("message", "i8"),  # its number, -1 between two
-        ("next", "i8"),  # segment
+        ("theirs", "i8"),  # digest that the last joined message carried
+        ("message", "i8"),  # number of the message being joined, -1 for none
+        ("next", "i8"),  # index of the segment expected
         ("used", "i8"),  # bytes so far
-        ("damaged", "i8"),  # messages of which a segment is missing or wrong
+        ("damaged", "i8"),  # messages with a missing or wrong segment
         ("text", "u1", ((LONGEST + 7) // 8 * 8,)),
     ]
 )
@@ -78,7 +78,7 @@ class SegmentSender:
 
 
 def set_joiner(joiner: np.ndarray, plan: Plan, side: Side) -> None:
-    """Make one record of ``joiner_dtype`` ready for what the other side sends to this one."""
+    """Initialise one record of ``joiner_dtype`` for the segments that the other side sends."""
     layout, j = plan.segment[SIDES[1 - SIDES.index(side)]], joiner[0]
     fields = layout.dtype.fields
     assert fields is not None
@@ -89,12 +89,12 @@ def set_joiner(joiner: np.ndarray, plan: Plan, side: Side) -> None:
 
 @njit(cache=True, nogil=True)
 def join(joiner, frame, message):
-    """Take a segment.
+    """Add a segment to its message.
 
     Args:
         joiner: one record of ``joiner_dtype``.
         frame: one record of ``wire.frame_dtype`` with its identifier.
-        message: bytes, written; of one that is longer only the beginning.
+        message: bytes, written; a longer message is cut off.
 
     Returns:
         The length of the message that it completes, NOTHING, or OTHER_DBC.

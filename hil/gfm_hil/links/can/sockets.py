@@ -1,7 +1,7 @@
 """Frames to and from a socket, compiled: libc's ``send`` and ``recv`` without Python.
 
-SocketCAN takes and gives whole structures; on the loopback bus (see ``loopback``) a frame goes to
-each of the other places as a datagram.
+SocketCAN transfers whole structures; on the loopback bus (see ``loopback``) a frame goes to each
+of the other places as a datagram.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ intrinsic: Any = _numba_intrinsic  # its stubs count typingctx among the caller'
 
 PORTABLE, SOCKETCAN, LOOPBACK = range(3)
 _OTHERS = 3  # places of a loopback bus besides our own
-_RECHECK_NS = 50_000_000  # how long a place found empty is passed over
+_RECHECK_NS = 50_000_000  # how long to skip a place that was empty
 
 socket_dtype = np.dtype(
     [
-        ("kind", "i8"),  # of the bus; PORTABLE: not reached from here
+        ("kind", "i8"),  # of the bus; PORTABLE: compiled code does not access it
         ("fd", "i8"),
         ("others", "i8", (_OTHERS,)),  # sockets connected to the other places
         ("empty_until", "i8", (_OTHERS,)),  # ns
-        ("poll", "i8"),  # struct pollfd: the socket, and that it may be read
+        ("poll", "i8"),  # struct pollfd: the socket and POLLIN
     ]
 )
 _POLL_AT = socket_dtype.itemsize - 8
@@ -40,7 +40,7 @@ _POLL_AT = socket_dtype.itemsize - 8
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 _NONE_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN)
-_EVENTS = 32  # bits before them in struct pollfd
+_EVENTS = 32  # bit offset of ``events`` in struct pollfd
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _BYTES = ir.IntType(8).as_pointer()
@@ -60,7 +60,7 @@ def _make_transfer(builder: Any, name: str, arguments: Any) -> Any:
 
 @intrinsic
 def _send(typingctx, fd, address, size):
-    """send(2) without waiting."""
+    """send(2), non-blocking."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _make_transfer(builder, "send", arguments)
@@ -70,7 +70,7 @@ def _send(typingctx, fd, address, size):
 
 @intrinsic
 def _recv(typingctx, fd, address, size):
-    """recv(2) without waiting."""
+    """recv(2), non-blocking."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _make_transfer(builder, "recv", arguments)
@@ -80,7 +80,7 @@ def _recv(typingctx, fd, address, size):
 
 @intrinsic
 def _errno(typingctx):
-    """What went wrong in the call before."""
+    """errno of the previous call."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = builder.call(_libc(builder, "__errno_location", _I32.as_pointer(), []), [])
@@ -103,14 +103,14 @@ def _poll(typingctx, address, ms):
 
 
 def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = ()) -> None:
-    """Make one record of ``socket_dtype`` ready; its owner keeps the sockets open."""
+    """Initialise one record of ``socket_dtype``; its owner keeps the sockets open."""
     record["kind"], record["fd"], record["others"][0, : len(others)] = kind, fd, others
     record["poll"] = fd | select.POLLIN << _EVENTS
 
 
 @njit(cache=True, nogil=True)
 def write_frame(sockets, frame):
-    """Send the frame in an array of ``wire.frame_dtype``: 0, or the errno of what went wrong."""
+    """Send the frame in an array of ``wire.frame_dtype``; returns 0 or the errno."""
     s, address = sockets[0], frame.ctypes.data
     if s.kind == SOCKETCAN:
         size = MTU_FD if frame[0].flags & FD else MTU
@@ -123,7 +123,7 @@ def write_frame(sockets, frame):
         s.empty_until[k] = 0
         if _send(s.others[k], address, size) != size:
             why = _errno()
-            if why == errno.ECONNREFUSED:  # says so of the datagram before this one
+            if why == errno.ECONNREFUSED:  # reports the previous datagram, not this one
                 s.empty_until[k] = now_ns() + _RECHECK_NS
             else:
                 problem = why
@@ -132,8 +132,8 @@ def write_frame(sockets, frame):
 
 @njit(cache=True, nogil=True)
 def read_frame(sockets, frame):
-    """Receive into the frame in an array of ``wire.frame_dtype``: 1, 0 if there is none now, or
-    the errno of what went wrong, negative."""
+    """Receive into the frame in an array of ``wire.frame_dtype``; returns 1, 0 if none is there,
+    or the negative errno."""
     got = _recv(sockets[0].fd, frame.ctypes.data, MTU_FD)
     if got < 0:
         why = _errno()
@@ -145,5 +145,5 @@ def read_frame(sockets, frame):
 
 @njit(cache=True, nogil=True)
 def sleep_for_frame(sockets, ms):
-    """Sleep until there is something to read, at most that long."""
+    """Sleep until the socket is readable, at most ``ms``."""
     _poll(sockets.ctypes.data + _POLL_AT, ms)

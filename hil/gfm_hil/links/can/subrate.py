@@ -1,10 +1,11 @@
-"""Exchange every n-th tick only, for a bus that cannot carry more; what is held in between.
+"""Exchange frames only every n-th tick, for a slow bus, and hold the values in between.
 
 At tick k, a multiple of n, the plant sends y[k] and the controller answers u[k], which has n ticks
-to arrive and is in force from k + n on (before, u[0] is): a delay of n ticks, in lockstep as in
-real time. The controller steps at every tick, those in between with the y before them, just before
-the next one. Frames for the ticks in between are made here, numbered so that the reader counts n
-lost ones for one that the bus lost. A word of a side that leaves goes at once.
+to arrive and takes effect at k + n (before tick n the plant uses u[0]): a delay of n ticks, in
+lockstep as in real time. The controller steps at every tick: it makes up the ticks in between with
+the last y, just before it takes the next. This module makes the frames of those ticks and numbers
+them so that the reader counts n lost frames for one that the bus lost. A side that leaves sends
+its last frames at once.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from gfm_runtime.states import RUNNING, STOPPED
 
 NOTHING = -1
 
-_KEPT = 4  # commands at hand: the one in force, its successor, and those that came early
+_KEPT = 4  # commands stored: the one in force, its successor, and early ones
 _ROOM = (MOST + 7) // 8 * 8
 _LOW = 0xFFFF_FFFF
 
@@ -40,27 +41,27 @@ subrate_dtype = np.dtype(
         ("plant", "i8"),  # which side this is
         ("size", "i8", (2,)),  # of our frames and of theirs
         ("head", "i8", (2,)),
-        ("ordinary", "i8", (2,)),  # the state of a side that is running
-        # the controller: the measurement received last, and one that waits until the ticks
-        # before it are made; ``left`` of them, and itself
+        ("ordinary", "i8", (2,)),  # the state byte of each side while it runs
+        # the controller: the last measurement, and the next one, which waits until the frames of
+        # the ticks before it are made; ``left`` frames remain, the next measurement included
         ("has", "i8"),
         ("left", "i8"),
         ("last", "u1", (_ROOM,)),
         ("next", "u1", (_ROOM,)),
         # the plant
-        ("due", "i8"),  # tick for which it wants a command
-        ("asked", "i8"),  # the newest tick that it was at
-        ("again", "i8"),  # commands that were sent again
-        ("given", "i8"),  # sequence given out last
-        ("ticks", "i8", (_KEPT + 1,)),  # that the commands at hand answer; NOTHING: none
-        ("sequences", "i8", (_KEPT + 1,)),  # theirs, but for those sent again
+        ("due", "i8"),  # tick for which it needs a command
+        ("asked", "i8"),  # newest tick for which it sent y
+        ("again", "i8"),  # commands received again
+        ("given", "i8"),  # sequence of the last frame given to the reader
+        ("ticks", "i8", (_KEPT + 1,)),  # tick of each stored command; NOTHING: free
+        ("sequences", "i8", (_KEPT + 1,)),  # their sequences, not counting repeats
         ("commands", "u1", ((_KEPT + 1) * _ROOM,)),
     ]
 )
 
 
 def set_subrate(subrate: np.ndarray, side: Side, every: int) -> None:
-    """Make one record of ``subrate_dtype`` ready for a side that exchanges every n-th tick."""
+    """Initialise one record of ``subrate_dtype`` for a side that exchanges every n-th tick."""
     s, plant = subrate[0], side == "plant"
     groups: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
     s["every"], s["plant"] = every, plant
@@ -79,18 +80,18 @@ def _good(s, whose, message, size):
 
 @njit(cache=True, nogil=True)
 def goes(subrate, message):
-    """Whether a message of ours is to be sent; asked of every one."""
+    """Whether to send a message of ours; called for every message."""
     s = subrate[0]
     if not _good(s, 0, message, len(message)):
         return True
     tick = s.asked = number(message, TICK, 8)
-    s.due = NOTHING if message[STATE] == STOPPED else tick  # a plant that leaves wants no command
+    s.due = NOTHING if message[STATE] == STOPPED else tick  # a leaving plant needs no command
     return tick % s.every == 0 or message[STATE] != s.ordinary[0]
 
 
 @njit(cache=True, nogil=True)
 def _under(message, size, tick, sequence):
-    """Give a frame another tick and sequence."""
+    """Rewrite a frame's tick and sequence."""
     put_number(message, TICK, 8, tick)
     put_number(message, SEQUENCE, 4, sequence & _LOW)
     seal(message, size)
@@ -99,7 +100,7 @@ def _under(message, size, tick, sequence):
 
 @njit(cache=True, nogil=True)
 def made(subrate, message):
-    """Write the next frame that is ready to be given out: its length, or NOTHING."""
+    """Write the next frame made for the reader: its length, or NOTHING."""
     s = subrate[0]
     if s.left == 0:
         return NOTHING
@@ -116,11 +117,11 @@ def made(subrate, message):
 
 @njit(cache=True, nogil=True)
 def admit(subrate, message, size):
-    """Take a message that the bus brought; returns the length of what ``message`` then is to give
-    out, or NOTHING."""
+    """Take a message from the bus and replace it in ``message`` by the one for the reader;
+    returns its length, or NOTHING."""
     s = subrate[0]
     if not _good(s, 1, message, size):
-        return size  # damaged: for the reader to count
+        return size  # damaged or another message: the reader checks and counts it
     return _command(s, message, size) if s.plant else _measurement(subrate, message, size)
 
 
@@ -144,7 +145,7 @@ def _command(s, message, size):
     tick, sequence = number(message, TICK, 8), number(message, SEQUENCE, 4)
     free, oldest = -1, 0
     for k in range(_KEPT + 1):
-        if s.ticks[k] == tick:  # sent again: likewise
+        if s.ticks[k] == tick:  # a repeat: the reader too gets a repeated frame
             s.again += 1
             return _under(message, size, tick, s.given)
         if s.ticks[k] == NOTHING:
@@ -164,8 +165,8 @@ def _command(s, message, size):
 
 @njit(cache=True, nogil=True)
 def in_force(subrate, message):
-    """The plant: write the command for the tick that is due, if it is there: its length, or
-    NOTHING."""
+    """The plant: write the command for the tick that is due; returns its length, or NOTHING if it
+    has not arrived."""
     s = subrate[0]
     if s.due < 0:
         return NOTHING

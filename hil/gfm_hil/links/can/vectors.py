@@ -1,16 +1,17 @@
 """Between the bench's frames and the bus: a vector becomes CAN frames, and a frame again.
 
-A frame of the bench has a sequence (one more for every frame sent) and a tick (the same in one
-that was sent again); how far the tick is behind is its lag. On the bus a vector carries the low six
-bits of its sequence and the lowest of its lag in the byte ``Counter``; the receiver counts on from
-what it had. State and lag travel in a frame of their own ahead of the values, with 32 bits of the
+A frame of the bench has a sequence (incremented with every frame sent) and a tick (unchanged in a
+repeat); the lag is sequence minus tick. On the bus a vector carries the low six bits of its
+sequence and the lowest bit of its lag in the byte ``Counter``; the receiver extends them from the
+last sequence. State and lag travel in a status frame ahead of the values, with 32 bits of the
 tick: when one of them has changed, at that tick and the next, and every ``heartbeat`` vectors.
-Values sent with a change are marked, and worth nothing without it: in lockstep, where a tick goes
-on only once it was heard, none can pass for another tick. In real time, whoever lost both changes,
-or more than 58 vectors in a row, takes new values for older ones or refuses them until the next
-heartbeat; of the latter the count of the lost misses multiples of 64.
+Values sent with a change are marked, and the receiver discards them without their status: in
+lockstep, where a tick ends only once its frame was received, no values can pass for another tick.
+In real time, a receiver that lost both status frames of a change, or more than 58 vectors in a
+row, takes new values for older ones or refuses them until the next heartbeat; after the latter
+loss the count of lost frames misses multiples of 64.
 
-What fails its check here is made a frame that fails its own, so that its reader counts it.
+A CAN frame that fails its check becomes a frame that fails the reader's check and is counted.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ from gfm_runtime.signals import Group
 CanFrame = tuple[int, bytes]
 
 NOTHING = -1
-PARTS = VALUES  # frames of a vector, at most
+PARTS = VALUES  # most CAN frames of a vector
 
-_SEQUENCES = 64  # that a counter tells apart
+_SEQUENCES = 64  # range of the counter's six bits
 _LAG, _MARK = 0x40, 0x80  # its other bits
-_BEHIND = 4  # how many of the sequences mean an older vector
+_BEHIND = 4  # how many of these sequences count as older vectors
 _LOW = 0xFFFF_FFFF
-_SAID = ("State", "Reason", "Tick")  # in a status, in this order
+_SAID = ("State", "Reason", "Tick")  # signals of a status frame, in this order
 
-#: a vector's frames by the DBC; the values of part k are those from first[k] to first[k + 1]
+#: a vector's frames by the DBC; part k holds the values first[k] to first[k + 1]
 _TABLE = [
     ("parts", "i8"),
     ("flags", "i8"),  # of a CAN FD frame
@@ -80,10 +81,10 @@ sender_dtype = np.dtype(
     [
         *_TABLE,
         ("heartbeat", "i8"),
-        ("since", "i8"),  # vectors since the state was said
-        ("told", "i8", (3,)),  # state, reason and lag
+        ("since", "i8"),  # vectors since the last status
+        ("told", "i8", (3,)),  # state, reason and lag sent last
         ("tick", "i8"),  # sent last
-        ("ticks", "i8"),  # for how many more the state is said with the values
+        ("ticks", "i8"),  # number of ticks that still send a status with the values
         ("saturated", "i8"),  # values that lay outside 16 bits
         ("values", "f8", (VALUES,)),
     ]
@@ -93,24 +94,25 @@ receiver_dtype = np.dtype(
         *_TABLE,
         ("sequence", "i8"),  # of the newest frame
         ("lag", "i8"),
-        ("said", "i8"),  # sequence of the newest state
-        ("told", "i8", (2,)),  # what it says
-        ("counter", "i8"),  # of the vector being put together
-        ("have", "i8"),  # its parts, bit by bit
-        ("incomplete", "i8"),  # vectors of which a part or the state never came
+        ("said", "i8"),  # sequence of the newest status
+        ("told", "i8", (2,)),  # its state and reason
+        ("counter", "i8"),  # of the vector being assembled
+        ("have", "i8"),  # its received parts, a bit mask
+        ("incomplete", "i8"),  # vectors without one of their parts or their status
         ("values", "f8", (VALUES,)),
     ]
 )
 
 
 def set_sender(sender: np.ndarray, plan: Plan, group: Group, heartbeat: int) -> None:
-    """Make one record of ``sender_dtype`` ready; the state is said every ``heartbeat`` vectors."""
+    """Initialise one record of ``sender_dtype``; it repeats the status every ``heartbeat``
+    vectors."""
     _set_table(sender, plan, group)
     sender["heartbeat"], sender["told"], sender["tick"] = heartbeat, NOTHING, NOTHING
 
 
 def set_receiver(receiver: np.ndarray, plan: Plan, group: Group) -> None:
-    """Make one record of ``receiver_dtype`` ready."""
+    """Initialise one record of ``receiver_dtype``."""
     _set_table(receiver, plan, group)
     receiver["sequence"] = receiver["said"] = receiver["counter"] = NOTHING
 
@@ -141,7 +143,7 @@ def encode(sender, message, frames):
     Args:
         sender: one record of ``sender_dtype``.
         message: bytes.
-        frames: of ``wire.frame_dtype``, one more than parts, written.
+        frames: of ``wire.frame_dtype``, written; room for one more than there are parts.
 
     Returns:
         How many; NOTHING if the message is not a frame of this vector.
@@ -182,7 +184,7 @@ def encode(sender, message, frames):
             s.values, s.index[a:b], s.start[a:b], s.scale[a:b], s.offset[a:b], s.data_id[k],
             counter, data,
         )  # fmt: skip
-        if not good:  # damaged before it came here, and so it shall arrive
+        if not good:  # it came here damaged and must arrive damaged
             data[0] ^= 0xFF
         count += 1
     return count
@@ -195,7 +197,7 @@ def _head(frame, number, length, flags):
 
 @njit(cache=True, nogil=True)
 def knows(receiver, number):
-    """Whether an identifier is one of this vector or its sender's state."""
+    """Whether an identifier belongs to this vector or to its sender's status."""
     r = receiver[0]
     for k in range(r.parts):
         if r.number[k] == number:
@@ -210,7 +212,7 @@ def decode(receiver, frame, message):
     Args:
         receiver: one record of ``receiver_dtype``.
         frame: one record of ``wire.frame_dtype``.
-        message: bytes, at least those of a frame of the bench, written.
+        message: bytes, with room for a frame of the bench, written.
 
     Returns:
         The length of the frame of the bench that it completes, or NOTHING.
@@ -222,7 +224,7 @@ def decode(receiver, frame, message):
             part, length, data_id = k, r.length[k], r.data_id[k]
     data = frame.data[: frame.length]
     if len(data) != length or data[0] != crc8(data_id, data):
-        message[: r.size] = 0  # its check is 0, which is wrong
+        message[: r.size] = 0  # a CRC of 0 is wrong for it
         return r.size
     if part < 0:
         _learn(r, data)
@@ -245,7 +247,7 @@ def _learn(r, data):
 
 @njit(cache=True, nogil=True)
 def _count_on(r, counter):
-    """The whole sequence of which the low bits came."""
+    """The full sequence from its received low bits."""
     return r.sequence + (counter - r.sequence + _BEHIND) % _SEQUENCES - _BEHIND
 
 
@@ -265,7 +267,7 @@ def _put(r, part, data, message):
     r.have = 0
     sequence = _count_on(r, counter)
     unsaid = counter & _MARK != 0 and sequence != r.said
-    if unsaid or (counter & _LAG != 0) != (r.lag & 1 != 0):  # its tick is not known
+    if unsaid or (counter & _LAG != 0) != (r.lag & 1 != 0):  # the tick is unknown
         r.incomplete += 1
         return NOTHING
     r.sequence = max(r.sequence, sequence)
@@ -273,7 +275,7 @@ def _put(r, part, data, message):
     message[STATE], message[REASON] = r.told[0], r.told[1]
     put_number(message, SPARE, SEQUENCE - SPARE, 0)
     put_number(message, SEQUENCE, 4, sequence & _LOW)
-    put_number(message, TICK, 8, sequence - r.lag)  # below 0: beyond 2**63, so the reader refuses
+    put_number(message, TICK, 8, sequence - r.lag)  # negative: reads as ≥ 2**63, refused
     copy(message.ctypes.data + FIRST, r.values.ctypes.data, r.size - FIRST - CRC_BYTES)
     seal(message, r.size)
     return r.size
@@ -285,7 +287,7 @@ class VectorSender:
     Args:
         plan: of the DBC.
         group: ``"y"`` or ``"u"``.
-        heartbeat: vectors after which the state is said again.
+        heartbeat: vectors after which the status is repeated.
     """
 
     def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:

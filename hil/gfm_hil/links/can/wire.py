@@ -1,6 +1,6 @@
-"""A CAN frame as Linux has it, ``struct canfd_frame`` of linux/can.h: in memory and as a datagram.
+"""A CAN frame as Linux defines it, ``struct canfd_frame`` of linux/can.h: in memory, as a datagram.
 
-A datagram ends with the last byte of data; SocketCAN wants whole structures.
+A datagram ends with the last data byte; SocketCAN requires whole structures.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ frame_dtype = np.dtype(
     [("id", "u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", (2,)), ("data", "u1", 64)]
 )
 HEAD = 8  # bytes before the data
-MTU, MTU_FD = 16, 72  # bytes of struct can_frame, which begins alike, and of canfd_frame
+MTU, MTU_FD = 16, 72  # bytes of struct can_frame, which begins the same way, and canfd_frame
 
 #: flags in ``id``, above the identifier
 EXTENDED, REMOTE, ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
@@ -87,8 +87,8 @@ def crc8(data_id, payload):
     return crc ^ 0xFF
 
 
-VALUES = max(NY, NU)  # most of a vector
-MOST = wire_dtype(VALUES).itemsize  # bytes
+VALUES = max(NY, NU)  # of the longest vector
+MOST = wire_dtype(VALUES).itemsize  # bytes of the longest frame
 
 
 def _at(field: str) -> int:
@@ -105,7 +105,7 @@ _HEAD_BYTES = STATE  # magic, version, data id
 
 
 def size_and_head(group: Group) -> tuple[int, int]:
-    """What tells a vector's frames from other messages: their length and their first bytes."""
+    """Length and first bytes of a vector's frames, which distinguish them from other messages."""
     _, message = buffer(len(names(group)), DATA_IDS[group])
     return len(message), int.from_bytes(message[:_HEAD_BYTES].tobytes(), "little")
 
@@ -128,17 +128,17 @@ def put_number(data, at, width, value):
 
 @njit(cache=True, nogil=True)
 def begins_with(head, message):
-    """Whether a message that is long enough has these first bytes."""
+    """Whether a message, long enough, begins with these bytes."""
     return number(message, 0, _HEAD_BYTES) == head
 
 
 @njit(cache=True, nogil=True)
 def undamaged(message, size):
-    """Whether a frame of ``size`` bytes passes its check."""
+    """Whether the CRC of a frame of ``size`` bytes is right."""
     return crc32(message, size - CRC_BYTES) == number(message, size - CRC_BYTES, CRC_BYTES)
 
 
 @njit(cache=True, nogil=True)
 def seal(message, size):
-    """Write the check of a frame of ``size`` bytes."""
+    """Write the CRC of a frame of ``size`` bytes."""
     put_number(message, size - CRC_BYTES, CRC_BYTES, np.int64(crc32(message, size - CRC_BYTES)))

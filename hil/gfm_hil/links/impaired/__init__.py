@@ -1,4 +1,4 @@
-"""A stage of faults on purpose, for any link."""
+"""Deliberate faults on any link."""
 
 from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.links.impaired.settings import Impairment

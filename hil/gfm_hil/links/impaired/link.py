@@ -32,8 +32,8 @@ class ImpairedLink:
     """One end of any link, whose incoming messages pass a stage; implements ``Link``.
 
     Args:
-        link: the end underneath, which this one closes too.
-        settings: what happens to messages.
+        link: the wrapped end, which this one closes too.
+        settings: the faults to inject.
         side: whose end this is.
     """
 
@@ -46,18 +46,18 @@ class ImpairedLink:
 
     @property
     def injected(self) -> dict[str, int]:
-        """How many messages were seen, how many of them met which fate, how many still wait."""
+        """How many messages the stage has seen, how many got each fault, how many still wait."""
         counts = {name: int(self._stage[index]) for name, index in COUNTED.items()}
         return {**counts, "waiting": int(waiting(self._stage))}
 
     def send(self, message: bytes) -> bool:
-        """As the link underneath, which may have no room: counted too."""
+        """Send over the wrapped link; count a message that it has no room for."""
         sent = self._link.send(message)
         self._stage[REFUSED] += not sent
         return sent
 
     def receive(self) -> bytes | None:
-        """The next message that the stage lets through; what comes after it stays on the link."""
+        """The next message that the stage releases; later messages stay on the link."""
         while not (size := release(self._stage, self._message)):
             if (message := self._link.receive()) is None:
                 return None
@@ -67,27 +67,36 @@ class ImpairedLink:
         return self._message[:size].tobytes()
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a message arrives underneath, shortly at most: one may be due by itself."""
+        """Sleep until the wrapped link has a message, at most 1 ms: a delayed one may be due."""
         return self._link.wait(min(seconds, 0.001))
 
     def start(self) -> None:
-        """Start the thread of a link underneath that needs one."""
+        """Start the thread of the wrapped link, if it has one."""
         if isinstance(self._link, PumpedLink):
             self._link.start()
 
     def stop(self) -> None:
-        """Stop it."""
+        """Stop that thread."""
         if isinstance(self._link, PumpedLink):
             self._link.stop()
 
     def close(self) -> None:
-        """As the link underneath."""
+        """Close the wrapped link."""
         self._link.close()
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) the stage; the functions around it are compiled anew in
+    every process."""
+    stage, message = make_stage(Impairment(delay=1e-6), 0), np.zeros(LONGEST, np.uint8)
+    admit(stage, message, 1)
+    release(stage, message)
+    waiting(stage)
 
 
 @intrinsic
 def _pointer(typingctx: Any, address: Any) -> Any:
-    """An int64 address as a pointer that ``carray`` takes."""
+    """Convert an int64 address to a pointer for ``carray``."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
@@ -99,16 +108,16 @@ _as_pointer: Any = _pointer
 
 
 def _port(inner: Port, stage: np.ndarray) -> Port:
-    """The port of an impaired link: the stage as its handle, with the one underneath in it."""
+    """The port of an impaired link: its handle is the stage, which points to the inner handle."""
     stage[INNER], stage[INNER_WORDS] = inner.handle.ctypes.data, len(inner.handle)
     return Port(stage, *_functions(inner.send, inner.receive), inner.spins, None, inner.spin_limit)
 
 
 @cache
 def _functions(inner_send: Any, inner_receive: Any) -> tuple[Any, Any]:
-    """Send and receive of an impaired port: closures over those of the one underneath.
+    """Send and receive of an impaired port: closures over those of the wrapped link's port.
 
-    Compiled anew in every process, since they hold addresses; it takes a second.
+    Every process compiles them anew, since they hold addresses; it takes a second.
     """
 
     def send(handle, message):

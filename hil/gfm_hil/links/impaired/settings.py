@@ -1,4 +1,4 @@
-"""What can be done to a link's messages, as the table ``link.impairment`` of a scenario."""
+"""Faults to inject into a link's messages: the table ``link.impairment`` of a scenario."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gfm_hil.links.base import LinkOptions
 
 
 class Impairment(LinkOptions):
-    """Faults that a link is given on purpose, drawn from a seed for every frame that arrives.
+    """Deliberate faults of a link, drawn from a seed for every frame that arrives.
 
-    Probabilities are those of a frame; times are in s.
+    Probabilities are per frame; times are in s.
     """
 
     towards: Literal["both", "controller", "plant"] = Field(
@@ -48,5 +48,5 @@ class Impairment(LinkOptions):
         return self
 
     def hits(self, side: Side) -> bool:
-        """Whether frames that come in at this side are hit."""
+        """Whether the faults apply to this side's incoming frames."""
         return self.towards in ("both", side)

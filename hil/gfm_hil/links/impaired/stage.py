@@ -1,8 +1,8 @@
-"""The stage behind an impaired link: what arrives goes in, what is let through comes out.
+"""The fault-injection stage of an impaired link: it admits received messages and releases them.
 
-All of it lives in one int64 array, which is the ``handle`` of the impaired port: settings, the
-generator's state, counters, and a queue of messages that wait for their time. So one compiled
-implementation serves every link, in Python and in compiled loops alike.
+All its state lies in one int64 array, which is the ``handle`` of the impaired port: settings, the
+generator's state, counters, and a queue of delayed messages. One compiled implementation serves
+every link, in Python and in compiled loops.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gfm_hil.links.impaired.settings import Impairment
 from gfm_hil.realtime.clock import end_this_process, now_ns
 
-INNER, INNER_WORDS = 0, 1  # address and length of the handle of the link underneath
+INNER, INNER_WORDS = 0, 1  # address and length of the wrapped link's handle
 _RANDOM, _LOSS, _LOSS_MORE, _CORRUPT, _BITS, _DUPLICATE, _REORDER = range(2, 9)
 _DELAY, _JITTER, _PAUSE_AT, _PAUSE, _KILL_AT, _BURST, _SILENT_UNTIL, _LAST_DUE = range(9, 17)
 SEEN, LOST, CORRUPTED, DUPLICATED, REORDERED, PAUSED, DROPPED, REFUSED, _HELD = range(17, 26)
@@ -24,23 +24,23 @@ COUNTED = {"seen": SEEN, "lost": LOST, "corrupted": CORRUPTED, "duplicated": DUP
 _QUEUE = 26
 
 PLACES, _WORDS = 64, 64  # messages in the queue; words of 8 bytes in each
-_DUE, _KEY, _SIZE, _DATA = range(4)  # of one place: ns, order, bytes (0: free), the message
+_DUE, _KEY, _SIZE, _DATA = range(4)  # of one place: ns, order, bytes (0: free), message
 _PLACE = _DATA + _WORDS
 LONGEST = 8 * _WORDS
 
 _ONE = 1 << 32  # probability 1
-_LONG = 1_000_000_000  # ns that a frame waits at most for the next one to overtake it
+_LONG = 1_000_000_000  # ns: longest time that a frame waits for the next one to overtake it
 
 
 def make_stage(settings: Impairment, side_number: int) -> NDArray[np.int64]:
-    """A stage in which nothing waits; each side draws from a sequence of its own."""
+    """A stage with an empty queue; each side draws its own random sequence."""
     h = np.zeros(_QUEUE + PLACES * _PLACE, np.int64)
-    seed = (settings.seed * 2 + side_number + 1) * 0x9E3779B97F4A7C15  # few bits to many
+    seed = (settings.seed * 2 + side_number + 1) * 0x9E3779B97F4A7C15  # spreads a small seed's bits
     h[_RANDOM] = np.uint64(seed % 2**64).astype(np.int64)
     loss, more = settings.loss, max(1 - 1 / settings.burst, settings.loss)
     for index, value in (
-        (_LOSS, loss * (1 - more) / (1 - loss) if loss < 1 else 1.0),  # after a frame that came
-        (_LOSS_MORE, more),  # after one that was lost
+        (_LOSS, loss * (1 - more) / (1 - loss) if loss < 1 else 1.0),  # after a received frame
+        (_LOSS_MORE, more),  # after a lost frame
         (_CORRUPT, settings.corrupt),
         (_DUPLICATE, settings.duplicate),
         (_REORDER, settings.reorder),
@@ -67,7 +67,8 @@ def _draw(h):
 
 @njit(cache=True, nogil=True)
 def _keep(h, message, size, due, key):
-    """Put a copy into a free place of the queue; -1 if there is none: it is gone and counted."""
+    """Copy a message into a free place of the queue; if there is none, count it as dropped and
+    return -1."""
     for n in range(PLACES):
         at = _QUEUE + n * _PLACE
         if h[at + _SIZE] == 0:
@@ -84,7 +85,7 @@ def _keep(h, message, size, due, key):
 
 @njit(cache=True, nogil=True)
 def _flip(h, message, size):
-    """Flip as many different bits as the settings say, each choice of them as likely."""
+    """Flip the set number of different bits, all choices equally likely."""
     left = min(h[_BITS], 8 * size)
     for bit in range(8 * size):
         if _draw(h) * (8 * size - bit) < left * _ONE:
@@ -103,11 +104,11 @@ def waiting(h):
 
 @njit(cache=True, nogil=True)
 def admit(h, message, size):
-    """Decide the fate of a message that has arrived; what survives waits in the queue.
+    """Apply the faults to a received message; if it is not lost, put it into the queue.
 
     Args:
         h: the stage.
-        message, size: bytes, of which some are flipped in place if that is its fate.
+        message, size: bytes; a corruption flips bits in place.
     """
     if size > LONGEST:
         return
@@ -124,7 +125,7 @@ def admit(h, message, size):
     if now < h[_SILENT_UNTIL]:
         h[PAUSED] += 1
         due = max(due, h[_SILENT_UNTIL])
-    due = max(due, h[_LAST_DUE])  # a link keeps order, unless it is told not to
+    due = max(due, h[_LAST_DUE])  # keep the order; only ``reorder`` changes it
     h[_LAST_DUE] = due
     chance = _draw(h)
     limit = h[_LOSS_MORE] if h[_BURST] else h[_LOSS]
@@ -134,7 +135,7 @@ def admit(h, message, size):
         h[LOST] += 1
         return
     chance -= limit
-    if 0 <= chance < h[_CORRUPT]:  # nobody is overtaken by what nobody reads
+    if 0 <= chance < h[_CORRUPT]:  # the reader refuses it, so it overtakes no waiting frame
         h[CORRUPTED] += 1
         _flip(h, message, size)
         _keep(h, message, size, due, 3 * n)
@@ -143,7 +144,7 @@ def admit(h, message, size):
     twice = 0 <= chance < h[_DUPLICATE]
     chance -= h[_DUPLICATE]
     held = h[_HELD]
-    behind = held == 0 and 0 <= chance < h[_REORDER]  # one that waits is to be overtaken
+    behind = held == 0 and 0 <= chance < h[_REORDER]  # at most one frame waits
     h[_HELD] = 0
     if behind:
         h[REORDERED] += 1
@@ -159,7 +160,7 @@ def admit(h, message, size):
 
 @njit(cache=True, nogil=True)
 def release(h, message):
-    """The next message whose time has come, written to ``message``: its bytes, or 0."""
+    """Write the next message that is due to ``message``; returns its length in bytes, or 0."""
     best = -1
     now = now_ns()
     for n in range(PLACES):
@@ -174,7 +175,7 @@ def release(h, message):
         return 0
     size = h[best + _SIZE]
     h[best + _SIZE] = 0
-    if h[_HELD] == best:  # nobody came to overtake it
+    if h[_HELD] == best:  # no frame arrived to overtake it
         h[_HELD] = 0
         h[REORDERED] -= 1
     for k in range(min(size, len(message))):

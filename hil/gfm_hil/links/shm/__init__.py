@@ -1,4 +1,4 @@
-"""Shared memory between two processes of one machine."""
+"""Shared memory between two processes on one machine."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:
     return ShmLink(side, endpoint)
 
 
+def _warm_up(options: LinkOptions) -> None:
+    from gfm_hil.links.ring import warm_up
+
+    warm_up()
+
+
 def _fresh(folder: Path) -> str:
     return f"shm://{secrets.token_hex(8)}"
 
@@ -26,4 +32,5 @@ KIND = LinkKind(
     form="shm://name, the name of 1 to 200 letters, digits, dots, dashes or underscores",
     fresh=_fresh,
     open=_open,
+    warm_up=_warm_up,
 )

@@ -1,4 +1,4 @@
-"""Shared-memory link: a ring each way, the controller makes the memory, the plant joins it."""
+"""Shared-memory link: a ring each way; the controller creates the memory, the plant joins it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
 from gfm_hil.links.shm import segment
 
-_SPINS = 200  # looks, about 10 µs; on one processor the peer then needs it
-_FIRST_S, _LONGEST_S = 50e-6, 1e-3  # sleeps of a wait, from the first to the longest
+_SPINS = 200  # polls, about 10 µs; then yield, since the peer may need the same processor
+_FIRST_S, _LONGEST_S = 50e-6, 1e-3  # first and longest sleep of a wait
 
 
 class ShmLink:
     """One end of the link; implements ``gfm_hil.links.Link``.
 
     Args:
-        side: the controller makes the memory, the plant joins it, however late it comes.
+        side: the controller creates the memory, the plant joins it; either may start first.
         endpoint: ``shm://name``.
 
     Raises:
-        UserError: it is in use, or another user made it. Where the controller comes later,
-            ``send``, ``receive`` and ``wait`` of the plant may raise it too.
+        UserError: the memory is in use, or another user made it. If the controller starts later,
+            the plant's ``send``, ``receive`` and ``wait`` may raise it too.
     """
 
     port: Port
@@ -37,11 +37,12 @@ class ShmLink:
         self._handle = np.zeros(ring.HANDLE, np.int64)
         self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
+        ring.warm_up()
         self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
         self._open()
 
     def send(self, message: bytes) -> bool:
-        """Hand a message of 1 to 504 bytes over; False if the peer has no room or is not there."""
+        """Send a message of 1 to 504 bytes; False if the peer has no room or is not there."""
         if len(message) > LONGEST or not self._there():
             return False
         room = self._message[: len(message)]
@@ -54,8 +55,8 @@ class ShmLink:
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a message is there, at most ``seconds``: it is looked for every millisecond
-        at least, and more often at first."""
+        """Sleep until a message has arrived, at most ``seconds``; polls at least once a
+        millisecond, and more often at first."""
         until = time.monotonic() + seconds
         step = _FIRST_S
         while not (self._there() and ring.waiting(self._handle)):
@@ -67,7 +68,7 @@ class ShmLink:
         return True
 
     def close(self) -> None:
-        """Let go of the memory; what was sent last stays readable to a peer that has joined."""
+        """Release the memory; a peer that has joined can still read the last messages."""
         self._closed = True
         self._handle[:] = 0
         mine, self._segment = self._segment, None

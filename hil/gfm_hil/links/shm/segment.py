@@ -1,9 +1,9 @@
-"""The memory itself: made by the controller, joined by the plant, gone when the controller is.
+"""The shared memory: the controller creates and removes it, the plant joins it.
 
-Its header says which process made it. A process is known by its number and start time, so that what
-a killed run left is told from what a living one uses. A process that makes, joins or removes a
-segment holds a lock on its file meanwhile; no process holds it during a run. Only files of our own
-user are used, locked or removed: another user may put any file under the same name.
+The header says which process made it. A process is identified by its number and start time, which
+distinguishes the segment of a killed run from one in use. A process locks the file while it makes,
+joins or removes a segment; no process holds the lock during a run. Only files of our own user are
+used, locked or removed: another user may put any file under the same name.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ PREFIX = "gfmhil-link-"
 MAGIC = b"GFMHILSM"
 VERSION = 1  # of everything below and of links/ring.py
 
-# Header, int64: magic, version, the owner's identity; the plant's; then each ring's head. All that
-# one side writes in a run is 128 bytes from what the other does: processors fetch lines in pairs.
+# Header, int64: magic, version, the owner's identity; the plant's; then each ring's head. What the
+# two sides write in a run is 128 bytes apart: processors fetch cache lines in pairs.
 _OWNER = struct.Struct("<8sq3q")
 _PLANT = struct.Struct("<3q")
 _PLANT_AT = 64
@@ -36,17 +36,17 @@ HEADS = (128, 256)  # plant to controller, controller to plant
 RINGS = (512, 512 + RING)
 SIZE = 512 + 2 * RING
 
-#: process number, start in clock ticks since boot, namespace of process numbers
+#: process id, start in clock ticks since boot, PID namespace
 Identity = tuple[int, int, int]
 NOBODY: Identity = (0, 0, 0)
 
 
 class Refused(Exception):
-    """A segment that is not to be had; says why."""
+    """A segment that cannot be used; the message says why."""
 
 
 def myself() -> Identity:
-    """This process."""
+    """The identity of this process."""
     start = _start(os.getpid())
     assert start is not None
     return os.getpid(), start, _namespace()
@@ -66,16 +66,16 @@ class Segment:
 
     @property
     def plant(self) -> Identity:
-        """The plant that has joined last, ``NOBODY`` if none has or it has left."""
+        """The plant that has joined last; ``NOBODY`` if none has joined or it has left."""
         plant: Identity = _PLANT.unpack_from(self.memory, _PLANT_AT)
         return plant
 
 
 def create(name: str) -> Segment:
-    """Make the segment of that name, after clearing away what dead owners left.
+    """Make the segment of that name, after removing the segments of dead owners.
 
     Raises:
-        Refused: a living process has it, it is none of ours, or there is no room.
+        Refused: a living process uses it, the file is not a segment of ours, or there is no room.
     """
     path = FOLDER / (PREFIX + name)
     for other in FOLDER.glob(PREFIX + "*"):
@@ -96,7 +96,7 @@ def create(name: str) -> Segment:
 def _made(path: Path, handle: int) -> Segment:
     """Turn an empty file into a segment of this process."""
     try:
-        os.posix_fallocate(handle, 0, SIZE)  # a full file system would only tell by a signal
+        os.posix_fallocate(handle, 0, SIZE)  # else a full file system shows up only as SIGBUS
     except OSError as problem:
         path.unlink()
         raise Refused(problem.strerror) from None
@@ -109,8 +109,8 @@ def join(name: str) -> Segment | None:
     """Join the segment of that name as the plant; None if no living controller has made it yet.
 
     Raises:
-        Refused: it has another layout, is none of ours, is open to other users, or another living
-            plant has joined it.
+        Refused: it has another layout, is not a segment of ours, is open to other users, or
+            another living plant has joined it.
     """
     path = FOLDER / (PREFIX + name)
     with _locked(path) as handle:
@@ -133,7 +133,7 @@ def join(name: str) -> Segment | None:
 
 
 def leave(segment: Segment) -> None:
-    """Undo ``join``; another plant may come, unless the controller was killed: then it goes."""
+    """Undo ``join``: another plant may join. If the controller was killed, remove the segment."""
     _PLANT.pack_into(segment.memory, _PLANT_AT, *NOBODY)
     _remove_if(segment, None)
 
@@ -149,7 +149,7 @@ def has_plant(segment: Segment) -> bool:
 
 
 def _remove_if(segment: Segment, owner: Identity | None) -> None:
-    """Unmap a segment, and remove its file if that is its living owner."""
+    """Unmap a segment; remove its file if its living owner is ``owner`` (None: no living one)."""
     with contextlib.suppress(Refused, OSError), _locked(segment.path) as handle:
         if handle is not None and _owner(segment.path, handle) == owner:
             segment.path.unlink()
@@ -164,8 +164,8 @@ def _locked(
 
     Args:
         path: of a segment.
-        flags: ``os.O_CREAT`` to make an empty one if there is none.
-        patience_s: how long another process may keep its lock, s.
+        flags: ``os.O_CREAT`` to make an empty file if there is none.
+        patience_s: how long to wait for another process's lock, s.
 
     Raises:
         Refused: it is not a file of our user, or another process keeps it locked.
@@ -186,7 +186,7 @@ def _locked(
                 scratch.lock(handle, fcntl.LOCK_EX, patience_s)
             except TimeoutError as problem:
                 raise Refused(str(problem)) from None
-            if _is_at(path, handle):  # it was not replaced while we waited
+            if _is_at(path, handle):  # the file was not replaced while we waited
                 yield handle
                 return
         finally:
@@ -209,14 +209,14 @@ def _is_at(path: Path, handle: int) -> bool:
 
 
 def _owner(path: Path, handle: int) -> Identity | None:
-    """The living owner of a locked segment, None if it is dead.
+    """The living owner of a locked segment; None if the owner is dead.
 
     Raises:
-        Refused: it is none of ours.
+        Refused: the file is not a segment of ours.
     """
     content = os.pread(handle, _OWNER.size, 0)
     if not content.strip(b"\0"):
-        return None  # its maker was killed while it held the lock
+        return None  # its creator was killed while it held the lock
     if len(content) < _OWNER.size or not content.startswith(MAGIC):
         raise Refused(f"{path} is there and is no link of ours")
     owner: Identity = _OWNER.unpack(content)[2:]
@@ -224,7 +224,7 @@ def _owner(path: Path, handle: int) -> Identity | None:
 
 
 def _lives(who: Identity) -> bool:
-    """Whether that process runs, as far as we can see: from within a container we cannot."""
+    """Whether that process runs; assume so if it is in another PID namespace (a container)."""
     if who == NOBODY:
         return False
     return who[2] != _namespace() or _start(who[0]) == who[1]
@@ -235,7 +235,7 @@ def _namespace() -> int:
 
 
 def _start(pid: int) -> int | None:
-    """When a process began, proc_pid_stat(5) field 22; None if it has ended."""
+    """Start time of a process, proc_pid_stat(5) field 22; None if it has ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except (FileNotFoundError, ProcessLookupError):

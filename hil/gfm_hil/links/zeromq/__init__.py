@@ -15,6 +15,12 @@ def _open(side: Side, endpoint: str, options: ZmqOptions) -> Link:
     return ZmqLink(side, endpoint, options)
 
 
+def _warm_up(options: ZmqOptions) -> None:
+    from gfm_hil.links.zeromq.native import warm_up
+
+    warm_up()
+
+
 def _fresh(folder: Path) -> str:
     return f"ipc://{folder}/link"
 
@@ -30,4 +36,5 @@ KIND = LinkKind(
     open=_open,
     options=ZmqOptions,
     check_both=refuse_open,
+    warm_up=_warm_up,
 )

@@ -1,7 +1,7 @@
-"""CURVE: keys for both sides, frames that nobody reads or forges, and one plant that gets in.
+"""CURVE: keys for both sides, encrypted and authenticated frames, and access for one plant only.
 
-A folder of keys holds ``<side>.key``, the public one, and ``<side>.key_secret`` in pyzmq's format.
-A side needs its own secret and the other's public key.
+A folder of keys holds ``<side>.key``, the public key, and ``<side>.key_secret`` in pyzmq's format.
+A side needs its own secret key and the other side's public key.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ _DOMAIN = "gfmhil"
 
 
 def key_files(folder: Path) -> list[Path]:
-    """Every file of a folder of keys."""
+    """All files of a folder of keys."""
     return [folder / f"{side}.{kind}" for side in SIDES for kind in ("key", "key_secret")]
 
 
 def write_keys(folder: Path, force: bool = False) -> list[Path]:
-    """Write a fresh key pair per side, readable by the user alone.
+    """Write a new key pair per side, readable by the user alone.
 
     Raises:
-        UserError: a key is there already and ``force`` is not set, or it cannot be written.
+        UserError: a key exists and ``force`` is not set, or it cannot be written.
     """
     _need_curve()
     files = key_files(folder)
@@ -42,7 +42,7 @@ def write_keys(folder: Path, force: bool = False) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for file in files:
-            file.unlink(missing_ok=True)  # one that others may read would stay so
+            file.unlink(missing_ok=True)  # an existing file would keep its mode
         for side in SIDES:
             zmq.auth.create_certificates(folder, side)
     except OSError as problem:
@@ -53,14 +53,14 @@ def write_keys(folder: Path, force: bool = False) -> list[Path]:
 
 
 class Curve:
-    """Encryption of one side's socket; at the controller also who may come in.
+    """Encryption of one side's socket; at the controller also access control.
 
     Args:
         socket: not yet bound or connected.
         side, folder: whose keys, and where they are.
 
     Raises:
-        UserError: a key is missing or is none.
+        UserError: a key is missing or invalid.
     """
 
     def __init__(self, socket: zmq.Socket[bytes], side: Side, folder: Path) -> None:
@@ -72,8 +72,8 @@ class Curve:
         socket.curve_publickey, socket.curve_secretkey = public, secret
         if side == "controller":
             socket.curve_server = True
-            # libzmq lets in whoever knows our public key if there is nobody to ask, unless
-            # asking is enforced, which takes a domain
+            # without an authenticator libzmq accepts every peer that knows our public key, unless
+            # authentication is enforced, which requires a domain
             socket.zap_domain = _DOMAIN.encode()
             socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)
             self._door = ThreadAuthenticator(socket.context)
@@ -83,20 +83,20 @@ class Curve:
             socket.curve_serverkey = self._peer
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether the owner of a public key may come in; asked by the authenticator."""
+        """Whether the owner of a public key may connect; the authenticator calls it."""
         return key == self._peer
 
     def close(self) -> None:
-        """Stop answering; before the context ends."""
+        """Stop the authenticator; call it before the context ends."""
         if self._door is not None:
             self._door.stop()
 
 
 def _key(file: Path) -> tuple[bytes, bytes | None]:
-    """Public and, if the file has it, secret key, Z85.
+    """The public key and, if the file has it, the secret key, Z85.
 
     Raises:
-        UserError: no such file, or no keys in it.
+        UserError: there is no such file, or it holds no valid key.
     """
     where = f"link.options.curve = {str(file.parent)!r}: {file.name}"
     try:
@@ -108,7 +108,7 @@ def _key(file: Path) -> tuple[bytes, bytes | None]:
     except OSError as problem:
         why = problem.strerror or "no such file"
         raise UserError(f"{where}: {why}; gfmhil keys makes one") from None
-    except (ValueError, KeyError, struct.error, zmq.ZMQError):  # whatever Z85 finds amiss
+    except (ValueError, KeyError, struct.error, zmq.ZMQError):  # what decoding Z85 may raise
         raise UserError(f"{where}: holds no key that fits; gfmhil keys makes one") from None
     return public, secret
 

@@ -1,9 +1,9 @@
-"""ZeroMQ link: a PAIR socket at each end, the controller binds, the plant connects.
+"""ZeroMQ link: a PAIR socket at each end; the controller binds, the plant connects.
 
-PAIR, because it takes one peer and no other: a stranger that connects to a DEALER would get every
-second frame. libzmq's I/O thread is started here and inherits the scheduling of the thread that
-opens the link, priority and processor. Leave it at that: with a higher priority than the loop's,
-each wake-up preempts the loop, and a round trip takes twice as long.
+PAIR accepts one peer only; a second peer that connects to a DEALER would get every second frame.
+libzmq's I/O thread starts here and inherits priority and processor of the thread that opens the
+link. Do not raise its priority: above the loop's, each wake-up preempts the loop, and a round trip
+takes twice as long.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ if TYPE_CHECKING:
     from gfm_hil.links.zeromq.curve import Curve
 
 _LAST_WORDS, _FAREWELL = 500, 50  # ms
-_NEVER = 10**9  # ms, 11 days; -1 would drop what has arrived and is not read yet
-_LOOK_S = 0.01  # between two looks whether a controller listens
+_NEVER = 10**9  # ms, 11 days; -1 would drop received messages that are not read yet
+_LOOK_S = 0.01  # poll interval while no controller listens
 
-# What a stalled peer leaves unread is bounded, and more is dropped: at each end so many messages,
+# The queues for a stalled peer are bounded, and further messages are dropped: each end holds
 _ROOM = 64
-# and in the kernel 500 to 800 more: a Unix socket takes no more by itself, tcp is told (bytes; by
-# itself it takes 40,000). A frame's tick says how old it is; PAIR ignores CONFLATE.
+# messages, and the kernel 500 to 800 more. A Unix socket has this limit by default; TCP gets a
+# buffer size in bytes (its default holds 40,000). A frame's tick says how old it is; PAIR ignores
+# CONFLATE.
 _KERNEL_ROOM = 16384
-# libzmq parts with a peer that announces a longer message, before it takes memory for it; CURVE
+# libzmq disconnects a peer that announces a longer message before it allocates memory for it; CURVE
 # adds 33 bytes to a message
 _LARGEST = LONGEST + 64
 
@@ -62,18 +63,18 @@ class ZmqLink:
     """One end of the link; implements ``gfm_hil.links.Link``.
 
     Args:
-        side: the controller binds, the plant connects, however late the controller comes.
+        side: the controller binds, the plant connects; either may start first.
         endpoint: ``ipc:///path`` or ``tcp://host:port``.
         options: of the link.
 
     Attributes:
-        port: libzmq itself on the same socket; None if the options leave the frames to pyzmq, or
-            if it has no library that could be called (it says so).
+        port: calls libzmq directly on the same socket; None if the options leave the frames to
+            pyzmq, or if no libzmq can be called (a warning says so).
 
     Raises:
-        UserError: it cannot be bound, as when it is in use; another user has it or could take it
-            over; keys are missing. Where the controller comes later, ``send``, ``receive`` and
-            ``wait`` of the plant may raise it too.
+        UserError: the endpoint cannot be bound, for example because it is in use; another user
+            owns it or could take it over; keys are missing. If the controller starts later, the
+            plant's ``send``, ``receive`` and ``wait`` may raise it too.
     """
 
     port: Port | None = None
@@ -81,7 +82,7 @@ class ZmqLink:
     def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
         self._side, self._endpoint, self._ipc = side, endpoint, endpoint.startswith(SCHEME)
         if side == "controller" and self._ipc and is_served(endpoint):
-            # libzmq would take the file over and leave the other run deaf
+            # libzmq would replace the file, and the other run would receive nothing more
             raise UserError(
                 f"link.endpoint = {endpoint!r}: cannot be bound: occupied by another run"
             )
@@ -91,13 +92,13 @@ class ZmqLink:
         self._open = False
         try:
             if options.curve is not None:
-                from gfm_hil.links.zeromq.curve import Curve  # 0.1 s, most runs need none
+                from gfm_hil.links.zeromq.curve import Curve  # takes 0.1 s, few runs need it
 
                 self._curve = Curve(self._socket, side, Path(options.curve))
             if side == "controller":
                 self._bind()
             else:
-                if self._ipc:  # only ``_there`` connects again: it looks whose socket it is
+                if self._ipc:  # only ``_there`` reconnects: it checks who owns the socket
                     self._socket.set(zmq.RECONNECT_IVL, _NEVER)
                 self._there()
         except UserError:
@@ -114,7 +115,7 @@ class ZmqLink:
                 warnings.warn("no libzmq that could be called: frames go by pyzmq", stacklevel=2)
 
     def _bind(self) -> None:
-        """Listen; on this machine to processes of our own user alone."""
+        """Listen; an ipc endpoint accepts only processes of our own user."""
         if self._ipc:
             self._socket.set(zmq.IPC_FILTER_UID, os.geteuid())  # by SO_PEERCRED
         self._socket.bind(self._endpoint)
@@ -123,21 +124,20 @@ class ZmqLink:
         self._open = True
 
     def _there(self) -> bool:
-        """Whether the socket is bound or connected; connects it once that can be."""
+        """Whether the socket is bound or connected; connects it as soon as possible."""
         if not self._open and (not self._ipc or is_served(self._endpoint)):
             self._socket.connect(self._endpoint)
             self._open = True
         return self._open
 
     def connected(self) -> bool | None:
-        """Whether a peer is at the other end; None for a plant on tcp, which cannot know it."""
+        """Whether a peer is at the other end; None for a plant on tcp, which cannot know."""
         if self._side == "plant" and not self._ipc:
             return None
         return self._open and bool(self._socket.poll(0, zmq.POLLOUT))
 
     def send(self, message: bytes) -> bool:
-        """Hand a message of at most 504 bytes over; False if the peer has no room or is not
-        there."""
+        """Send a message of at most 504 bytes; False if the peer has no room or is not there."""
         if len(message) > LONGEST or not self._there():
             return False
         try:
@@ -154,7 +154,7 @@ class ZmqLink:
         return None
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a message is there, at most ``seconds`` (rounded up to a millisecond)."""
+        """Sleep until a message has arrived, at most ``seconds`` (at least one millisecond)."""
         until = time.monotonic() + seconds
         while not self._there():
             left = until - time.monotonic()
@@ -165,18 +165,18 @@ class ZmqLink:
         return bool(self._socket.poll(max(1, round(left * 1000)), zmq.POLLIN))
 
     def again(self) -> None:
-        """Reach out anew: libzmq turns a second plant away once and for all, even if the first
-        one, of a run before, is about to leave."""
+        """Reconnect: libzmq refuses a second plant for good, even if the first one, of a previous
+        run, is about to leave."""
         if self._side == "plant" and self._open:
             self._socket.disconnect(self._endpoint)
-            self._socket.poll(_FAREWELL)  # a PAIR takes no other peer while it parts from one
+            self._socket.poll(_FAREWELL)  # a PAIR accepts no new peer while it disconnects
             self._open = False
             self._there()
 
     def close(self) -> None:
-        """Free the endpoint; the last words get a moment to leave."""
+        """Free the endpoint; the last messages get 500 ms to be sent."""
         if self.port is not None:
-            self.port.handle[:] = 0  # its functions then do nothing
+            self.port.handle[:] = 0  # makes its functions do nothing
         self._socket.close(linger=_LAST_WORDS)
         if self._curve is not None:
             self._curve.close()

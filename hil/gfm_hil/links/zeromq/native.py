@@ -1,7 +1,7 @@
-"""libzmq itself for compiled loops: its functions are called by their address, without pyzmq.
+"""libzmq for compiled loops: they call its functions by address, without pyzmq.
 
-The library is the very one that pyzmq has loaded, so that both see the same socket. A socket may
-change threads behind a full fence; starting and joining a thread is one.
+It is the library that pyzmq has loaded, so that both use the same socket. A socket may move to
+another thread after a full memory fence; starting and joining a thread is one.
 """
 
 from __future__ import annotations
@@ -23,24 +23,29 @@ _SEND, _RECEIVE, _SOCKET = range(3)
 
 _DONTWAIT = int(zmq.DONTWAIT)
 _PATIENCE = 1  # ms
-_LOOKS = 500  # a look is a call of libzmq and a yield, a microsecond
+_LOOKS = 500  # polls; each is a libzmq call and a yield, about a microsecond
 
 
 def native_port(socket: zmq.Socket[bytes]) -> Port | None:
-    """The port of an open socket, or None where pyzmq shows no libzmq that could be called."""
+    """The port of an open socket, or None if pyzmq exposes no libzmq functions."""
     found = _functions()
     if found is None:
         return None
     handle = np.array([*found, socket.underlying], dtype=np.int64)
     socket.set(zmq.RCVTIMEO, _PATIENCE)
-    return Port(handle, _send, _receive, 0, _await, _LOOKS)  # its own thread needs the processor
+    return Port(handle, _send, _receive, 0, _await, _LOOKS)  # the I/O thread needs the processor
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) the functions of a port."""
+    Port(np.zeros(3, np.int64), _send, _receive, 0, _await)
 
 
 def _functions() -> tuple[int, int] | None:
     """Addresses of zmq_send and zmq_recv.
 
-    They are looked for through pyzmq's extension module, which finds them in whatever library it
-    was linked to: that of its wheel, or the system's.
+    They come from pyzmq's extension module, which resolves them in the library that it is linked
+    to: that of its wheel, or the system's.
     """
     try:
         from zmq.backend.cython import _zmq
@@ -50,13 +55,13 @@ def _functions() -> tuple[int, int] | None:
             ctypes.cast(getattr(library, name), ctypes.c_void_p).value
             for name in ("zmq_send", "zmq_recv")
         )
-    except (ImportError, AttributeError, OSError):  # PyPy; linked in and hidden; no such loader
+    except (ImportError, AttributeError, OSError):  # PyPy; static and hidden; no such loader
         return None
     return (send, receive) if send and receive else None
 
 
 def _make_transfer(typingctx, address, socket, message, size, flags):
-    """zmq_send or zmq_recv at an address, given addresses and sizes as int64; returns int32."""
+    """Call zmq_send or zmq_recv at an address; addresses and sizes are int64; returns int32."""
     int64 = ir.IntType(64)
     pointer = ir.IntType(8).as_pointer()
 

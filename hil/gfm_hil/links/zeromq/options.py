@@ -35,11 +35,11 @@ _IFF_LOOPBACK = 0x8  # of linux/if.h
 
 
 def refuse_open(endpoint: str | None, options: ZmqOptions) -> None:
-    """See that frames leave this machine encrypted, or because somebody said so, and that on it
-    file permissions say who may connect.
+    """Check that frames leave this machine only encrypted or with ``plain = true``, and that file
+    permissions control who may connect on this machine.
 
     Raises:
-        ValueError: they do not.
+        ValueError: the check fails.
     """
     if endpoint is None:
         return
@@ -57,9 +57,9 @@ def refuse_open(endpoint: str | None, options: ZmqOptions) -> None:
 
 
 def beyond_loopback(endpoint: str) -> bool:
-    """False for ipc, and for tcp where the host is nothing but this machine's loopback.
+    """False for ipc, and for tcp if the host is only this machine's loopback.
 
-    Whatever cannot be told (a name that does not resolve, ``*``) counts as beyond.
+    A host that does not resolve, or ``*``, counts as beyond.
     """
     if not endpoint.startswith("tcp://"):
         return False
@@ -68,7 +68,7 @@ def beyond_loopback(endpoint: str) -> bool:
 
 
 def _interface_is_loopback(name: str) -> bool:
-    """``tcp://lo:5555``: libzmq takes the names of interfaces too."""
+    """``tcp://lo:5555``: libzmq also accepts interface names."""
     try:
         flags = (Path("/sys/class/net") / name / "flags").read_text("ascii")
     except (OSError, ValueError):

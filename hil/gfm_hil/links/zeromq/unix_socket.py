@@ -1,5 +1,5 @@
-"""The file of an ipc endpoint: whether a process of our own user listens there, and no other user
-can take its place."""
+"""The file of an ipc endpoint: checks that a process of our own user listens there, and that no
+other user can replace the file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def is_served(endpoint: str) -> bool:
 
     Raises:
         UserError: the folder, the file or the process belongs to another user, another user could
-            replace the file or connect to it, or it is no socket.
+            replace the file or connect to it, or it is not a socket.
     """
     path = path_of(endpoint)
     where = f"link.endpoint = {endpoint!r}"
@@ -42,7 +42,7 @@ def is_served(endpoint: str) -> bool:
         found = path.lstat()
     except PermissionError:
         raise UserError(f"{where}: {path.parent} belongs to another user") from None
-    except OSError:  # neither is there yet; binding says what is wrong
+    except OSError:  # folder or file is missing; binding reports what is wrong
         return False
     if found.st_uid != os.geteuid():
         raise UserError(f"{where}: {path} belongs to another user (uid {found.st_uid})")
@@ -51,7 +51,7 @@ def is_served(endpoint: str) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
         try:
             probe.connect(str(path))
-        except OSError:  # what a killed run has left
+        except OSError:  # left by a killed run
             return False
         sent = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     _, user, _ = _CREDENTIALS.unpack(sent)

@@ -29,6 +29,7 @@ _TRUE = {
     "omega_g": ("p.u. (omega_n)", "grid frequency"),
     "V_g": ("p.u. (V_n)", "grid voltage magnitude"),
     "trip": ("", "what has tripped"),
+    "i_dc": ("p.u. (S_n/V_dcref)", "current of the DC source"),
 }
 _OTHERS = {
     "tick": ("", "number of the tick"),

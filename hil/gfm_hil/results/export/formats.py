@@ -37,8 +37,8 @@ FORMATS = {
     "mat": Format("MATLAB 5", "writers:write_mat", "scipy"),
     "parquet": Format("Apache Parquet", "writers:write_parquet", "pyarrow"),
     "blf": Format(
-        "CAN frames and their DBC, for Vector's tools", "blf:write_blf", "cantools",
-        (".dbc", "blf:dbc_text"),
+        "CAN frames and their DBC, for Vector's tools", "blf:write_blf",
+        beside=(".dbc", "blf:dbc_text"),
     ),
 }  # fmt: skip
 

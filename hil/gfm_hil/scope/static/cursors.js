@@ -1,11 +1,11 @@
-// Two cursors: lines over all strips that can be dragged, and what lies at and between them.
+// Two cursors: draggable lines over all strips; shows the values at them and the time between them.
 
 import { colour } from "./palette.js";
 import { make, seconds, span, symbol, value } from "./text.js";
 
 export class Cursors {
-  // strips(): those to be seen; about: of the channels; origin(): time of the run that the axis
-  // calls 0; redraw(): draws the strips again
+  // strips(): the visible strips; about: of the channels; origin(): run time at 0 of the axis;
+  // redraw(): redraws the strips
   constructor(table, strips, about, origin, redraw) {
     this.table = table;
     this.strips = strips;
@@ -13,7 +13,7 @@ export class Cursors {
     this.origin = origin;
     this.redraw = redraw;
     this.on = false;
-    this.at = [0.35, 0.65]; // parts of the window; times of the run, s, while it is held
+    this.at = [0.35, 0.65]; // fractions of the window; while it is held: times of the run, s
     this.held = false;
   }
 
@@ -28,8 +28,8 @@ export class Cursors {
     this.redraw();
   }
 
-  // While pictures roll by, cursors stay where they are on the screen; in one that is held they
-  // stay where they are in time.
+  // While the picture rolls, cursors keep their place on the screen; in a held picture they keep
+  // their time.
   follow(held, window) {
     if (held === this.held) return;
     const wide = window[1] - window[0];
@@ -43,7 +43,7 @@ export class Cursors {
     return this.held ? this.at.map((t) => t - this.origin()) : this.at.map((part) => window[0] + part * (window[1] - window[0]));
   }
 
-  // Makes the plot of a strip take hold of a cursor that is near the pointer.
+  // Lets the pointer drag a near cursor on the plot of a strip.
   attach(strip) {
     const over = strip.plot.over;
     const near = (event) => {
@@ -56,7 +56,7 @@ export class Cursors {
     over.addEventListener("pointermove", (event) => {
       over.style.cursor = near(event) >= 0 ? "col-resize" : "";
     });
-    // before the plot's own mousedown, which would begin to select
+    // before the plot's own mousedown, which would start a selection
     over.addEventListener("mousedown", (event) => {
       if (near(event) >= 0) event.stopImmediatePropagation();
     }, { capture: true });
@@ -101,7 +101,7 @@ export class Cursors {
     ctx.restore();
   }
 
-  // Values at the bins that the cursors stand on: where a bin holds more than one, its middle.
+  // Values at the cursors' bins; of a bin with several values, the middle.
   tell(frame, x, window, T_s) {
     if (!this.on || !frame.bins) return;
     const [a, b] = this.times(window);

@@ -1,4 +1,4 @@
-// What happened in the run: a list, lines across the strips, and how it ended.
+// The events of the run: a list, lines across the strips, and how the run ended.
 
 import { colour } from "./palette.js";
 import { make, span } from "./text.js";
@@ -13,7 +13,7 @@ export class Events {
   constructor(list) {
     this.list = list;
     this.events = [];
-    this.said = []; // by this page: {t, text, kind}
+    this.said = []; // entries of this page: {t, text, kind}
   }
 
   set(events) {
@@ -21,7 +21,7 @@ export class Events {
     this.write();
   }
 
-  // What was asked from this page and refused, at the time of the run.
+  // Adds a command of this page that was refused, at the run's time.
   refuse(t, why) {
     this.said.push({ t, text: `refused: ${why}`, kind: "refused" });
     this.write();
@@ -34,7 +34,7 @@ export class Events {
       make("li", { class: kind }, make("time", {}, `${t.toFixed(3)} s`), make("span", {}, text))));
   }
 
-  // Lines at events within the plot; words only in the first strip, where there is room.
+  // Draws lines at the events; labels only in the first strip, where there is room.
   draw(u, strip, origin, first) {
     const { ctx, bbox } = u;
     const ratio = devicePixelRatio;
@@ -68,13 +68,13 @@ export class Events {
   }
 }
 
-// Of both sides' words on one trip, or one end, the first are those of the side that it happened to.
+// Both sides log one trip, or one end; the first entry is that of the side where it happened.
 function firstToSay(e, k, all) {
   const same = (other) => other.event === e.event && e.t - other.t <= ECHO_S;
   return e.label || !all.slice(0, k).some(same);
 }
 
-// Words and kind of an event of the log.
+// Text and kind of an event of the log.
 function describe(e) {
   if (e.event === "end") {
     return { text: e.reason ? `${e.status}: ${e.reason}` : e.status,
@@ -89,7 +89,7 @@ function describe(e) {
   return { text: e.label, kind: e.by ? "operator" : "planned" };
 }
 
-// The slim bar under the strips: the whole run, what happened, and the window on it.
+// The slim bar under the strips: the whole run, its events, and the visible window.
 export class OverviewMap {
   constructor(element, look) {
     this.element = element;
@@ -115,7 +115,7 @@ export class OverviewMap {
     });
   }
 
-  // A run that is going on may be long: its whole length would leave nothing to be seen.
+  // Recorded time, not the run's full duration: of a long run one would see nothing.
   get length() {
     return Math.max(this.look.done, this.look.window[1], 1e-6);
   }

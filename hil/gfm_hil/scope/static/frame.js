@@ -1,10 +1,10 @@
-// One frame of the server taken apart; its layout is that of view.py.
+// Decodes a frame of the server; view.py defines its layout.
 
 const HEAD = ["view", "first", "width", "bins", "channels", "start", "stop", "head", "edge",
   "doing", "state", "law", "misses", "trip", "same", "live"];
 export const IDLE = 0, ARMED = 1, FILLING = 2, AUTO = 3, HELD = 4;
 
-// names: the channels that were asked for, in order; watched: those of which only the value now.
+// names: the requested channels, in order; watched: channels of which only the present value comes.
 export function decode(buffer, names, watched) {
   const numbers = new Float64Array(buffer, 0, HEAD.length);
   const frame = Object.fromEntries(HEAD.map((name, k) => [name, numbers[k]]));
@@ -28,7 +28,7 @@ export function decode(buffer, names, watched) {
   return frame;
 }
 
-// Seconds of each point of a frame, against `origin`: two for each bin, unless a bin is one tick.
+// Time of each point of a frame from `origin`, s: two points per bin, unless a bin is one tick.
 export function times(frame, T_s, origin) {
   const each = frame.width > 1 ? 2 : 1;
   const t = new Float64Array(frame.bins * each);
@@ -39,8 +39,8 @@ export function times(frame, T_s, origin) {
   return t;
 }
 
-// The points of one channel: least and greatest of each bin, first the one that is nearer to where
-// the bin before ended, so that a slope is a line and a peak a peak. null: there is no value.
+// The points of one channel: minimum and maximum of each bin, first the one nearer to the previous
+// bin's last point, so that a slope stays a line and a peak a peak. null: no value.
 export function points(low, high, width) {
   const n = low.length;
   if (width === 1) return Array.from(low, (v) => (Number.isNaN(v) ? null : v));

@@ -1,4 +1,4 @@
-// The knobs: set-points, grid, law, reset. They only ask; what happens is up to the run.
+// The knobs: set-points, grid, law, reset. They only send requests; the run decides.
 
 import { make, symbol, value } from "./text.js";
 
@@ -6,7 +6,7 @@ const SETPOINTS = [["P_ref", 0.1], ["Q_ref", 0.1], ["V_ref", 0.01]];
 export const WATCHED = ["P_ref", "Q_ref", "V_ref", "d_omega_g"];
 
 export class Knobs {
-  // about: of the run; tell(event, name): sends an event, says whether it was accepted
+  // about: of the run; tell(event, name): sends an event, returns whether it was accepted
   constructor(place, about, tell) {
     this.tell = tell;
     this.about = about;
@@ -17,7 +17,7 @@ export class Knobs {
     this.allow(false);
   }
 
-  // why: in words, if nothing may be touched
+  // why: the reason, in words, if the knobs are disabled
   allow(may) {
     this.may = may;
     for (const knob of this.all) knob.disabled = !may;
@@ -57,14 +57,14 @@ export class Knobs {
         onclick: by(1) }, "+"), make("small", {}, unit));
   }
 
-  // label, what it is now if that is known by an id, and the field to set it
+  // label, the present value if an id is given for it, and the input field
   row(label, name, now, options) {
     const value = now ? [make("output", { id: now, title: "now" }, "–")] : [];
     return make("div", { class: now ? "row" : "row short" },
       make("label", { for: `set-${name}` }, label), ...value, this.field(name, options));
   }
 
-  // rows, with the button in the last one; send(): what it asks for
+  // rows, with the button in the last one; send(): sends the request
   form(button, id, rows, send) {
     rows.at(-1).append(make("button", { class: "strong go", id }, button));
     const form = make("form", { novalidate: true }, ...rows);
@@ -131,7 +131,7 @@ export class Knobs {
     return section;
   }
 
-  // What the run is doing: there is something to reset only in SAFE.
+  // Shows the run's state; only in SAFE is there something to reset.
   condition(safe, active, words = this.words) {
     Object.assign(this, { wasSafe: safe, active, words });
     this.safe.classList.toggle("safe", safe);

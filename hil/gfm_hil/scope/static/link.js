@@ -1,9 +1,9 @@
-// The connection to the server: says hello, comes back after a loss, hands on what arrives.
+// The connection to the server: says hello, reconnects after a loss, passes on messages.
 
 const KEY = "gfmhil-scope-token";
 
-// The token comes behind the # of the address, which is never sent; it leaves the address bar, so
-// that nobody reads it over a shoulder, and stays with this tab.
+// The token comes after the # of the address, which browsers never send. The page removes it from
+// the address bar, where others could read it, and keeps it for this tab.
 function token() {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
   if (given) {
@@ -25,7 +25,7 @@ export class Link {
 
   open() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    // With a token there is room also where many look: the query says that a hello comes first.
+    // Pages with a token have places of their own: the query announces that a hello comes first.
     const query = this.token ? "?control" : "";
     this.socket = new WebSocket(`${scheme}://${location.host}/socket${query}`);
     this.socket.binaryType = "arraybuffer";
@@ -58,7 +58,7 @@ export class Link {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
-  // Have an event carried out; what the run says to it: {ok, text} or {ok, tick, label}.
+  // Sends an event; resolves to the run's answer: {ok, text} or {ok, tick, label}.
   tell(event) {
     const id = this.next++;
     return new Promise((done) => {

@@ -1,9 +1,9 @@
-// What is looked at: rolling along, held, or around a trigger's edge; and asking the server for it.
+// The view: rolling, held, or around a trigger's edge; requests its frames from the server.
 
 export const SPANS = [0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60];
 
 export class Look {
-  // say: sends a message; changed: told when any of it is other
+  // say: sends a message; changed: called when any of it changes
   constructor(say, changed) {
     this.say = say;
     this.changed = changed;
@@ -11,7 +11,7 @@ export class Look {
     this.span = 2;
     this.start = 0;
     this.trigger = null; // {channel, level, edge, mode, before}
-    this.speed = 1; // at which a run that is over is played
+    this.speed = 1; // of the replay of a finished run
     this.playing = false;
     this.live = true;
     this.channels = [];
@@ -20,7 +20,7 @@ export class Look {
     this.frame = null;
     this.id = 0;
     this.T_s = 1e-4;
-    this.asked = new Map(); // by id, the names that were asked for
+    this.asked = new Map(); // requested names by id
   }
 
   get running() {
@@ -32,7 +32,7 @@ export class Look {
     return this.frame ? this.frame.head * this.T_s : 0;
   }
 
-  // The window to be seen, s: the one that is wanted, or wherever the newest frame has got to.
+  // The visible window, s: the held one, or that of the newest frame.
   get window() {
     if (this.mode === "held") return [this.start, this.start + this.span];
     if (!this.frame) return [0, this.span];
@@ -71,7 +71,7 @@ export class Look {
     this.say({ kind: "play" });
   }
 
-  // On from here: along with the run, or, if it is over, from the start of the window.
+  // Continues: along with the run, or, if it is over, from the start of the window.
   run() {
     if (!this.live) {
       const [from, to] = this.window;
@@ -99,7 +99,7 @@ export class Look {
     }
   }
 
-  // By a factor around a time that stays where it is.
+  // Zooms by a factor around a time that keeps its place.
   zoom(factor, around) {
     const [from, to] = this.window;
     const wide = Math.min(Math.max((to - from) * factor, 8 * this.T_s), 1e5);

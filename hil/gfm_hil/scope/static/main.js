@@ -1,4 +1,4 @@
-// The page: puts its parts together.
+// The page: assembles its parts.
 
 import { Cursors } from "./cursors.js";
 import { Events, OverviewMap } from "./events.js";
@@ -13,7 +13,7 @@ import { Tools } from "./tools.js";
 
 const get = (id) => document.getElementById(id);
 const WORDS = { RUNNING: "running, no fault", READY: "ready", INIT: "not started yet" };
-const WORDS_MS = 200; // numbers that change faster cannot be read
+const WORDS_MS = 200; // numbers that change faster are illegible
 
 const events = new Events(document.querySelector("#log ol"));
 let about = null, strips = [], knobs = null, tools = null, cursors = null, x = new Float64Array(0);
@@ -75,7 +75,7 @@ async function tell(event) {
   return answer;
 }
 
-// The strips that are wanted, one below the other; all share one axis of time.
+// The selected strips, one below the other; all share one time axis.
 function layout() {
   for (const strip of strips) strip.plot?.destroy();
   strips = STRIPS.filter((spec) => spec.shown).map((spec) => new Strip(spec, about.byName, {
@@ -101,7 +101,7 @@ function bins() {
   return Math.max(100, Math.min(2000, Math.round(wide)));
 }
 
-// Wheel and double click on a plot.
+// Handles wheel and double click on a plot.
 function hold(over) {
   over.addEventListener("wheel", (event) => {
     event.preventDefault();
@@ -117,7 +117,7 @@ function hold(over) {
   });
 }
 
-// Time that the axis calls 0: the edge of a trigger, else the start of the run.
+// Time at 0 of the axis: the edge of a trigger, else the start of the run.
 function origin() {
   const { frame } = look;
   return frame && frame.edge >= 0 ? frame.edge * about.T_s : 0;
@@ -126,7 +126,7 @@ function origin() {
 function seen(buffer) {
   const id = new Float64Array(buffer, 0, 1)[0];
   const asked = look.asked.get(id);
-  if (!asked) return; // of a look that is no longer wanted
+  if (!asked) return; // a frame of an outdated request
   const frame = decode(buffer, asked.channels, asked.watched);
   const before = look.frame;
   if (frame.same && before) frame.bins = before.bins, frame.low = before.low, frame.high = before.high;
@@ -205,7 +205,7 @@ function toggleCursors() {
   cursors.toggle(on, window_());
 }
 
-// What people read, a few times a second.
+// Updates the texts, a few times a second.
 function words(frame) {
   const now = performance.now();
   clearTimeout(later);
@@ -236,7 +236,7 @@ function state(text, kind) {
   get("state").dataset.state = kind;
 }
 
-// Why the run is in SAFE, or how it ended if not as it should.
+// Why the run is in SAFE, or how it ended if not regularly.
 function why() {
   const frame = look.frame;
   const safe = frame && about.states[frame.state] === "SAFE";

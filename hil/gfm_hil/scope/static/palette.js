@@ -1,4 +1,4 @@
-// Colours as the style sheet has them now, light or dark, for what is drawn on a canvas.
+// The style sheet's present colours, light or dark, for drawing on a canvas.
 
 const probe = document.createElement("span");
 probe.hidden = true;
@@ -15,7 +15,7 @@ export function colour(name) {
 
 export const THEMES = ["auto", "light", "dark"];
 
-// Calls `changed` whenever colours are others; returns a function that sets the theme.
+// Calls `changed` whenever the colours change; returns a function that sets the theme.
 export function watch(changed) {
   const again = () => {
     cache = new Map();

@@ -1,10 +1,10 @@
-// The strips: one plot below the other over one axis of time.
+// The strips: one plot below the other over one time axis.
 
 import { points } from "./frame.js";
 import { colour } from "./palette.js";
 import { make, seconds, symbol, tick, value } from "./text.js";
 
-// `references` are dashed, in the colour of the trace that they are for.
+// `references` are dashed, in the colour of their trace.
 export const STRIPS = [
   { name: "power", title: "Power", traces: ["p", "q"],
     references: { P_ref: "p", Q_ref: "q" }, shown: true },
@@ -27,7 +27,7 @@ export function channelsOf(strip) {
   return [...strip.traces, ...Object.keys(strip.references), ...(strip.marks ? [strip.marks] : [])];
 }
 
-// A calm range: one that holds all values, changed only if they leave it or no longer need it.
+// A stable range: it contains all values and changes only if they leave it or need much less.
 export function calm(range, low, high, least) {
   if (!(low <= high)) return range ?? [0, 1];
   const need = Math.max(high - low, least);
@@ -46,8 +46,8 @@ export class Strip {
     this.spec = spec;
     this.about = about;
     this.on = on;
-    this.range = null; // as it came out
-    this.held = null; // as the operator chose it
+    this.range = null; // computed
+    this.held = null; // chosen by the operator
     this.last = false;
     this.values = new Map();
     this.element = make("section", { class: "strip", "data-strip": spec.name,
@@ -154,7 +154,7 @@ export class Strip {
     });
   }
 
-  // the values of just now, for people: a few times a second
+  // shows the present values, a few times a second
   tell(frame) {
     for (const [name, element] of this.values) {
       const text = value(frame.now[name], this.about[name].unit);

@@ -8,7 +8,7 @@ export function value(number, unit) {
   return +text === 0 ? text.replace("-", "") : text.replace("-", "−");
 }
 
-// A value on an axis whose marks are `step` apart.
+// A value as text for an axis with ticks `step` apart.
 export function tick(v, step) {
   const thousands = step >= 1e3;
   const digits = Math.max(0, -Math.floor(Math.log10(thousands ? step / 1e3 : step) + 1e-6));
@@ -40,7 +40,7 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-// A symbol such as V_dcref as V with a subscript.
+// A symbol such as V_dcref, shown as V with a subscript.
 export function symbol(text) {
   const [base, ...below] = text.split("_");
   if (base.length > 2) return make("span", { class: "symbol word" }, text);

@@ -58,7 +58,7 @@ export class Tools {
     };
   }
 
-  // A level in the middle of what is to be seen.
+  // A trigger level in the middle of the visible values.
   propose() {
     const name = get("trigger-channel").value;
     const low = this.look.frame?.low[name], high = this.look.frame?.high[name];
@@ -121,7 +121,7 @@ export class Tools {
     get("doing").dataset.doing = doing;
   }
 
-  // A length that is none of the list, after a zoom.
+  // Shows a length that is not in the list, after a zoom.
   free(now) {
     const first = get("span").options[0];
     const option = first.value === "" ? first : make("option", { value: "" });

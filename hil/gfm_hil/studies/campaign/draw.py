@@ -35,8 +35,8 @@ class _Drawn(Model):
 
 
 class _Between(_Drawn):
-    low: float
-    high: float
+    low: float = Field(description="least value")
+    high: float = Field(description="greatest value")
 
     @model_validator(mode="after")
     def _not_empty(self) -> _Between:
@@ -55,7 +55,7 @@ class _Between(_Drawn):
 class Uniform(_Between):
     """Every value in [low, high] alike."""
 
-    type: Literal["uniform"]
+    type: Literal["uniform"] = Field(description="kind of distribution")
 
     def quantile(self, u: float) -> float:
         """The value below which a share u, 0 <= u < 1, of all draws lies."""
@@ -65,7 +65,7 @@ class Uniform(_Between):
 class LogUniform(_Between):
     """Every decade of [low, high] alike; for factors, inductances and the like."""
 
-    type: Literal["loguniform"]
+    type: Literal["loguniform"] = Field(description="kind of distribution")
 
     @model_validator(mode="after")
     def _positive(self) -> LogUniform:
@@ -81,9 +81,9 @@ class LogUniform(_Between):
 class Normal(_Between):
     """Normal with mean and sigma, cut off at low and high."""
 
-    type: Literal["normal"]
-    mean: float
-    sigma: float = Field(gt=0)
+    type: Literal["normal"] = Field(description="kind of distribution")
+    mean: float = Field(description="of the distribution before it is cut at low and high")
+    sigma: float = Field(gt=0, description="its standard deviation")
 
     @model_validator(mode="after")
     def _reaches(self) -> Normal:
@@ -109,8 +109,10 @@ class Normal(_Between):
 class Choice(_Drawn):
     """One of some values, all alike; they may be numbers, words or true and false."""
 
-    type: Literal["choice"]
-    values: list[bool | int | float | str] = Field(min_length=1)
+    type: Literal["choice"] = Field(description="kind of distribution")
+    values: list[bool | int | float | str] = Field(
+        min_length=1, description="numbers, words or true and false, all equally likely"
+    )
 
     def ends(self) -> list[Any]:
         """All values."""

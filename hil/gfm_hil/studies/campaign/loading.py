@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, lines
 from gfm_hil.scenario.model import check_scenario, find_file, load_scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies.campaign.draw import Distribution
@@ -83,9 +83,8 @@ def check_campaign(
     try:
         file = CampaignFile.model_validate(content)
     except ValidationError as problem:
-        raise UserError(
-            "\n".join(f"{path}: {printable(_line(e))}" for e in problem.errors())
-        ) from None
+        wrong = lines(problem, CampaignFile)
+        raise UserError("\n".join(f"{path}: {line}" for line in wrong)) from None
     if text is None:
         text = toml_text(content)
     base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
@@ -163,15 +162,3 @@ def _run_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]
             raise
 
     yield from (partial(check, run) for run in range(min(campaign.file.runs, _TRIED)))
-
-
-def _line(error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"])
-    text = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "value_error":
-        return f"{where}: {text}"
-    if error["type"] == "missing":
-        return f"{where}: missing"
-    if error["type"] == "extra_forbidden":
-        return f"{where}: unknown key"
-    return f"{where} = {error['input']!r:.60}: {text}"

@@ -54,25 +54,31 @@ def _words(place: Any, path: str, above: str) -> str:
 class Axes(Model):
     """What the figure is drawn over: drawn paths, or sums of them ("a + b")."""
 
-    x: str | None = None
-    y: str | None = None
+    x: str | None = Field(
+        None,
+        description="drawn path of the horizontal axis, or a sum a + b; the first drawn if none",
+    )
+    y: str | None = Field(
+        None,
+        description="drawn path of the vertical axis, or a sum a + b; the second drawn if none",
+    )
 
 
 class CampaignFile(Model):
     """The whole file."""
 
-    title: str
-    description: str = ""
+    title: str = Field(description="of tables and the figure")
+    description: str = Field("", description="for people")
     scenario: str = Field(description="scenario file, or the name of a shipped one")
     laws: list[str] = Field(min_length=1, description="each runs on the same draws")
     runs: int = Field(gt=0, le=10**7, description="number of draws")
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: int = Field(0, ge=0, lt=2**63, description="of all draws")
     ripple_max: float = Field(
         0.2, gt=0, description="p.u.; peak to peak of p over the last 0.2 s of a stable run"
     )
-    figure: Axes = Axes()
+    figure: Axes = Field(Axes(), description="what the figure is drawn over")
     set: dict[str, Any] = Field({}, description="dotted path = value, the same in every run")
-    draw: list[Distribution] = Field(min_length=1)
+    draw: list[Distribution] = Field(min_length=1, description="what is drawn in every run")
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from gfm_hil.core.terminal import fitting, terminal
 from gfm_hil.results.report import EVENT_COLUMNS, cell
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.campaign.axes import Axis
@@ -22,20 +24,22 @@ _COLOURS = {"stable": "green", "oscillating": "yellow"}
 
 def print_campaign(result: dict[str, Any], axes: tuple[Axis, Axis | None], folder: Path) -> None:
     """Counts, quantiles of the stable runs' metrics, and the worst runs of every law."""
-    console = Console()
+    console = terminal()
     console.print(f"[bold]{escape(result['title'])}[/]", highlight=False)
     console.print(
         f"{result['done']} runs in {result['wall_s']:.1f} s on "
         + (f"{w} workers" if isinstance(w := result["workers"], int) else escape(w)),
         highlight=False,
     )
-    console.print(_counts(result["laws"]))
+    for table in fitting(console, list(result["laws"]), partial(_counts, result["laws"])):
+        console.print(table)
     for law, found in result["laws"].items():
         console.print(_worst(law, found["worst"], [a for a in axes if a]))
     console.print(escape(f"folder: {folder}, figure: {folder / 'map.png'}"), soft_wrap=True)
 
 
-def _counts(laws: dict[str, Any]) -> Table:
+def _counts(all_laws: dict[str, Any], names: Sequence[str]) -> Table:
+    laws = {name: all_laws[name] for name in names}
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     for law in laws:
@@ -85,7 +89,7 @@ def _worst(law: str, runs: list[dict[str, Any]], axes: list[Axis]) -> Table:
 
 def print_record(record: Record, folder: Path) -> None:
     """One run in a few lines."""
-    console = Console()
+    console = terminal()
     reason = f" — {escape(record['reason'])}" if record["reason"] else ""
     console.print(
         f"run {record['run']}, {escape(record['law'])}: [bold]{record['status']}[/]{reason}",

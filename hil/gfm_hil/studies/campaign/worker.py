@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.inproc import buffers, compile_loop
-from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.recorder import (
-    Part,
-)
+from gfm_hil.engine.compiling import compiled_bench
+from gfm_hil.engine.inproc import buffers
+from gfm_hil.recording.recorder import Part
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
@@ -23,18 +21,18 @@ Job = tuple[int, str]  # run number, law
 Record = dict[str, Any]
 
 _RIPPLE_WINDOW = 0.2  # s, ten periods of 50 Hz
-_EVENT_KEYS = ("t", "tick", "label")  # of a summary's event; the scenario has them
+_EVENT_KEYS = ("t", "tick", "label", "cut_short")  # of a summary's event; the scenario has them
 
 
 class RunFailed(Exception):
     """A run ended by an error of the program; the message names the run."""
 
 
-def compile_once(campaign: Campaign) -> None:
+def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
     scenario, _ = campaign.scenario(0, campaign.file.laws[0])
     try:
-        compile_loop(make_bench(scenario), *buffers(1))
+        compiled_bench(scenario, notice)
     except UserError:  # no steady state: the workers will compile
         return
 

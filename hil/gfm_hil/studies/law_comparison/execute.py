@@ -1,4 +1,4 @@
-"""All rows of the league, by several processes if wanted; what is done is kept and not redone."""
+"""All rows of the law comparison, in several processes if wanted; finished rows are kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiments of the league on the nonlinear bench: the paper's simulation, disturbed."""
+"""The experiments of the law comparison on the nonlinear bench, each with one disturbance."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def experiment(name: str, law: str) -> dict[str, Any]:
         "plant": plant,
         "events": [{"t": AT, **event} | ({"law": law} if switched else {})],
     }
-    scenario = check_scenario(content, f"league, {name}")
+    scenario = check_scenario(content, f"law comparison, {name}")
     parts = buffers(scenario.ticks)
     summary, p = simulate(scenario, *parts)
     out: dict[str, Any] = {"status": summary["status"], "reason": summary["reason"]}

@@ -1,4 +1,4 @@
-"""Figures of the league: gamma by law, the bench's overshoot over gamma, steps of some laws."""
+"""Figures of the law comparison: γ by law, overshoot on the bench over γ, steps of some laws."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def draw(folder: Path, rows: Sequence[Row]) -> None:
     """All figures of the laws that have a gamma; none without any."""
     rated = [row for row in rows if row["gamma"] is not None]
     if rated:
-        _gammas(folder / "league_gamma.png", rated)
-        _overshoots(folder / "league_overshoot.png", rated)
-        _steps(folder / "league_steps.png", _spread(rated))
+        _gammas(folder / "law_comparison_gamma.png", rated)
+        _overshoots(folder / "law_comparison_overshoot.png", rated)
+        _steps(folder / "law_comparison_steps.png", _spread(rated))
 
 
 def _spread(rows: Sequence[Row]) -> list[Row]:

@@ -1,4 +1,4 @@
-"""One law of the league from its file to its row: search, law file, sampled loop, bench."""
+"""One law of the comparison from its file to its row: search, law file, sampled loop, bench."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def make_row(job: Job, folder: Path, tell: Tell) -> Row:
     if not as_shipped(job.law):
         path = folder / "laws" / f"{job.law}-tuned.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_law(path, file, found.gains, row, _notes(job, row), "gfmhil design league")
+        write_law(path, file, found.gains, row, _notes(job, row), "gfmhil design compare")
         name = str(path)
     row["bench"] = {kind: experiment(kind, name) for kind in EXPERIMENTS}
     return row

@@ -1,4 +1,4 @@
-"""The league as tables: Markdown for a page, and on a terminal."""
+"""The law comparison as tables: in Markdown for a page, and on a terminal."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gfm_design.margins.delays import longest
 from gfm_design.model.closed_loop import T_S
+from gfm_hil.core.terminal import terminal
 
 Row = dict[str, Any]
 Column = tuple[str, Callable[[Row], str]]
@@ -116,7 +116,7 @@ def _bump(row: Row) -> str:
 
 _LAW: Column = ("law", lambda r: str(r["law"]))
 _WITH_GAMMA: dict[str, list[Column]] = {
-    "league_gamma": [
+    "law_comparison_gamma": [
         _LAW,
         ("states", lambda r: str(r["order"])),
         ("free", lambda r: str(len(r["free"]))),
@@ -128,7 +128,7 @@ _WITH_GAMMA: dict[str, list[Column]] = {
         ("γ of the others", lambda r: number(others(r), 4)),
         *(_channel(i, j) for i, j in ((1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 1))),
     ],
-    "league_loop": [
+    "law_comparison_loop": [
         _LAW,
         ("σ [1/s]", lambda r: number(r["sigma"])),
         ("least damping ratio", _damping),
@@ -136,7 +136,7 @@ _WITH_GAMMA: dict[str, list[Column]] = {
         ("L_g", _factors("L_g")),
         ("R_f, R_g", _factors("R")),
     ],
-    "league_bench": [
+    "law_comparison_bench": [
         _LAW,
         ("P_ref step: overshoot [%]", _bench("p_ref", "overshoot_pct")),
         ("settling [s]", _bench("p_ref", "settling_s", 2, False)),
@@ -155,12 +155,12 @@ _WITHOUT: list[Column] = [
     ("free", lambda r: str(len(r["free"]))),
     ("in the way", lambda r: str(r["reason"])),
 ]
-TABLES = (*_WITH_GAMMA, "league_unstable")
+TABLES = (*_WITH_GAMMA, "law_comparison_unstable")
 
 
 def markdown(name: str, rows: Sequence[Row]) -> str:
     """One of ``TABLES``."""
-    wanted = [r for r in rows if (r["gamma"] is None) == (name == "league_unstable")]
+    wanted = [r for r in rows if (r["gamma"] is None) == (name == "law_comparison_unstable")]
     columns = _WITH_GAMMA.get(name, _WITHOUT)
     lines = [f"| {' | '.join(head for head, _ in columns)} |", f"|{'---|' * len(columns)}"]
     for row in wanted:
@@ -170,11 +170,13 @@ def markdown(name: str, rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def print_league(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
-    """The ranking, then who has no place in it."""
-    console = Console(highlight=False)
+def print_comparison(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
+    """Print the ranking, then the laws that have no place in it, and why."""
+    console = terminal(highlight=False)
     heads = ("law", "γ own", "γ ideal", "γ late", "worst channel", "delay µs", "overshoot %")
-    table = Table(*heads, box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    for head in heads:
+        table.add_column(head, no_wrap=head == "law")
     for row in (r for r in rows if r["gamma"] is not None):
         table.add_row(
             row["law"],

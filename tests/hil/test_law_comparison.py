@@ -1,4 +1,4 @@
-"""gfmhil design league: rows, tables, law files, going on, what it refuses."""
+"""gfmhil design compare: rows, tables, law files, going on, what it refuses."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SHORT = ("--evaluations", "320", "--starts", "1", "--quiet")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("league") / "out"
-    assert main(["design", "league", "--laws", "droop-1,vsg-2", "--out", str(out), *SHORT]) == 0
+    out = tmp_path_factory.mktemp("comparison") / "out"
+    assert main(["design", "compare", "--laws", "droop-1,vsg-2", "--out", str(out), *SHORT]) == 0
     return out
 
 
 def test_rows(folder: Path) -> None:
-    vsg, droop = json.loads((folder / "league.json").read_text())["laws"]
+    vsg, droop = json.loads((folder / "law_comparison.json").read_text())["laws"]
     assert (vsg["law"], droop["law"]) == ("vsg-2", "droop-1")  # by gamma, none last
     assert vsg["gamma"] == pytest.approx(15.973, rel=1e-3)
     assert {(c["i"], c["j"]) for c in vsg["channels"]} >= {(1, 1), (4, 1)}
@@ -39,7 +39,7 @@ def test_rows(folder: Path) -> None:
 
 def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Capture) -> None:
     path = folder / "laws" / "vsg-2-tuned.toml"
-    row = json.loads((folder / "league.json").read_text())["laws"][0]
+    row = json.loads((folder / "law_comparison.json").read_text())["laws"][0]
     assert main(["design", "gamma", "--law", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["gamma"] == pytest.approx(row["gamma"], rel=1e-9)
     file = law_file(str(path))
@@ -49,10 +49,11 @@ def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Cap
 
 def test_tables(folder: Path) -> None:
     assert (
-        "| vsg-2 | 3 | 2 | 15.97 | 15.97 | **15.97** |" in (folder / "league_gamma.md").read_text()
+        "| vsg-2 | 3 | 2 | 15.97 | 15.97 | **15.97** |"
+        in (folder / "law_comparison_gamma.md").read_text()
     )
-    assert "droop-1" not in (folder / "league_gamma.md").read_text()
-    assert "50.7" in (folder / "league_unstable.md").read_text()
+    assert "droop-1" not in (folder / "law_comparison_gamma.md").read_text()
+    assert "50.7" in (folder / "law_comparison_unstable.md").read_text()
 
 
 def test_what_is_done_is_kept(folder: Path, capsys: Capture) -> None:
@@ -60,7 +61,7 @@ def test_what_is_done_is_kept(folder: Path, capsys: Capture) -> None:
         return {p.name: p.stat().st_mtime_ns for p in (folder / "rows").iterdir()}
 
     before = written()
-    again = ("design", "league", "--laws", "droop-1,vsg-2", "--out", str(folder))
+    again = ("design", "compare", "--laws", "droop-1,vsg-2", "--out", str(folder))
     assert main([*again, *SHORT]) == 0
     assert written() == before
     assert main([*again, *SHORT, "--seed", "1"]) == 0
@@ -102,7 +103,7 @@ def test_mimo_gfm_with_other_gains_is_not_searched() -> None:
     ],
 )
 def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
-    assert main(["design", "league", *arguments]) == 2
+    assert main(["design", "compare", *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1

@@ -25,19 +25,19 @@ def rows(name: str) -> dict[str, list[str]]:
 
 
 def test_every_law_has_a_row() -> None:
-    rated, not_rated = set(rows("league_gamma")), set(rows("league_unstable"))
+    rated, not_rated = set(rows("law_comparison_gamma")), set(rows("law_comparison_unstable"))
     assert rated | not_rated | set(LEFT_OUT) == set(law_names())
     assert not rated & not_rated
     searched = {name for name in rated if not as_shipped(name)}
     assert {f"{name}-tuned" for name in searched} == set(tuned_names())
-    assert set(rows("league_loop")) == set(rows("league_bench")) == rated
+    assert set(rows("law_comparison_loop")) == set(rows("law_comparison_bench")) == rated
 
 
 @pytest.mark.parametrize("name", tuned_names())
 def test_gamma_of_a_tuned_law_is_the_page_s(name: str) -> None:
     found = as_it_is(law_file(name))
     assert not isinstance(found.after, Culprit)
-    own, late = (rows("league_gamma")[name.removesuffix("-tuned")][k] for k in (2, 4))
+    own, late = (rows("law_comparison_gamma")[name.removesuffix("-tuned")][k] for k in (2, 4))
     # at the operating point of the tuned gains, to the page's four digits
     assert float(late.strip("*")) == pytest.approx(gamma(found.after), rel=1e-3)
     assert own == "unstable" or float(own) >= 0.999 * gamma(found.after)

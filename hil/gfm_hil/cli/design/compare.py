@@ -1,4 +1,4 @@
-"""gfmhil design league: every law tuned for the same problem, and what each then does."""
+"""gfmhil design compare: every law tuned for the same problem, and how each then behaves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
@@ -19,32 +18,37 @@ from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.campaign.execute import WorkerLost
 from gfm_hil.studies.law_comparison.execute import kept, run
 from gfm_hil.studies.law_comparison.figures import draw
 from gfm_hil.studies.law_comparison.row import LEFT_OUT, Job, Row
-from gfm_hil.studies.law_comparison.tables import TABLES, markdown, print_league, ranked
+from gfm_hil.studies.law_comparison.tables import TABLES, markdown, print_comparison, ranked
 from gfm_runtime import law_names
 
 
 def add(kinds: Any) -> None:
     """Add the command to the parser."""
-    command = kinds.add_parser("league", help="every law tuned for the same problem, in a table")
+    command = kinds.add_parser("compare", help="every law tuned for the same problem, in a table")
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
     command.add_argument("--evaluations", type=int, default=EVALUATIONS, help="of each start")
     command.add_argument("--starts", type=int, help="of each law; more for more gains, if left")
-    command.add_argument("--out", help="folder to write, or to go on with; runs/league-<time>")
+    command.add_argument(
+        "--out", help="folder to write, or to go on with; runs/law-comparison-<time>"
+    )
     command.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
-    command.add_argument("--json", action="store_true", help="print league.json, nothing else")
+    command.add_argument(
+        "--json", action="store_true", help="print law_comparison.json, nothing else"
+    )
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Make the league; a law that --out has already is not tuned again."""
+    """Compare the laws; a law that the folder --out has already is not tuned again."""
     jobs = _jobs(options)
-    folder = new_folder(options.out, "league")
+    folder = new_folder(options.out, "law-comparison")
     _make(folder)
     rows = {job.law: row for job in jobs if (row := kept(folder, job))}
     missing = [job for job in jobs if job.law not in rows]
@@ -65,15 +69,17 @@ def call(options: argparse.Namespace) -> int:
     order = ranked(list(rows.values()))
     left_out = {name: why for name, why in LEFT_OUT.items() if not options.laws}
     result = {"seed": options.seed, "laws": order, "left_out": left_out}
-    (folder / "league.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    (folder / "law_comparison.json").write_text(
+        json.dumps(result, indent=1) + "\n", encoding="utf-8"
+    )
     for name in TABLES:
         (folder / f"{name}.md").write_text(markdown(name, order), encoding="utf-8")
     draw(folder, order)
     if options.json:
         print(json.dumps(result, indent=1))
     else:
-        print_league(order, left_out)
-        Console(highlight=False, soft_wrap=True).print(f"folder: {folder}")
+        print_comparison(order, left_out)
+        terminal(highlight=False, soft_wrap=True).print(f"folder: {folder}")
     if len(rows) < len(jobs):
         why = f"{lost}; " if lost else "interrupted; "
         again = f"the same command with --out {folder} goes on"
@@ -110,7 +116,7 @@ def _make(folder: Path) -> None:
 @contextlib.contextmanager
 def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     """A bar of laws and one of each search; yields what tells them of evaluations and of rows."""
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = terminal(stderr=True, quiet=options.quiet, highlight=False)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

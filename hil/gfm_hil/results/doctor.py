@@ -1,7 +1,7 @@
-"""Is this machine fit for real time: the badge judged line by line, with what to do about it.
+"""Whether this machine is fit for real time: one finding a line, with what to do about it.
 
-Green: nothing to do. Yellow: the longest times are longer than they need be. Red: ticks will be
-late, or something that a run needs is refused.
+Green: there is nothing to do. Yellow: the longest times are longer than they need be. Red: ticks
+will be late, or the machine refuses something that a run needs.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _NEEDED = ("numpy", "numba", "pyzmq", "python-can")
 
 
 class Finding(NamedTuple):
-    """One line of the doctor's table; ``advice`` is empty where there is nothing to do."""
+    """One line of the doctor's table; ``advice`` is empty if there is nothing to do."""
 
     what: str
     found: str
@@ -56,6 +56,16 @@ def examine() -> tuple[Facts, list[Finding]]:
     time.sleep(_STEAL_OVER_S)
     facts = {**environment(), **look(Path("/")), "steal_pct": steal.percent()}
     return facts, judge(facts)
+
+
+def verdict() -> dict[str, Any]:
+    """The worst level of this machine's findings, and the findings that are not green, in words.
+
+    It takes some milliseconds, as it does not measure how much time the host takes.
+    """
+    findings = judge({**environment(), **look(Path("/")), "steal_pct": None})
+    said = [f"{f.what} {f.found}" for f in findings if f.level != "green"]
+    return {"worst": worst(findings), "findings": said}
 
 
 def look(root: Path) -> Facts:
@@ -230,18 +240,19 @@ def _room(facts: Facts) -> Finding:
 
 
 def _virtual(facts: Facts) -> Finding:
-    kind, steal = facts["virtual_machine"], facts["steal_pct"] or 0.0
+    kind, steal = facts["virtual_machine"], facts["steal_pct"]
     if kind == "no":
         return Finding("virtual machine", "no", "green")
-    level: Level = "red" if steal > 1 else "yellow"
+    level: Level = "red" if (steal or 0.0) > 1 else "yellow"
+    found = kind if steal is None else f"{kind}, host takes {steal:g} %"
     advice = "the host can stop it for milliseconds: bare metal, or processors pinned by the host"
-    return Finding("virtual machine", f"{kind}, host takes {steal:g} %", level, advice)
+    return Finding("virtual machine", found, level, advice)
 
 
 def _load(facts: Facts) -> Finding:
     load = facts["load_average"][0]
     busy = load / facts["cpus"] > 0.5
-    advice = "other work runs beside: stop it, or isolate the loops' processors"
+    advice = "other work runs on this machine: stop it, or isolate the loops' processors"
     return Finding("load", f"{load:g}", "yellow" if busy else "green", advice if busy else "")
 
 

@@ -1,0 +1,48 @@
+"""gfmhil schema: what a scenario, law or campaign file may hold, as JSON Schema for editors."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from gfm_hil.core.files import write_text
+from gfm_hil.scenario.model import Scenario
+from gfm_hil.studies.campaign.spec import CampaignFile
+from gfm_runtime.lawfile import LawFile
+
+MODELS: dict[str, type[BaseModel]] = {
+    "scenario": Scenario,
+    "law": LawFile,
+    "campaign": CampaignFile,
+}
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    command = commands.add_parser(
+        "schema",
+        description="Prints the JSON Schema (draft 2020-12) of a kind of file. It describes every "
+        "key; what keys must be like together, only gfmhil itself checks.",
+    )
+    command.add_argument("kind", choices=list(MODELS), help="kind of file")
+    command.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Print or write the schema; returns the exit code."""
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **MODELS[options.kind].model_json_schema(),
+        "title": f"gfmhil {options.kind} file",
+    }
+    text = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    if options.out is None:
+        print(text, end="")
+    else:
+        write_text(options.out, text)
+    return 0

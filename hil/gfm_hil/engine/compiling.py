@@ -1,0 +1,121 @@
+"""What a run calls in its ticks, compiled set by set before it starts.
+
+numba compiles a function when it is first called, and keeps the result in its cache. So the first
+run of an installation on a machine compiles for minutes, and those after it only load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from numba.core import event
+
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.engine.inproc import buffers, compile_loop
+from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.links import link_kind, link_names
+from gfm_hil.links.impaired import link as impaired
+from gfm_hil.realtime import prevent_idle
+from gfm_hil.scenario.model import INPROC, Scenario
+
+#: a name for people, and what compiles the functions, or loads them from the cache
+Set = tuple[str, Callable[[], object]]
+
+
+class _Listener(event.Listener):
+    """Calls a function at the first compilation that is none of another one's parts."""
+
+    def __init__(self, begun: Callable[[], None]) -> None:
+        self._begun, self.heard = begun, False
+
+    def on_start(self, event: Any) -> None:
+        if not self.heard:
+            self.heard = True
+            self._begun()
+
+    def on_end(self, event: Any) -> None:
+        """Nothing is said at the end."""
+
+
+def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
+    """Compile sets of functions; ``notice`` is told of each set that numba has not in its cache.
+
+    Returns:
+        How many sets those were.
+    """
+    compiled = 0
+    for k, (name, compile_set) in enumerate(sets, 1):
+        text = f"compiling {name} ({k} of {len(sets)}, once a machine) …"
+        listener = _Listener(lambda text=text: notice(text))  # type: ignore[misc]
+        with event.install_listener("numba:compile", listener):
+            compile_set()
+        compiled += listener.heard
+    return compiled
+
+
+def compiled_bench(
+    scenario: Scenario, notice: Callable[[str], None], sides: Iterable[Side] = SIDES
+) -> Bench:
+    """The bench of a scenario, with everything compiled that a tick calls.
+
+    Args:
+        scenario: checked.
+        notice: told of each set of functions that numba has to compile.
+        sides: the sides to compile for.
+
+    Raises:
+        UserError: as ``make_bench``.
+    """
+    found: list[Bench] = []
+    sets: list[Set] = [("the operating point", lambda: found.append(make_bench(scenario)))]
+    link = scenario.link
+    if link.type == INPROC:
+        sets.append(_both(found))
+    else:
+        sets += [_side(side, found) for side in sides]
+        sets.append(_link(link.type, link.options))
+        if link.impairment is not None:
+            sets.append(("the link's impairment", impaired.warm_up))
+        if scenario.mode == "realtime":
+            sets.append(_IDLE)
+    compile_sets(sets, notice)
+    return found[0]
+
+
+def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
+    """Compile what any run may call, over every link there is.
+
+    Returns:
+        How many sets of functions numba had to compile, and how many there are.
+    """
+    scenario = Scenario(title="warm-up", duration=1.0)
+    found: list[Bench] = []
+    sets: list[Set] = [
+        ("the operating point", lambda: found.append(make_bench(scenario))),
+        _both(found),
+        *(_side(side, found) for side in SIDES),
+        *(_link(name, {}) for name in link_names()),
+        ("a link's impairment", impaired.warm_up),
+        _IDLE,
+    ]
+    return compile_sets(sets, notice), len(sets)
+
+
+_IDLE: Set = ("the thread that keeps a processor awake", prevent_idle.warm_up)
+
+
+def _both(found: list[Bench]) -> Set:
+    return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1))
+
+
+def _side(side: Side, found: list[Bench]) -> Set:
+    plant, controller = buffers(1)
+    part = plant if side == "plant" else controller
+    return f"the {side}", lambda: compile_side(side, found[0], part)
+
+
+def _link(name: str, options: dict[str, Any]) -> Set:
+    kind = link_kind(name)
+    return f"the link {name}", lambda: kind.warm_up(kind.options.model_validate(options))

@@ -1,0 +1,92 @@
+"""What pydantic finds wrong with a file, in one line a mistake."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from gfm_runtime.errors import meant, printable
+
+_SHOWN = 20
+
+
+Path = tuple[str | int, ...]
+
+
+def lines(
+    problem: ValidationError, model: Any = None, source: Callable[[Path], str] | None = None
+) -> list[str]:
+    """The mistakes, 20 at most: path, value, what is wrong, and the name that was perhaps meant.
+
+    Args:
+        problem: from pydantic.
+        model: what was validated, a model or a union of models; its fields are suggested in place
+            of a key that is unknown.
+        source: names the file or option that the value at a path comes from; it begins the line.
+    """
+    errors = problem.errors()
+    found = [(error["loc"], _line(error, model)) for error in errors[:_SHOWN]]
+    if len(errors) > _SHOWN:
+        found.append(((), f"and {len(errors) - _SHOWN} more mistakes"))
+    return [printable(f"{source(path)}: {text}" if source else text) for path, text in found]
+
+
+def _line(error: Any, model: Any) -> str:
+    path = ".".join(str(part) for part in error["loc"])
+    text = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{path}: {text}" if path else text
+    if error["type"] == "missing":
+        return f"{path}: missing"
+    shown = _cut(error["input"])
+    context = error.get("ctx", {})
+    if error["type"] in ("union_tag_not_found", "union_tag_invalid"):
+        key = ".".join(filter(None, (path, context["discriminator"].strip("'"))))
+        if "tag" not in context:
+            return f"{key}: missing"
+        tags = context["expected_tags"]
+        return f"{key} = {_cut(context['tag'])}: must be one of {tags}" + meant(
+            context["tag"], _quoted(tags)
+        )
+    if error["type"] == "extra_forbidden":
+        *parents, last = error["loc"]
+        return f"{path} = {shown}: unknown key" + meant(last, _fields(model, parents))
+    if error["type"] == "literal_error":
+        text += meant(error["input"], _quoted(context["expected"]))
+    return f"{path}: {text}, not {shown}" if path else f"{text}, not {shown}"
+
+
+def _quoted(text: str) -> list[str]:
+    return re.findall(r"'([^']*)'", text)
+
+
+def _fields(model: Any, path: Sequence[str | int]) -> set[str]:
+    """The keys of the table that a path of an error leads to."""
+    models = _models(model)
+    for part in path:
+        inside = [m.model_fields[part].annotation for m in models if part in m.model_fields]
+        if inside:
+            models = [m for annotation in inside for m in _models(annotation)]
+        else:  # an index, a name in a table, or the type that chooses one of several models
+            models = [m for m in models if part in _tags(m)] or models
+    return {field for m in models for field in m.model_fields}
+
+
+def _models(hint: Any) -> list[type[BaseModel]]:
+    """The models that a type is made of."""
+    if isinstance(hint, type) and issubclass(hint, BaseModel):
+        return [hint]
+    return [model for argument in get_args(hint) for model in _models(argument)]
+
+
+def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
+    return get_args(model.model_fields["type"].annotation) if "type" in model.model_fields else ()
+
+
+def _cut(value: Any) -> str:
+    """A value as Python writes it, at most 60 characters."""
+    shown = repr(value)
+    return shown if len(shown) < 60 else shown[:57] + "..."
