@@ -1,4 +1,4 @@
-"""Other work on the machine: one process a processor that never rests, at ordinary priority."""
+"""Load on the machine: one busy process per processor, at ordinary priority."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _SETTLE_S = 0.02
 
 @contextmanager
 def hogs() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
-    """Start them, halted; yields a context that lets them go for ``hogs`` and not for ``idle``."""
+    """Start them, stopped; yields a context that runs them for ``hogs`` and not for ``idle``."""
     started = [
-        subprocess.Popen(  # own session: Ctrl-C is the parent's to handle
+        subprocess.Popen(  # own session: only the parent handles Ctrl-C
             [sys.executable, "-c", _HOG, str(cpu), str(os.getpid())], start_new_session=True
         )
         for cpu in sorted(os.sched_getaffinity(0))

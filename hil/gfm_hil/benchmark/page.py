@@ -1,4 +1,4 @@
-"""bench.html: a result in one file that needs nothing else."""
+"""bench.html: a result as one self-contained file."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ _SECTIONS = {
 
 
 def write_page(content: dict[str, Any], path: Path) -> None:
-    """Write the page of a result, and its figures beside it as files."""
+    """Write the page of a result, and its figures as files beside it."""
     made = figures(content)
     for name, svg in made.items():
         path.with_name(f"{name}.svg").write_bytes(svg)
@@ -133,7 +133,7 @@ def _badge(environment: dict[str, Any]) -> str:
 
 
 def _cards(content: dict[str, Any]) -> str:
-    """The figures that most people look for, a line a kind."""
+    """The most important figures, one line per kind."""
     loop = content.get("loop", {})
     trips = [
         (f"{tables.micro(r['p50_us'])} µs", _beside(r))
