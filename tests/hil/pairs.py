@@ -31,7 +31,7 @@ Touch = Callable[[Side, Link], Link]
 
 @dataclass
 class Pair:
-    """What a run in two threads left.
+    """The results of a run in two threads.
 
     Attributes:
         signals, timing: as in signals.npz and timing.npz.
@@ -63,7 +63,7 @@ def run_pair(
     touch: Touch = lambda side, link: link,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Pair:
-    """Run a scenario over a link of its own; ``touch`` may wrap an end after the handshake."""
+    """Run a scenario over a new link; ``touch`` may wrap an end after the handshake."""
     folder.mkdir(parents=True, exist_ok=True)
     endpoint = link_kind(link).fresh(folder)
     benches = {side: make_bench(scenario) for side in SIDES}
