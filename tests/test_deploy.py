@@ -21,6 +21,8 @@ from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.scenario.model import Link
 from gfm_hil.scenario.toml_out import toml_text
 
+pytestmark = pytest.mark.processes
+
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 ROOT = DEPLOY.parent
 COMPOSE, CONTAINERFILE = (DEPLOY / "container" / n for n in ("compose.yaml", "Containerfile"))

@@ -12,6 +12,8 @@ import pytest
 from gfm_hil.realtime import prevent_idle as awake
 from gfm_hil.realtime.prevent_idle import kept_awake
 
+pytestmark = pytest.mark.processes
+
 HERE = sorted(os.sched_getaffinity(0))[0]
 _IDLE = 5  # SCHED_IDLE
 

@@ -23,6 +23,8 @@ from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
 
+pytestmark = pytest.mark.processes
+
 KEYS = {
     "link", "peer", "code", "mode", "load", "policy", "payload", "n", "ratio_to_baseline_p50",
     "p50_us", "p90_us", "p99_us", "p99_9_us", "p99_99_us", "max_us",

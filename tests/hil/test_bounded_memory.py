@@ -18,6 +18,8 @@ import zmq
 from gfm_hil.links.base import LONGEST
 from gfm_hil.telemetry import blocks
 
+pytestmark = pytest.mark.processes
+
 BIG = 50_000_000  # bytes
 LOOSE_KB = 20_000  # far less than one big message
 PATIENCE_S = 60

@@ -38,6 +38,8 @@ from gfm_runtime.signals import Group, names
 from .can_reference import quantised_run
 from .test_links import in_threads
 
+pytestmark = pytest.mark.processes
+
 KIND = link_kind("can")
 PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
 RIG = {

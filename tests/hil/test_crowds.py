@@ -26,6 +26,8 @@ from gfm_hil.operator import Operator
 from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, at, wait_for
 from .scope_pages import addresses, mute
 
+pytestmark = pytest.mark.processes
+
 PAGES, CONNECTIONS, DESCRIPTORS = 200, 2000, 1024
 TURN_S = 5.0
 LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "roll", "span": 2.0}

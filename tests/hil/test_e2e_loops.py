@@ -35,6 +35,8 @@ from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 from .test_e2e import FAR, HOLD, REALTIME, T_NS, Forger
 from .test_faults import LINKS
 
+pytestmark = pytest.mark.processes
+
 BAD = np.array([0.9, 1.05, 0.8])  # a u that no honest frame of these tests carries
 GROUPS: dict[Side, Group] = {"plant": "u", "controller": "y"}  # what each side hears
 OTHER: dict[Side, Side] = {"plant": "controller", "controller": "plant"}

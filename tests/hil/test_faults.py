@@ -16,6 +16,8 @@ from gfm_hil.scenario.model import check_scenario
 
 from .pairs import PATIENT, Pair, run_pair
 
+pytestmark = pytest.mark.processes
+
 TICKS, MANY = 2_000, 100_000
 LINKS: dict[str, tuple[str, dict[str, Any]]] = {
     "shm": ("shm", {}),

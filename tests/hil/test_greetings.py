@@ -24,6 +24,8 @@ from gfm_runtime.signals import NY
 from .test_links import PATIENT
 from .test_shm import endpoint as shm_endpoint
 
+pytestmark = pytest.mark.processes
+
 __all__ = ["shm_endpoint"]
 
 SHORT = {**PATIENT, "start_timeout_s": 0.8}

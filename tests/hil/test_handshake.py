@@ -24,6 +24,8 @@ from gfm_runtime.signals import NU, NY
 from .pairs import run_pair
 from .test_links import PATIENT, in_threads
 
+pytestmark = pytest.mark.processes
+
 
 def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
     """Shake hands with a scenario each."""

@@ -25,6 +25,8 @@ from gfm_hil.core.roles import SIDES
 
 from .test_processes import end, has_run, sides_of, signals, summary, wait_for, write
 
+pytestmark = pytest.mark.systems
+
 ROUNDS = int(os.environ.get("GFMHIL_KILLS", "5"))
 SEED = int(os.environ.get("GFMHIL_KILLS_SEED", "4"))
 REPORT = os.environ.get("GFMHIL_KILLS_REPORT")

@@ -8,6 +8,8 @@ import pytest
 from .pairs import run_pair
 from .test_loops import PATIENT, PORTS
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.mark.parametrize("link", PORTS)
 @pytest.mark.parametrize("samples", [0, 1])

@@ -34,6 +34,8 @@ from .pairs import PATIENT, run_pair
 from .test_frames import resealed
 from .test_links import RIG, assert_same
 
+pytestmark = pytest.mark.processes
+
 PORTS = ("shm", "zmq")
 
 

@@ -24,6 +24,8 @@ from gfm_hil.operator import Operator
 
 from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Iterator[Path]:

@@ -16,6 +16,8 @@ from gfm_hil.modbus.image import VENDOR
 
 from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
 
+pytestmark = pytest.mark.processes
+
 
 def test_a_folder_without_a_run(tmp_path):
     done = subprocess.run([*GFMHIL, "modbus", str(tmp_path)], capture_output=True, text=True)

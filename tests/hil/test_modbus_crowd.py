@@ -25,6 +25,8 @@ from gfm_hil.modbus.serve import Address
 from .modbus_parts import SUNS
 from .test_modbus_device import Bench
 
+pytestmark = pytest.mark.processes
+
 PATIENCE_S = 60.0
 READ = struct.pack(">BHH", 3, SUNS, 2)
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]

@@ -17,6 +17,8 @@ from gfm_hil.engine.announcement import present
 from gfm_hil.operator import Operator
 from gfm_hil.recording.log import read_log
 
+pytestmark = pytest.mark.processes
+
 SCENARIO = """
 title = "told"
 duration = 600.0

@@ -23,6 +23,8 @@ from gfm_hil.recording.log import read_log
 from gfm_hil.scenario.events import Reference
 from gfm_hil.scope.record import open_record
 
+pytestmark = pytest.mark.processes
+
 
 class Ends:
     """A command server with a timeline that carries out at once, and no loop."""

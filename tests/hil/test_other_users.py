@@ -26,6 +26,8 @@ from gfm_hil.recording import parts as recording
 
 from .test_shm import header
 
+pytestmark = pytest.mark.processes
+
 OTHER = 65534  # nobody
 SECRET = b"readable by its owner alone"
 PATIENCE_S = 60

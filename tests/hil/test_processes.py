@@ -18,6 +18,8 @@ from gfm_hil.core.roles import SIDES
 from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.toml_out import toml_text
 
+pytestmark = pytest.mark.processes
+
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
 PATIENCE_S = 90.0
 

@@ -37,6 +37,8 @@ from gfm_hil.scope.record import open_record
 
 from .test_processes import has_run, sides_of, signals, summary, wait_for, write
 
+pytestmark = pytest.mark.processes
+
 EVENTS = [
     {"type": "reference", "t": 0.02, "P_ref": 0.6},
     {"type": "law", "t": 0.05, "law": "vsg-2"},

@@ -12,6 +12,7 @@ from websockets.sync.client import connect
 from .scope_pages import HAS_BROWSER, Browser, Rig, rig, wait_for
 
 pytestmark = [
+    pytest.mark.systems,
     pytest.mark.apt,
     pytest.mark.full,
     pytest.mark.timeout(300),

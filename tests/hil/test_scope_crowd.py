@@ -22,6 +22,8 @@ from gfm_hil.scope.view import View
 
 from .scope_pages import Rig, mute, rig, serving, wait_for
 
+pytestmark = pytest.mark.processes
+
 LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "held", "span": 0.1}
 
 

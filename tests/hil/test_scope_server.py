@@ -27,6 +27,8 @@ from gfm_hil.scope.view import HEAD
 
 from .scope_pages import addresses, serving
 
+pytestmark = pytest.mark.processes
+
 LOOK = {"kind": "look", "id": 1, "channels": ["p", "omega_u"], "bins": 50, "mode": "held"}
 
 

@@ -13,6 +13,8 @@ import pytest
 from gfm_hil.core import temporary as scratch
 from gfm_hil.recording import parts as recording
 
+pytestmark = pytest.mark.processes
+
 HOLD = """
 import sys, time
 from pathlib import Path

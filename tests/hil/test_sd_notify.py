@@ -17,6 +17,8 @@ import pytest
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.scenario.toml_out import toml_text
 
+pytestmark = pytest.mark.processes
+
 PATIENCE_S = 90.0
 
 

@@ -14,6 +14,8 @@ from gfm_hil.links.shm.link import ShmLink
 
 from .test_shm import endpoint, segment_of
 
+pytestmark = pytest.mark.processes
+
 __all__ = ["endpoint"]
 
 Peer = Callable[..., "subprocess.Popen[str]"]

@@ -32,6 +32,8 @@ from .soak_parts import MB, Clients, Sampler, ports_in
 from .test_kill import places
 from .test_processes import PATIENCE_S, has_run, sides_of, signals, summary, wait_for
 
+pytestmark = pytest.mark.systems
+
 SOAK_S = float(os.environ.get("GFMHIL_SOAK_S", "0"))
 CSV = os.environ.get("GFMHIL_SOAK_CSV")
 FAULTS = """

@@ -10,6 +10,8 @@ import pytest
 
 from gfm_hil.core.stopping import Interrupt
 
+pytestmark = pytest.mark.processes
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -26,6 +26,8 @@ from gfm_hil.telemetry.follow import Follower, Rows
 from gfm_hil.telemetry.publish import Ports, Publisher
 from gfm_hil.telemetry.samples import Sampler
 
+pytestmark = pytest.mark.processes
+
 SCENARIO = """
 title = "sent on"
 duration = 600.0

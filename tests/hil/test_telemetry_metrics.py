@@ -19,6 +19,8 @@ from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics
 
+pytestmark = pytest.mark.processes
+
 PATIENCE_S = 100.0
 SCENARIO = """
 title = "collected"

@@ -16,6 +16,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.checks import Window, damped, envelope, overshoot, read_envelope, settles
 
+pytestmark = pytest.mark.processes
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CONTROLLER = EXAMPLES / "own_controller" / "controller.py"
 

@@ -22,6 +22,8 @@ from gfm_hil.links.zeromq.options import ZmqOptions, beyond_loopback
 from .test_links import PATIENT, assert_same, both_sides, in_threads
 from .test_zmq_port import deliver
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def tcp() -> str:
