@@ -1,4 +1,4 @@
-"""What a scenario expects of its end: status, reason and time, each of which can fail alone."""
+"""A scenario's expected end: status, reason and time; each can fail alone."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_terminal_summary_report_and_exit_code_agree(expected, part, make, tmp_p
 @pytest.mark.parametrize(("after", "met"), [(0.05, True), (0.08, False)])
 def test_a_run_that_waits_is_judged_by_its_last_trip(run, after, met):
     done = run(**TRIP, after_trip="wait", expect_reason="over-current", expect_after=after)
-    assert done.summary["ticks"] == 1000  # it waited to its end, which is not the time that counts
+    assert done.summary["ticks"] == 1000  # it waited to its end; the trip's time counts
     assert (not done.summary["unmet"]) is met
 
 

@@ -1,4 +1,4 @@
-"""Runs as files of other tools, read again by those tools' own libraries."""
+"""Runs exported to files of other tools, read back by those tools' libraries."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EVENTS = [
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory) -> RunTable:
-    """A run between two processes, so that there are times; its operator did something, too."""
+    """A run of two processes, so that it has times; with a command of an operator."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     content = {"title": "to be exported", "duration": 0.05, "link": {"type": "shm"}}
     run_scenario(check_scenario({**content, "events": EVENTS}, "test"), folder, figures=False)

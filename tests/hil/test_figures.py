@@ -1,4 +1,4 @@
-"""Figures of recordings that are whole, cut short, or lack a side."""
+"""Figures of recordings that are complete, cut short, or lack a side."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 
 
 
 def recording(ticks: int) -> dict[str, np.ndarray]:
-    """Signals with an oscillation, as a plant and a controller record them."""
+    """Signals with an oscillation, in the form that plant and controller record."""
     t = np.arange(ticks) * 1e-4
     names = ("p", "q", "omega_u", "omega_g", "V", "v_dc", "i")
     wave = 1 + 0.1 * np.sin(2 * np.pi * 50 * t)

@@ -1,4 +1,4 @@
-"""gfmhil design league: rows, tables, law files, going on, what it refuses."""
+"""gfmhil design league: rows, tables, law files, resuming, errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_rows(folder: Path) -> None:
     vsg, droop = json.loads((folder / "league.json").read_text())["laws"]
-    assert (vsg["law"], droop["law"]) == ("vsg-2", "droop-1")  # by gamma, none last
+    assert (vsg["law"], droop["law"]) == ("vsg-2", "droop-1")  # sorted by gamma, None last
     assert vsg["gamma"] == pytest.approx(15.973, rel=1e-3)
     assert {(c["i"], c["j"]) for c in vsg["channels"]} >= {(1, 1), (4, 1)}
     assert set(vsg["free"]) == {"k_22", "k_34"}
@@ -78,7 +78,7 @@ def test_an_experiment_measures_the_bench() -> None:
 
 
 def test_an_experiment_that_ends_early() -> None:
-    run = experiment("late", "mimo-gfm")  # the printed gains do not hold one sample late
+    run = experiment("late", "mimo-gfm")  # unstable with one sample of delay
     assert run["status"] == "tripped"
     assert 0.0 < run["end_s"] < 4.5
     assert "overshoot_pct" not in run

@@ -1,4 +1,4 @@
-"""Scenario files: what ships loads, what is written is read back, what is wrong is one line."""
+"""Scenario files: shipped ones load, written ones are read back, a mistake gives one line."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_every_mistake_is_named_at_once():
 
 
 def gfmhil(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
+    """Run the command in a separate process."""
     return subprocess.run(
         [sys.executable, "-m", "gfm_hil", *arguments], capture_output=True, text=True
     )
