@@ -1,4 +1,4 @@
-"""One law of the league: its search, the mode in its way, what its sampled loop stands."""
+"""One law of the league: its search, its limiting mode, the margins of its sampled loop."""
 
 from __future__ import annotations
 
