@@ -30,7 +30,7 @@ def events(count: int) -> list[dict[str, object]]:
 def test_a_run_of_any_length_is_drawn_without_a_warning(ticks, make, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", ResourceWarning)  # of what another test has left
+        warnings.simplefilter("ignore", ResourceWarning)  # from another test
         pictures = draw_run(tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)})
     assert [p.name for p in pictures] == ["signals.png"]
     assert pictures[0].stat().st_size > 20_000
@@ -42,7 +42,7 @@ def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):
         signals[name][30_000:] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", ResourceWarning)  # of what another test has left
+        warnings.simplefilter("ignore", ResourceWarning)  # from another test
         draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []})
 
 

@@ -206,7 +206,7 @@ def test_set_points_that_follow_a_reference() -> None:
     before = running("vsg-2", seed=5)
     after, _, bump = change(before, DISCRETE["matching-1"], ref, ref)
     assert bump <= 1e-12
-    # all errors are 0, so that row 3's integrator holds what E_u is away from E_0
+    # all errors are 0, so that row 3's integrator holds the difference of E_u and E_0
     E_u = after.step(ref, ref)[2]
     np.testing.assert_allclose(u_0(LAWS["matching-1"], ref), [0.8, 1.0, 1.02])
     assert after.state["x"][0, 0] == pytest.approx(E_u - 1.02, abs=1e-12)
