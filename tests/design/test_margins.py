@@ -115,7 +115,7 @@ def test_agrees_with_python_control() -> None:
     assert 2 * np.pi * m.phase_hz == pytest.approx(w_p, rel=1e-4)
     omega = np.linspace(0.01, np.pi / T, 20_000)
     assert m.disk == pytest.approx(control.disk_margins(L, omega, 0.0)[0], rel=1e-4)
-    # far below the sampling rate, the exact held delay is what the phase says
+    # far below the sampling rate, the exact held delay equals that from the phase margin
     assert delay_at_u(loop, 2).seconds == pytest.approx(np.radians(pm) / w_p, rel=0.01)
     assert delay_at_y(loop, 4).seconds == pytest.approx(delay_at_u(loop, 2).seconds, rel=1e-5)
 

@@ -1,6 +1,6 @@
-"""A peer that packs good CRCs and wrong content: no link's loop stays alive by it or acts on it.
+"""A peer that sends good CRCs and wrong content: no loop, on any link, stays alive or acts on it.
 
-One side runs its real loop; the other side is played by a peer that lies.
+One side runs its real loop; a lying peer plays the other side.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ by_link = pytest.mark.parametrize("link", LINKS)
 
 
 class Liar:
-    """The other side's end of the link, and what it heard: time, tick, state and reason."""
+    """The other side's end of the link, and its received frames: time, tick, state, reason."""
 
     def __init__(self, link: Link, side: Side) -> None:
         self._link, self.over = link, threading.Event()
@@ -63,7 +63,7 @@ class Liar:
             self.listen()  # ZeroMQ has no room before the other side has connected
 
     def listen(self) -> None:
-        """Take in what has come."""
+        """Read the received frames."""
         unused = np.zeros(len(names(self.reader.group)))
         while (message := self._link.receive()) is not None:
             self.reader.unpack(message, unused)
@@ -71,7 +71,7 @@ class Liar:
             self.heard.append((time.monotonic_ns(), r.tick, r.state, r.reason))
 
     def keep_saying(self, tick: int, pause_s: float = 0.0005) -> None:
-        """The same tick under new sequence numbers, until the other side has ended."""
+        """Send the same tick under new sequence numbers until the other side has ended."""
         give_up = time.monotonic() + LIMIT_S
         while not self.over.wait(pause_s) and time.monotonic() < give_up:
             self.say(tick)
@@ -86,7 +86,7 @@ class Liar:
 
 @dataclass
 class Found:
-    """What the side that was lied to left."""
+    """The results of the side under test."""
 
     reader: FrameReader
     part: Part
@@ -103,7 +103,7 @@ class Found:
 def lied_to(
     side: Side, scenario: Scenario, folder: Path, link: str, lie: Callable[[Liar], None]
 ) -> Found:
-    """Run one side over one of ``LINKS`` against a peer that does what ``lie`` says."""
+    """Run one side over one of ``LINKS`` against a peer that runs ``lie``."""
     name, options = LINKS[link]
     endpoint = link_kind(name).fresh(folder)
     bench, part = make_bench(scenario), Part.create(folder, side, scenario.ticks)
@@ -225,7 +225,7 @@ def test_u_of_another_time_never_acts(link, make, place, attack_now):
     u = found.part.signals[: found.part.progress[0], 5 : 5 + NU]
     assert not np.isclose(u, BAD, atol=1e-3).all(axis=1).any()
     assert found.end[:2] == ("safe", NO_FRESH_U)
-    if link == "shm":  # there all frames have arrived before the first tick ends
+    if link == "shm":  # all frames arrive before the first tick ends
         assert found.refused == {"tick": 4}
     attack_now(f"{link}: none acts in {len(u)} ticks; refused: {found.refused.get('tick', 0)}")
 

@@ -1,4 +1,4 @@
-"""Runs as files of other tools, read again by those tools' own libraries."""
+"""Runs exported to files of other tools, read back by those tools' libraries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server beside runs that begin and end, and where there is none to serve."""
+"""The server beside runs that begin and end, and without a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two real processes: they start, meet, run, and end together however one of them is ended."""
+"""Two real processes: they start, connect, run, and end together, however one of them ends."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATIENCE_S = 90.0
 
 
 def write(folder: Path, **content: Any) -> str:
-    """A scenario file in ``folder``; returns its path."""
+    """Write a scenario file to ``folder``; returns its path."""
     path = folder / "scenario.toml"
     path.write_text(toml_text({"title": "test", "duration": 0.1, **content}))
     return str(path)
@@ -39,7 +39,7 @@ def free_endpoint() -> str:
 
 
 def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
-    """Poll until ``what()`` is true; give up when the process has ended or patience has."""
+    """Poll until ``what()`` is true; fail if the process ends or the timeout expires."""
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         found = what()
@@ -51,7 +51,7 @@ def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
 
 
 def has_run(folder: Path, ticks: int) -> bool:
-    """The plant has recorded that many ticks."""
+    """Whether the plant has recorded that many ticks."""
     part = Part.open(folder, "plant")
     return part is not None and int(part.progress[0]) >= ticks
 
@@ -90,7 +90,7 @@ def signals(folder: Path) -> dict[str, np.ndarray]:
 
 
 def assert_same(one: Path, other: Path) -> None:
-    """Two runs recorded the same, bit for bit."""
+    """Check that two runs recorded the same, bit by bit."""
     a, b = signals(one), signals(other)
     assert set(a) == set(b)
     for name in a:
@@ -168,7 +168,7 @@ def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
 
 
 def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
-    """At rest, so that no lateness of a loaded machine can make the plant do anything."""
+    """In a steady state, so that late frames on a loaded machine do not change the signals."""
     scenario = write(
         tmp_path,
         law="vsg-2",
@@ -185,7 +185,7 @@ def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
     with np.load(tmp_path / "run" / "timing.npz") as file:
         timing = dict(file)
     due, sent, received = (timing[f"plant_{n}"] for n in ("scheduled", "sent", "received"))
-    assert (np.diff(due) == 100_000).all()  # absolute deadlines: no drift whatever happened
+    assert (np.diff(due) == 100_000).all()  # absolute deadlines: no drift
     assert (timing["plant_woke"] >= due).all()
     there = received >= 0
     assert found["misses"] == (~there).sum()

@@ -1,4 +1,4 @@
-"""Run folders after kills and full disks: whole, or made whole by ``gfmhil recover``."""
+"""Run folders after kills and full disks: complete, or completed by ``gfmhil recover``."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def names(folder: Path) -> set[str]:
 
 
 def same_run(one: Path, other: Path) -> None:
-    """Two folders hold the same, but for how long the run took."""
+    """Check that two folders hold the same, except for the run's duration."""
     a, b = signals(one), signals(other)
     assert list(a) == list(b)
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)
@@ -73,7 +73,7 @@ def same_run(one: Path, other: Path) -> None:
 
 @pytest.fixture
 def left(make, tmp_path, monkeypatch):
-    """A folder as a run leaves it before ``finish``, and the arguments of that."""
+    """A run folder before ``finish``, and the arguments of ``finish``."""
     found = []
 
     def stop(scenario, folder, laws, wall_s, figures, outside):
@@ -143,18 +143,18 @@ def test_a_kill_between_any_two_files_is_recovered(left, tmp_path, attack_now):
         shutil.copytree(folder, place)
         killed = finish_killed_at(count, scenario, place, rest)
         present = {n for n in ("signals.npz", "timing.npz") if (place / n).exists()}
-        for name in present:  # never half a file under its name
+        for name in present:  # never an incomplete file under its name
             with np.load(place / name) as file:
                 assert all(file[n] is not None for n in file.files)
         recover(place)
         same_run(place, whole)
-        assert names(place) in (WHOLE, DRAWN)  # drawn if it was killed before it said how it ended
+        assert names(place) in (WHOLE, DRAWN)  # DRAWN if killed before it stored its end
     assert count > 15
     attack_now(f"recovered after a kill at each of {count - 1} places, bit for bit the same")
 
 
 def finish_killed_at(number: int, scenario, folder: Path, rest) -> bool:
-    """Finish a folder in a process that kills itself before the n-th renaming or removal."""
+    """Finish a folder in a process that kills itself before the n-th rename or removal."""
     child = os.fork()
     if child == 0:
         count = 0
@@ -266,7 +266,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
 
 
 def fill(place: Path) -> Path:
-    """Take all the room that is left."""
+    """Fill the remaining space."""
     with (place / "ballast").open("wb", buffering=0) as file:
         try:
             while True:
@@ -361,7 +361,7 @@ def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, att
         run = run_scenario(make(duration=ticks * 1e-4, events=events), tmp_path / "run")
     starts = [e["tick"] for e in run.summary["events"]]
     assert len(starts) == 8000 and starts == sorted(starts)
-    assert read < 40 * ticks  # every column a few times, however many events there are
+    assert read < 40 * ticks  # every column a few times, for any number of events
     assert 20 < len(labels) <= 40
     attack_now(f"each row is read {read / ticks:.0f} times in all; {len(labels)} labels are drawn")
 
@@ -391,7 +391,7 @@ def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeyp
 
 
 def test_finishing_takes_the_memory_of_pieces(make, tmp_path):
-    """Of 20 s, whose columns take 45 MB."""
+    """A run of 20 s, whose columns take 45 MB."""
     scenario = make(duration=20.0)
     tracemalloc.start()
     try:

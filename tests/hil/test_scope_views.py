@@ -1,4 +1,4 @@
-"""What a scope shows of a recording: no peak is lost, whatever the window; the trigger's edge."""
+"""A scope's view of a recording: no window loses a peak; the trigger's edge."""
 
 from __future__ import annotations
 

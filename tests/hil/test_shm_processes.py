@@ -1,4 +1,4 @@
-"""The shared-memory link between processes: nothing torn, and what a killed one leaves."""
+"""The shared-memory link between processes: no torn message, and the rests of killed processes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Peer = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def peer(endpoint: str) -> Iterator[Peer]:
-    """Start a side as a process, and wait until it has opened its end."""
+    """Start a side as a process and wait until it has opened its end."""
     started = []
 
     def call(side: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:

@@ -1,4 +1,4 @@
-"""Signals become a flag while a run lasts, and are what they were before and after."""
+"""Signals set a flag during a run, and the handlers are restored after it."""
 
 from __future__ import annotations
 
