@@ -341,6 +341,8 @@ def test_a_certificate_is_asked_of_every_client(run, tmp_path):
         assert known.models[1][0].Mn.value == "gfmhil"
         write(known, 704, WSetEna=1, WSet=2200)
         wait_for(lambda: last(run)["ref_P_ref"] == 0.55)
+        # the loop records the reference before the log has the line
+        wait_for(lambda: told(run) and "certificate" in told(run)[-1]["operator"])
         assert "commonName=Ada" in told(run)[-1]["operator"]["certificate"]
         write(known, 704, WSetEna=0)
         known.close()
