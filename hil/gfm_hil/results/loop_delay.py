@@ -1,9 +1,9 @@
 """The delay that a run measured, and whether a law's delay margin covers it.
 
 u[k] acts on the emulated plant at its set delay after the tick that sampled y[k]. A u[k] that has
-not arrived by the next tick is a miss: the plant goes on with the newest u it has, so what acts is
-older by the ticks since then. That is what eats into the margin. The time from y[k] sent to u[k]
-received says how near the misses are.
+not arrived by the next tick is a miss: the plant holds the last u, which is older by the ticks
+since then. This additional delay uses up the margin. The time from y[k] sent to u[k]
+received shows how close a run is to misses.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def check_run(folder: Path) -> None:
 
 
 def read_loop_delay(folder: Path, set_s: float, T_s: float, margin_s: float) -> LoopDelay:
-    """What a run folder says, beside a margin; all arguments in s.
+    """The delays of a run folder, to compare with a margin; all arguments in s.
 
     Raises:
         UserError: a file cannot be read or lacks the plant's times.
