@@ -113,14 +113,12 @@ def test_gamma_gains_and_margins_of_a_law():
     softer = law.with_gains("softer", k_34=1.0)
     assert softer.gains["k_35"] == pytest.approx(20.0)  # tied: k_34 / D_q
     assert law.with_gains(k_34=1.0, k_35=3.0).gains["k_35"] == 3.0
-    found = gfmhil.design.tune(softer, "mine", evaluations=120, starts=1, seed=4)
+    found = gfmhil.design.tune(softer, "mine", evaluations=24, starts=1, seed=4)
     assert found.law.name == "mine" and found.gains == {n: found.law.gains[n] for n in found.gains}
     assert found.gamma.value < gfmhil.design.gamma(softer).value
     assert gfmhil.design.gamma(found.law).value == pytest.approx(found.gamma.value, rel=1e-6)
     with pytest.raises(gfmhil.design.UnstableLoop, match="the mode at 49"):
         gfmhil.design.margins(law, "rig_pref_step")
-    margins = gfmhil.design.margins("droop-5", "pref_step")
-    assert margins.loop.delay.seconds == pytest.approx(1014e-6, rel=1e-3)  # docs/margins.md
 
 
 def test_tables_of_other_libraries():

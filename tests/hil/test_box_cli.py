@@ -1,4 +1,4 @@
-"""gfmhil design box and deploy: what they print, write and refuse."""
+"""gfmhil design box and deploy: their output, files and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""bench.html: a result in one file that needs nothing else."""
+"""bench.html: a result as one self-contained file."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _badge(environment: dict[str, Any]) -> str:
 
 
 def _cards(content: dict[str, Any]) -> str:
-    """The figures that most people look for, a line a kind."""
+    """The most important figures, one line per kind."""
     loop = content.get("loop", {})
     trips = [
         (f"{tables.micro(r['p50_us'])} µs", _compared(r))

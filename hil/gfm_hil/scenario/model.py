@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from collections.abc import Mapping
@@ -293,12 +294,14 @@ def shipped_scenarios() -> list[str]:
 
 
 def load_scenario(
-    name: str, options: Mapping[str, str] = MappingProxyType({}), **changed: Any
+    given: str | Path | Scenario | dict[str, Any],
+    options: Mapping[str, str] = MappingProxyType({}),
+    **changed: Any,
 ) -> Scenario:
     """Read, override and check a scenario, its laws and its plant.
 
     Args:
-        name: path or shipped name.
+        given: path or shipped name; content of a file; or a checked scenario.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
             None leaves the file's value. A link other than the file's drops the file's endpoint
             and options.
@@ -308,11 +311,17 @@ def load_scenario(
     Raises:
         UserError: one line per mistake, each with its path, the value and what is allowed.
     """
-    path = find_scenario(name)
-    try:
-        content = read_toml(path)
-    except ValueError as problem:
-        raise UserError(f"{path}: {problem}") from None
+    where, content = "scenario", {}
+    if isinstance(given, str | Path):
+        where = str(find_scenario(str(given)))
+        try:
+            content = read_toml(where)
+        except ValueError as problem:
+            raise UserError(f"{where}: {problem}") from None
+    elif isinstance(given, Scenario):
+        content = given.model_dump(mode="json", exclude_none=True)
+    else:
+        content = copy.deepcopy(given)
     link, chosen = content.get("link"), changed.get("link__type")
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
         link.pop("endpoint", None)  # they belong to the file's link
@@ -330,7 +339,7 @@ def load_scenario(
         for key, value in changed.items()
         if value is not None
     }
-    return check_scenario(content, str(path), overrides)
+    return check_scenario(content, where, overrides)
 
 
 def check_scenario(

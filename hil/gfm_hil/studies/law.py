@@ -162,7 +162,7 @@ class Law:
         from gfm_hil.studies.loop import Loop
 
         if isinstance(on, str | Path):
-            on = load_scenario(str(on))
+            on = load_scenario(on)
         if isinstance(on, Scenario):
             more = {"references": on.references.vector(), "T_s": on.T_s, **more}
             on = on.plant

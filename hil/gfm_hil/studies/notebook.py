@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
-from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
+from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import Here, execute, processes
 from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
@@ -48,7 +48,8 @@ def run(
     with _law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
-        return run_in_memory(_scenario(scenario, changes))
+        here = {"mode": "lockstep", "link__type": "inproc", **changes}
+        return run_in_memory(load_scenario(scenario, **here))
 
 
 @contextmanager
@@ -62,28 +63,6 @@ def _law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
             else:
                 files[str(law)] = str(law)
         yield files
-
-
-def _scenario(given: str | Path | Scenario | dict[str, Any], changes: dict[str, Any]) -> Scenario:
-    here = {"mode": "lockstep", "link__type": "inproc", **changes}
-    if isinstance(given, str | Path):
-        return load_scenario(str(given), **here)
-    content = given if isinstance(given, dict) else given.model_dump(mode="json", exclude_none=True)
-    return check_scenario(_changed(content, here), "scenario")
-
-
-def _changed(content: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """A copy with keys changed by their path."""
-    found = dict(content)
-    for key, value in changes.items():
-        first, _, rest = key.partition("__")
-        inner = found.get(first, {})
-        if rest and not isinstance(inner, dict):
-            raise UserError(f"{key}: {first} is no table")
-        found[first] = _changed(inner, {rest: value}) if rest else value
-    if found.get("link", {}).get("type") == "inproc":
-        found["link"] = {"type": "inproc"}
-    return found
 
 
 @dataclass(frozen=True, repr=False)
