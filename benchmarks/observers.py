@@ -32,9 +32,9 @@ from gfm_hil.benchmark.attribution import CAUSES, attribute
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import pair
-from gfm_hil.core.roles import SIDES
 from gfm_hil.realtime.environment import environment, may_sched_fifo
-from gfm_hil.recording.recorder import CONTROLLER_TIMES, PLANT_TIMES, Part
+from gfm_hil.recording.columns import TIMES_OF
+from gfm_hil.recording.live import LiveRun
 
 T_S = 1e-4  # s
 _SETTLE_S = 0.5  # between two rounds, not counted: clients come and go
@@ -182,13 +182,12 @@ def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing
 
 def _times(folder: Path) -> Timing:
     """What both sides have recorded so far, as in timing.npz."""
-    parts = {side: Part.open(folder, side) for side in SIDES}
-    done = min(int(part.progress[0]) for part in parts.values() if part is not None)
+    run = LiveRun(folder)
+    done = min(run.done(side) for side in run.parts)
     return {
-        f"{side}_{name}": np.array(part.times[:done, k])
-        for side, part in parts.items()
-        if part is not None
-        for k, name in enumerate(PLANT_TIMES if side == "plant" else CONTROLLER_TIMES)
+        f"{side}_{name}": np.array(run.columns[f"{side}_{name}"][:done])
+        for side in run.parts
+        for name in TIMES_OF[side]
     }
 
 

@@ -26,7 +26,7 @@ from websockets.asyncio.client import connect
 from gfm_hil.engine.inproc import compile_loop, run_inproc
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import check_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 

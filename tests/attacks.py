@@ -1,7 +1,7 @@
-"""The table "attack → before → now": each attack is a test, the table is what the tests saw.
+"""The table "attack → before → now": each attack is a test, the table shows their results.
 
-A test names its attack by ``@pytest.mark.attack(item, attack, before)`` and says through the
-fixture ``attack_now`` what it measured::
+A test names its attack by ``@pytest.mark.attack(item, attack, before)`` and reports what it
+measured through the fixture ``attack_now``::
 
     @pytest.mark.attack("1.2", "a plant whose tick stands still", "RUNNING for ever")
     def test_frozen(attack_now): ...
@@ -36,7 +36,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def attack_now(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Say in a few words what the attack comes to now, with the figures this test measured."""
+    """Report in a few words the attack's present effect, with the figures this test measured."""
 
     def say(now: str) -> None:
         request.node.user_properties.append((_NOW, now))

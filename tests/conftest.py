@@ -29,7 +29,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # The first example may compile a kernel, which takes longer than hypothesis' deadline.
 settings.register_profile("gfmhil", deadline=None)
 settings.load_profile("gfmhil")
-# Fuzzing for as long as wanted, see CONTRIBUTING.md. An input that takes that long is a fault.
+# Fuzzing of any length, see CONTRIBUTING.md. An input that exceeds the deadline is a bug.
 settings.register_profile("fuzz", deadline=60_000, max_examples=20_000)
 
 _SYSTEMS = ("apt", "soak", "uml")

@@ -1,4 +1,4 @@
-"""The benchmarks, tried out with hardly any work; no figure is judged."""
+"""The benchmarks, run with minimal work; the tests judge no figure."""
 
 import json
 import subprocess
@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def rows_of(name: str, *words: str) -> Any:
-    """What a benchmark prints with --json."""
+    """The output of a benchmark with --json."""
     done = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{name}", *words, "--json"],
         cwd=ROOT, capture_output=True, text=True, check=False,

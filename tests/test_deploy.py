@@ -1,4 +1,4 @@
-"""What is in deploy/: units, container files, CAN and the tuning script pass their own tools."""
+"""The files in deploy/: units, container files, CAN and the tuning script pass their tools."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.scenario.model import Link
 from gfm_hil.scenario.toml_out import toml_text
 
+pytestmark = pytest.mark.processes
+
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 ROOT = DEPLOY.parent
 COMPOSE, CONTAINERFILE = (DEPLOY / "container" / n for n in ("compose.yaml", "Containerfile"))
@@ -36,7 +38,7 @@ needs_systemd = pytest.mark.skipif(
 
 
 def tool(name: str) -> str:
-    """A program that a package of the extra `test` brings."""
+    """A program from a package of the extra `test`."""
     path = shutil.which(name, path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     if path is None:
         pytest.skip(f"needs {name}")
@@ -52,7 +54,7 @@ def unit(side: str) -> Path:
 
 
 def settings(path: Path, section: str = "Service") -> dict[str, list[str]]:
-    """The settings of a unit's section, each as often as it is there."""
+    """The settings of a unit's section, each with all its values."""
     found: dict[str, list[str]] = {}
     inside = ""
     for line in path.read_text().splitlines():
@@ -65,7 +67,7 @@ def settings(path: Path, section: str = "Service") -> dict[str, list[str]]:
 
 
 def installed(root: Path) -> Path:
-    """The units where a machine would have them, below ``root``."""
+    """Install the units below ``root``, in their places on a machine."""
     units = root / "etc/systemd/system"
     shutil.copytree(SYSTEM_UNITS, root / "usr/lib/systemd/system", symlinks=True)
     shutil.copytree(DEPLOY / "systemd", units)
@@ -78,7 +80,7 @@ def installed(root: Path) -> Path:
 
 
 def verify(root: Path, name: str) -> str:
-    """What systemd finds fault with; its exit code is 0 even for a key that it does not know."""
+    """systemd's complaints; its exit code is 0 even for an unknown key."""
     done = call("systemd-analyze", "verify", "--man=no", f"--root={root}", name)
     return done.stdout + done.stderr
 
@@ -146,7 +148,7 @@ def test_the_operators_services_look_where_the_bench_records():
         bound = relations.get("BindsTo", []) + relations.get("PartOf", [])
         assert bound == relations["After"] == ["gfmhil-bench@%i.service"]
         assert settings(unit(name), "Install")["WantedBy"] == bound
-        assert parser(name).parse_args(words(service)).call  # every option is there
+        assert parser(name).parse_args(words(service)).call  # every option exists
         same = ("User", "RuntimeDirectory", "RuntimeDirectoryPreserve", "StateDirectory")
         assert [service[key] for key in same] == [bench[key] for key in same]
         forbidden = {"MemoryDenyWriteExecute", "PrivateIPC", "DynamicUser", "PrivateNetwork"}
@@ -169,7 +171,7 @@ def test_udev_starts_a_unit_that_there_is():
 
 
 def interpolated(text: str, **values: str) -> str:
-    """As compose does it: ${NAME:-default}."""
+    """Interpolate as compose does: ${NAME:-default}."""
     return re.sub(r"\$\{(\w+):-([^}]*)\}", lambda m: values.get(m[1], m[2]), text)
 
 
@@ -228,7 +230,7 @@ def test_sides_meet_with_the_arguments_keys_and_names_of_the_compose_file(tmp_pa
     services = yaml.safe_load(interpolated(COMPOSE.read_text(), GFMHIL_PORT=port))["services"]
     running = []
     for side in SIDES:
-        mounted = tmp_path / side  # only the keys that the file gives this side
+        mounted = tmp_path / side  # only the keys that the file mounts for this side
         mounted.mkdir()
         for secret in services[side]["secrets"]:
             shutil.copy(keys / secret["source"], mounted / Path(secret["target"]).name)

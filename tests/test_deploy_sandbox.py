@@ -1,8 +1,8 @@
-"""The services compile, run and get their real-time rights within what their units leave them.
+"""The services compile, run and get their real-time rights within their units' restrictions.
 
-systemd is not asked to start them: the limits, the lack of capabilities and the filter of system
-calls are taken from the units and set before the command is executed. Where root itself may not
-raise a limit, as in some containers, the capability that is worth the same stands for it.
+The tests do not start them with systemd: they take the limits, the dropped capabilities and the
+filter of system calls from the units and set them before the command is executed. If root itself
+may not raise a limit, as in some containers, they grant the equivalent capability instead.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def calls_of(group: str) -> set[str]:
 
 
 def confine(side: str) -> Callable[[], None]:
-    """What is to be done between fork and exec to have what systemd would leave to this unit."""
+    """A function to call between fork and exec that applies this unit's restrictions."""
     try:
         library = ctypes.CDLL("libseccomp.so.2")
     except OSError:
@@ -98,7 +98,7 @@ def confine(side: str) -> Callable[[], None]:
         rules = ctypes.c_void_p(library.seccomp_init(ERRNO | errno.EPERM))
         for name in permitted:
             number = library.seccomp_syscall_resolve_name(name.encode())
-            if number >= 0:  # one of this architecture
+            if number >= 0:  # exists on this architecture
                 library.seccomp_rule_add(rules, ALLOW, number, 0)
         if library.seccomp_load(rules):
             raise OSError("seccomp_load")
@@ -125,7 +125,7 @@ def test_confinement_is_in_force():
     probe = (
         "import ctypes, re, pathlib;"
         "print(re.search(r'CapEff:\\s*(\\w+)', pathlib.Path('/proc/self/status').read_text())[1]);"
-        "print(ctypes.CDLL(None).ptrace(0, 0, 0, 0))"  # PTRACE_TRACEME, open to everybody
+        "print(ctypes.CDLL(None).ptrace(0, 0, 0, 0))"  # PTRACE_TRACEME, normally allowed
     )
     command = [sys.executable, "-c", probe]
     free, confined = (
@@ -169,7 +169,7 @@ def test_sides_run_in_real_time_within_what_their_units_leave(state):
         "title": "rig",
         "duration": 0.1,
         "mode": "realtime",
-        "late_policy": {"hold": 1_000_000},  # this machine is busy: it is not the lateness we test
+        "late_policy": {"hold": 1_000_000},  # a busy machine is late; that is not tested here
         "link": {
             "type": "zmq",
             "endpoint": f"ipc://{state}/rig",
@@ -213,7 +213,7 @@ def test_the_bench_and_a_stream_beside_it_run_within_what_their_units_leave(stat
     (state / "rig").symlink_to(state / "runs/rig-1")  # as ExecStartPre= does
 
     def begin(service: str, *words: str) -> subprocess.Popen[str]:
-        # systemd watches the process that it started, but hears its children too
+        # systemd watches the process that it started, but accepts its children's messages too
         told = {"NOTIFY_SOCKET": f"{state}/notify", "WATCHDOG_USEC": "5000000", "WATCHDOG_PID": "1"}
         return subprocess.Popen(
             [sys.executable, "-m", "gfm_hil", *words], cwd=state, text=True,
@@ -244,7 +244,7 @@ def test_the_bench_and_a_stream_beside_it_run_within_what_their_units_leave(stat
             subscriber.connect(stream.stdout.readline().split()[1])
             assert subscriber.poll(60_000)
             assert "tick" in json.loads(subscriber.recv_multipart()[1])
-            bench.terminate()  # KillMode=mixed: the sides are for it to stop
+            bench.terminate()  # KillMode=mixed: the bench stops the sides
             _, error = bench.communicate(timeout=300)
             assert (bench.returncode, error) == (130, "")
             _, said = stream.communicate(timeout=60)

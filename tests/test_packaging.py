@@ -1,4 +1,4 @@
-"""The packages: who imports whom, what a wheel holds, what no file may hold."""
+"""The packages: their imports, a wheel's content, and content that no file may have."""
 
 import ast
 import json
@@ -96,7 +96,7 @@ def test_no_machine_paths() -> None:
 
 
 def committed(folder: str) -> set[str]:
-    """The files of a folder that git knows."""
+    """The files of a folder that git tracks."""
     done = subprocess.run(
         ["git", "ls-files", folder], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -127,7 +127,7 @@ def test_deploy_writes_what_is_committed_and_keeps_what_is_there(
 
 
 def pins(name: str) -> dict[str, str]:
-    """Package to the lines that follow it in a lock file; each package once a Python version."""
+    """Package to the lines that follow it in a lock file; each package once per Python version."""
     text = (ROOT / "requirements" / name).read_text(encoding="utf-8")
     return {k + rest.split("\n")[0]: rest for k, rest in re.findall(LOCKED, text)}
 

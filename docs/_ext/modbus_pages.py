@@ -6,7 +6,7 @@ from gfm_hil.modbus.device import Device
 from gfm_hil.modbus.gains import Gains
 from gfm_hil.modbus.image import Point, definition
 from gfm_hil.modbus.view import Slack, View
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import load_scenario
 from gfm_runtime import law_names
 from gfm_runtime.states import RUNNING

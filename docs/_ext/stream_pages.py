@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from gfm_hil.recording.columns import TABLE
 from gfm_hil.results.export import FORMATS
-from gfm_hil.results.export.columns import all_columns, describe
 from gfm_hil.telemetry.metrics import METRICS
 
 
@@ -16,10 +16,10 @@ def export_formats() -> str:
 
 def columns() -> str:
     """A row a column of the recording."""
-    rows = ["| column | unit | |", "|---|---|---|"]
-    for name in all_columns():
-        column = describe(name, [])
-        rows.append(f"| `{name}` | {column.unit or '–'} | {column.comment} |")
+    rows = ["| column | symbol | unit | |", "|---|---|---|---|"]
+    for name, row in TABLE.items():
+        symbol = f"${row.symbol}$" if row.symbol else "–"
+        rows.append(f"| `{name}` | {symbol} | {row.unit or '–'} | {row.comment} |")
     return "\n".join(rows)
 
 

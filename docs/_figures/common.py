@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
 from gfm_hil.results.figures import dress as dress
-from gfm_hil.results.runner import Run, run_scenario
+from gfm_hil.results.runner import run_in_memory as run  # noqa: F401
 from gfm_hil.scenario.model import Scenario, check_scenario, find_scenario
 from gfm_plant import Plant
 from gfm_runtime import get_law
@@ -41,12 +40,6 @@ def scenario(name: str, **changed: Any) -> Scenario:
         else:
             place[last] = value
     return check_scenario(content, name)
-
-
-def run(case: Scenario) -> Run:
-    """Run it; only the signals and the summary are kept."""
-    with tempfile.TemporaryDirectory() as place:
-        return run_scenario(case, Path(place) / "run", figures=False)
 
 
 def modes(law: str, plant: dict[str, Any], ideal: bool = False, **gains: float) -> list[Mode]:

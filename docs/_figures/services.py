@@ -49,7 +49,7 @@ def _bench(axes: Axes) -> None:
     _box(axes, (0.3, 0.75), (3.6, 0.6), "recording: every tick, in memory, append only", GREY)
     _arrow(axes, (0.95, 1.7), (0.95, 1.4), _LOOP)
     _arrow(axes, (3.15, 1.7), (3.15, 1.4), _LOOP)
-    _box(axes, (0.3, 2.6), (3.6, 0.45), "desks: commands, checked off the loop", GREY)
+    _box(axes, (0.3, 2.6), (3.6, 0.45), "command servers: check commands off the loop", GREY)
     for x in (0.95, 3.15):
         _arrow(axes, (x, 2.57), (x, 2.39), _WATCH)
     axes.text(0.3, 0.3, "/run/gfmhil/rig → /var/lib/gfmhil/runs/rig-…", fontsize=7.5, color=GREY)

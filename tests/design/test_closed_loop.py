@@ -19,7 +19,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant
 from gfm_plant.model import f, g
@@ -51,7 +51,7 @@ def test_a_law_may_be_a_name_a_law_or_a_discrete_law() -> None:
 
 @pytest.mark.parametrize("law", ["mimo-gfm-deployable", "vsg-2"])
 def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
-    # 1e-4 p.u. of P_ref: what is not linear is of the order of 1e-8
+    # 1e-4 p.u. of P_ref: nonlinear terms are of the order of 1e-8
     size, ticks = 1e-4, 1500
     content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": RIG}
     bench = make_bench(check_scenario(content, "test"))
@@ -218,7 +218,7 @@ def test_many_laws_in_one_loop_are_each_of_them(law: str) -> None:
 
 
 def test_sampling_a_loop_is_discretising_its_law() -> None:
-    # Tustin of the law with its omega_u loop closed, against that of the runtime, closed after it
+    # Tustin of the law with closed omega_u loop, against the runtime, which closes it after Tustin
     ideal, exact = loop("vsg-5", ideal=True), loop("vsg-5", {"delay": {"samples": 1}})
     ours = ideal.sampled(1e-4, 1e-4)
     np.testing.assert_allclose(

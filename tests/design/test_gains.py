@@ -1,4 +1,4 @@
-"""Free gains: what may be asked for, ties, and laws affine in them."""
+"""Free gains: valid choices, ties, and laws affine in them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_law_declares_its_gains(law: str) -> None:
 
 @pytest.mark.parametrize("law", every_law())
 def test_a_law_as_a_function_of_its_gains(law: str) -> None:
-    """Many at once against one by one from the file, by T(s)."""
+    """Many at once against one at a time from the file, by T(s)."""
     gains = free_gains(law_file(law))
     problem = PaperProblem(law_file(law), gains)
     code = Encoding(gains)

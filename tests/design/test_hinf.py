@@ -1,4 +1,4 @@
-"""The H-infinity norm against python-control, dense grids and values worked by hand."""
+"""The H-infinity norm against python-control, dense grids and values computed by hand."""
 
 from __future__ import annotations
 

@@ -14,7 +14,8 @@ from gfm_design.model.linear import Mode, hold, linearise_plant
 from gfm_design.model.operating_point import operating_point
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.recording.recorder import PLANT_COLUMNS, Part
+from gfm_hil.recording.columns import PLANT_COLUMNS
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import Plant, make_plant
 from gfm_plant.model import DELTA, N_X, f, g
@@ -150,7 +151,7 @@ def test_mode_is_what_the_bench_shows(
 @pytest.mark.parametrize(
     ("law", "plant", "ideal", "frequency", "sigma"),
     [
-        # figures worked out before this module, with other programs
+        # figures computed before this module existed, with other programs
         ("vsg-2", {}, True, 3.7, -2.94),
         ("vsg-2", {}, True, 50.2, -3.1),
         ("vsg-2", RIG, False, 49.5, 12.0),
@@ -168,17 +169,17 @@ def test_known_figures(
 
 @pytest.mark.parametrize("law", every_law())
 def test_sampling_fast_leads_to_the_continuous_loop(law: str) -> None:
-    # without delay the hold's half a sample is all that differs: at 1 us 1.1 kHz turns by 0.4 deg
+    # without delay only the hold's half a sample differs: at 1 us it turns 1.1 kHz by 0.4 deg
     home = get_law(law).home_grid
     plant = {"factors": {"L_g": home.L_g, "R_g": home.R_g}, "substeps": 1}
     fast, ideal = modes(law, plant, T_s=1e-6), modes(law, plant, T_s=1e-6, ideal=True)
     assert len(fast) == len(ideal)
     assert fast[0].sigma == pytest.approx(ideal[0].sigma, rel=0.02, abs=0.02)
-    assert fast[0].sigma < 0.0  # what the catalogue promises on each law's home grid
+    assert fast[0].sigma < 0.0  # the catalogue's promise for each law's home grid
 
 
 def test_row_1_is_no_mode_beside_a_regulated_source() -> None:
-    # its integrator would stand open, at z = 1
+    # its integrator would be an open one, at z = 1
     assert max(m.sigma for m in modes("vsg-2", {**REGULATED})) < -0.1
 
 

@@ -29,9 +29,11 @@ from gfm_design.model.linear import LinearLaw, LinearPlant
 from gfm_hil.cli import main
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.recorder import PLANT_COLUMNS, Part
-from gfm_hil.results.loop_delay import read_loop_delay
-from gfm_hil.scenario.model import check_scenario, load_scenario
+from gfm_hil.recording.columns import PLANT_COLUMNS
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.loop_delay import loop_delay
+from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
 from gfm_plant import load_converter
 from gfm_plant.model import DELTA
 
@@ -113,7 +115,7 @@ def test_agrees_with_python_control() -> None:
     assert 2 * np.pi * m.phase_hz == pytest.approx(w_p, rel=1e-4)
     omega = np.linspace(0.01, np.pi / T, 20_000)
     assert m.disk == pytest.approx(control.disk_margins(L, omega, 0.0)[0], rel=1e-4)
-    # far below the sampling rate, the exact held delay is what the phase says
+    # far below the sampling rate, the exact held delay equals that from the phase margin
     assert delay_at_u(loop, 2).seconds == pytest.approx(np.radians(pm) / w_p, rel=0.01)
     assert delay_at_y(loop, 4).seconds == pytest.approx(delay_at_u(loop, 2).seconds, rel=1e-5)
 
@@ -247,14 +249,15 @@ def test_grid_strength_and_region() -> None:
             assert (found < 0.0) == (region.sigma[i, j] < 0.0)
 
 
-def write_run(folder: Path, missed: slice) -> None:
-    """A run folder in real time with some ticks missed, 60 us there and back."""
-    sent = np.arange(1000, dtype=np.int64) * 100_000
-    received = sent + 60_000
+def late_run(missed: slice) -> RecordedRun:
+    """A run in real time with some ticks missed, 60 us there and back."""
+    due = np.arange(1000, dtype=np.int64) * 100_000
+    received = due + 60_000
     received[missed] = -1
-    np.savez(folder / "timing.npz", plant_sent=sent, plant_received=received)
-    (folder / "summary.json").write_text('{"mode": "realtime"}')
-    (folder / "scenario.toml").write_text("")
+    timing = {"plant_scheduled": due, "plant_sent": due, "plant_received": received}
+    scenario = Scenario(title="late", duration=0.1, mode="realtime")
+    columns = {"tick": np.arange(1000)}
+    return RecordedRun(scenario, {"mode": "realtime"}, columns, timing=timing)
 
 
 @pytest.mark.parametrize(
@@ -265,9 +268,8 @@ def write_run(folder: Path, missed: slice) -> None:
         (slice(500, 520), False, "does not fit", 2100.0),
     ],
 )
-def test_measured_delay(missed: slice, fits: bool, word: str, worst: float, tmp_path: Path) -> None:
-    write_run(tmp_path, missed)
-    found = read_loop_delay(tmp_path, 1e-4, 1e-4, 1.5e-3)
+def test_measured_delay(missed: slice, fits: bool, word: str, worst: float) -> None:
+    found = loop_delay(late_run(missed), 1e-4, 1.5e-3)
     assert found.fits(1500.0) is fits
     assert word in found.words(1500.0)
     assert found.acting_us is not None and found.round_trip_us is not None
@@ -312,10 +314,10 @@ def test_unstable_loop_has_no_margins(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command("--run", str(tmp_path / "nothing")) == 2
-    assert "no such folder" in capsys.readouterr().err
+    assert "is not a run folder (signals.npz is missing)" in capsys.readouterr().err
     (tmp_path / "scenario.toml").write_text("")
     assert command("--run", str(tmp_path)) == 2
-    assert "lacks timing.npz, summary.json" in capsys.readouterr().err
+    assert "the run is not over" in capsys.readouterr().err
     assert command("--scenario", "pref_step", "--law", "nobody") == 2
     assert "nobody" in capsys.readouterr().err
 

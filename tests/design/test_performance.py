@@ -22,7 +22,7 @@ def problem(law: str) -> PaperProblem:
 
 @pytest.mark.parametrize(("law", "gamma"), [("mimo-gfm", 2.0209), ("vsg-2", 15.975)])
 def test_printed_gains(law: str, gamma: float) -> None:
-    # worked out before this module with other programs, to four digits
+    # computed before this module existed, with other programs, to four digits
     assert max(c.norm for c in problem(law).channels(NONE)) == pytest.approx(gamma, rel=5e-5)
 
 

@@ -1,4 +1,4 @@
-"""The box of real loops, and the gains that are meant to hold in it."""
+"""The box of real loops, and the gains that must be stable in it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .support import reference_loop
 LAW = "mimo-gfm-deployable"
 CONTROLLED, RIG = Box(dc=("controlled",)), Box(dc=("regulated",))
 RIG_LAW = "mimo-gfm-deployable-rig"
-THIRD = (0.33, 1.0, 3.0)  # resistances that it is tuned for
+THIRD = (0.33, 1.0, 3.0)  # resistances for which it is tuned
 
 
 def gains(law: str = LAW) -> tuple[FreeGain, ...]:
@@ -55,7 +55,7 @@ def delay_margin(law: str, dc: Source = "controlled") -> float:
     ],
 )
 def test_stack_is_the_sampled_loop(point: Point) -> None:
-    """Another program: the law discretised by the runtime, its matrix by support.py."""
+    """An independent computation: the runtime discretises the law, support.py gives the matrix."""
     par, _ = make_plant(point.plant(), T_S)
     # the printed k_35 is k_34/D_q to four digits; a search ties it exactly
     law = discretise(get_law("mimo-gfm", k_35=1.0844 / 0.05), T_S)
@@ -63,7 +63,7 @@ def test_stack_is_the_sampled_loop(point: Point) -> None:
     linear = linearise_law(law.law, law, op, point.references(), point.dc == "controlled")
     loop = reference_loop(par, linearise_plant(par, op), linear)
     expected = np.log(np.abs(np.linalg.eigvals(loop)).max()) / T_S
-    # others beside it, so that it is found again among stacks of several shapes
+    # with other points, so that stacks of several shapes must return it in its place
     found = sigma([Point(delay=3.0), point, Point(L_g=5.0)], "mimo-gfm")
     assert found[1] == pytest.approx(expected, abs=1e-5)
 
@@ -105,7 +105,7 @@ def test_gamma_and_delay_margin() -> None:
 
 def test_every_corner_decays() -> None:
     assert sigma(CONTROLLED.corners()).max() <= -1.0
-    assert sigma(RIG.corners()).max() < 0.0  # holds, but more slowly: see docs/deployable.md
+    assert sigma(RIG.corners()).max() < 0.0  # stable, but slower: see docs/deployable.md
 
 
 def test_random_points_decay() -> None:
@@ -122,14 +122,14 @@ def test_the_rigs_law_holds_beside_its_source() -> None:
     assert max(o for p, o in zip(stepped, beyond, strict=True) if p.L_g <= 3.0) <= 0.05
     assert beyond.max() <= 0.20
     assert delay_margin(RIG_LAW, "regulated") >= 1e-3
-    # what is given for it: gamma, and chokes of a tenth of their resistance
+    # its price: gamma, and chokes of a tenth of their resistance
     rig = paper_problem(law_file(RIG_LAW), gains(RIG_LAW), "regulated")
     assert 1.5 < max(c.norm for c in rig.channels(start(RIG_LAW))) <= 3.6
     assert sigma(RIG.corners(), RIG_LAW).max() > 0.0
 
 
 def test_the_rigs_problem_is_that_of_row_1_in_its_source() -> None:
-    """With a PI alone in row 1, what the source does is what the law would have it do."""
+    """With only a PI in row 1, the source does the same as the law would."""
     only_pi = {"k_pdc": 90.0, "k_idc": 400.0, "k_12": 0.0, "k_14": 0.0, "k_15": 0.0}
     file = law_file("mimo-gfm")
     named = free_gains(file, only_pi)

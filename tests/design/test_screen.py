@@ -1,4 +1,4 @@
-"""The quick look and the polish against the norm with a guarantee."""
+"""The fast estimate and the polish against the guaranteed norm."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ def test_slopes_of_peaks_against_differences() -> None:
 
 @pytest.mark.parametrize("law", ["mimo-gfm", "vsg-12"])
 def test_curvature_of_peaks(law: str) -> None:
-    """A peak moves along the frequency: its model is held against peaks that are looked for."""
+    """A peak moves in frequency: its model is compared with peaks found by search."""
     gains = free_gains(law_file(law))
     problem, code = PaperProblem(law_file(law), gains), Encoding(gains)
 
     def loops(x: np.ndarray) -> StateSpace:
         return problem.loops(code.values(x))
 
-    at = problem.polish(code, code.start)  # where no peak is alone
+    at = problem.polish(code, code.start)  # where several peaks are equal
     found = peaks(loops(at), problem.weights)
     assert found is not None
     nearby = model(loops, problem.weights, at, found)

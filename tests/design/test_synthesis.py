@@ -1,4 +1,4 @@
-"""The search: known optima, the paper's gains, bounds, seeds, and none to be found."""
+"""The search: known optima, the paper's gains, bounds, seeds, and no solution."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("cma")
 
 @dataclass
 class Valley:
-    """Least at a known place, with a kink there; of no use where a > 5."""
+    """A minimum with a kink at a known place; infeasible where a > 5."""
 
     least: tuple[float, ...]
 
@@ -38,7 +38,7 @@ def gains(n: int, start: float = 1.0) -> list[FreeGain]:
     return [FreeGain(f"k_{k}", start, 0.1, 100.0) for k in range(n)]
 
 
-@pytest.mark.parametrize("start", [1.0, 50.0])  # 50: no use at first
+@pytest.mark.parametrize("start", [1.0, 50.0])  # 50: infeasible at first
 @pytest.mark.parametrize("n", [1, 3])
 def test_reaches_a_known_optimum(n: int, start: float) -> None:
     least = (2.0, 30.0, 0.3)[:n]
@@ -92,7 +92,7 @@ def test_unstable_start_is_stabilised_first() -> None:
 
 
 def test_gains_that_move_the_operating_point() -> None:
-    """E_u of droop-4 rests where k_34 puts it: gamma is that of the loop at rest there."""
+    """k_34 sets the equilibrium of E_u of droop-4: gamma is that of the loop at that point."""
     found = paper("droop-4")
     file = law_file("droop-4")
     named = dict(zip([g.name for g in free_gains(file)], found.values.tolist(), strict=True))
@@ -111,7 +111,7 @@ def test_the_reason_when_there_are_none() -> None:
 
 
 def test_gains_that_cannot_move_gamma_are_chosen_for_the_rest() -> None:
-    """droop-2 holds p by V: two channels are 294 at rest whatever its gains."""
+    """droop-2 controls p through V: in steady state two channels are 294 for any gains."""
     file = law_file("droop-2")
     problem = PaperProblem(file, free_gains(file))
     before = problem.channels(np.array([g.start for g in problem.gains]))

@@ -1,4 +1,4 @@
-"""The page's tables are those of the laws that ship."""
+"""The page's tables match the shipped laws."""
 
 from __future__ import annotations
 

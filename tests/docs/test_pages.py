@@ -1,4 +1,4 @@
-"""The pages' examples work, and what they list by hand is what the code has."""
+"""The pages' examples work, and their hand-written lists match the code."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_committed_eigenvalues_are_current(monkeypatch: pytest.MonkeyPatch) -> N
     for name, rows in written.items():
         committed = (DOCS / "tables" / f"{name}.md").read_text(encoding="utf-8").splitlines()[2:]
         assert len(committed) == len(rows)
-        for old, new in zip(committed, rows, strict=True):  # in the last digit they may differ
+        for old, new in zip(committed, rows, strict=True):  # the last digit may differ
             np.testing.assert_allclose(numbers(old), numbers(new), rtol=1e-3, atol=0.02)
 
 
@@ -133,7 +133,7 @@ def test_worked_example_of_a_tuning_says_what_the_page_shows(
     monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
     from _figures import tuning
 
-    # all but tune_box, whose thousand corners are looked at in the tests of that command
+    # all but tune_box, whose thousand corners that command's tests cover
     said = tuning.run_example(tmp_path, ("tune_tune", "tune_run", "tune_margins"))
     for name, what in (
         ("tune_tune", r"γ = ([\d.]+)"),
@@ -143,7 +143,7 @@ def test_worked_example_of_a_tuning_says_what_the_page_shows(
     ):
         committed = (DOCS / "tables" / f"{name}.md").read_text(encoding="utf-8")
         assert "[exit code" not in said[name]
-        # gamma's minimum is flat: other rounding leads to gains that differ in the third digit
+        # gamma's minimum is flat: with other rounding the gains differ in the third digit
         shown = [float(n) for n in re.findall(what, committed)]
         assert shown
         assert [float(n) for n in re.findall(what, said[name])] == pytest.approx(shown, rel=0.02)

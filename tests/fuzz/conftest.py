@@ -1,4 +1,4 @@
-"""One reader for each parser, its corpus, and what every reader has to keep to."""
+"""One reader for each parser, its corpus, and the requirements on every reader."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from hypothesis import strategies as st
 CORPUS = Path(__file__).with_name("corpus")
 #: reads one input
 Take = Callable[[bytes], None]
-MOST_MEMORY = 400e6  # bytes that reading may take on top, whatever is read
+MOST_MEMORY = 400e6  # most additional bytes that reading any input may take
 
 
 @dataclass(frozen=True)
 class Parser:
-    """Something that reads what others wrote.
+    """A parser of foreign input.
 
     Attributes:
         name: its folder in the corpus.
-        open: given an empty folder, what reads one input; it raises nothing that is documented.
+        open: opens it in an empty folder; yields a function that reads one input and catches the
+            documented exceptions.
         inputs: strategy of inputs, made once the parser is open.
     """
 
@@ -36,7 +37,7 @@ class Parser:
 
 @dataclass
 class Reader:
-    """An open parser; ``read`` fails if an input brings up what is not documented."""
+    """An open parser; ``read`` fails if an input raises an undocumented exception."""
 
     parser: Parser = field(repr=False)
     inputs: st.SearchStrategy[bytes] = field(repr=False)
@@ -44,7 +45,7 @@ class Reader:
     kept: Path
 
     def read(self, message: bytes) -> None:
-        """Read an input; one that fails is kept, to be copied into the corpus."""
+        """Read an input; save one that fails, to be copied into the corpus."""
         try:
             self.take(message)
         except Exception as problem:
@@ -55,24 +56,24 @@ class Reader:
             raise
 
     def corpus(self) -> list[Path]:
-        """The inputs that are kept in the repository."""
+        """The inputs in the repository."""
         return sorted((CORPUS / self.parser.name).iterdir())
 
 
 def peak() -> int:
-    """Most memory of this process since ``forget_peak``, bytes."""
+    """Peak memory of this process since ``forget_peak``, bytes."""
     status = Path("/proc/self/status").read_text()
     return 1024 * int(status.partition("VmHWM:")[2].split()[0])
 
 
 def forget_peak() -> None:
-    """Begin to measure the most memory anew, proc_pid_clear_refs(5)."""
+    """Reset the peak memory, proc_pid_clear_refs(5)."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
 @pytest.fixture(scope="module")
 def reader(request: pytest.FixtureRequest) -> Iterator[Reader]:
-    """The parser of the parameter, open; in the end it must not have taken much memory."""
+    """The parser of the parameter, open; checks its memory at the end."""
     parser: Parser = request.param
     kept = Path(os.path.relpath(request.config.rootpath / ".hypothesis" / "failed" / parser.name))
     place = Path(tempfile.mkdtemp(prefix="gfmhil-fuzz-"))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 _WORD = re.compile(r'"(?:\\.|[^"\\\n])*"|[A-Za-z_@][\w.-]*@?|[-+]?\d[\w.+-]*|\s+|.', re.DOTALL)
 _DEPTH = 3000
 
-#: words that parsers stumble over, in TOML or in JSON
+#: words that often break parsers, in TOML or in JSON
 NASTY = (
     *("0", "-1", "1e308", "1e999", "-0.0", "NaN", "nan", "inf", "Infinity", "0x7f", "1_000"),
     *(str(2**31), str(2**63 - 1), str(2**63), str(2**64), "9" * 30, "9" * 400, "9" * 5000),
@@ -47,7 +47,7 @@ NASTY = (
 
 @st.composite
 def texts(draw: st.DrawFn, seeds: Sequence[str], also: Sequence[str] = ()) -> bytes:
-    """A seed in which a few words were replaced, added, left out or exchanged.
+    """A seed in which a few words were replaced, added, removed or swapped.
 
     Args:
         draw: of hypothesis.
@@ -79,12 +79,12 @@ def texts(draw: st.DrawFn, seeds: Sequence[str], also: Sequence[str] = ()) -> by
 
 @st.composite
 def blobs(draw: st.DrawFn, seeds: Sequence[bytes], changes: int = 4) -> bytes:
-    """A seed of which a few bits, bytes or numbers were changed, or that was cut or extended.
+    """A seed in which a few bits, bytes or numbers were changed, or that was cut or extended.
 
     Args:
         draw: of hypothesis.
         seeds: valid inputs.
-        changes: at most so many.
+        changes: most changes.
     """
     data = bytearray(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(0, changes))):
@@ -111,7 +111,7 @@ def blobs(draw: st.DrawFn, seeds: Sequence[bytes], changes: int = 4) -> bytes:
 
 
 def lines(one: st.SearchStrategy[bytes], most: int = 4) -> st.SearchStrategy[bytes]:
-    """A few messages, one a line."""
+    """A few messages, one per line."""
     return st.lists(one, min_size=1, max_size=most).map(
         lambda many: b"\n".join(message.replace(b"\n", b" ") for message in many)
     )

@@ -18,7 +18,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
@@ -164,7 +164,7 @@ def _campaign(place: Path) -> Iterator[Take]:
         except UserError as problem:
             short(str(problem))
 
-    loading._TRIED = 20  # of a million runs, for the sake of time
+    loading._TRIED = 20  # instead of a million runs, to save time
     try:
         yield take
     finally:
@@ -172,7 +172,7 @@ def _campaign(place: Path) -> Iterator[Take]:
 
 
 def short(text: str) -> None:
-    """What is told of a mistake can be read."""
+    """Check that an error message is readable."""
     assert len(text) < 20_000, f"{len(text)} characters"
 
 
@@ -202,7 +202,7 @@ def _run_folder(place: Path) -> Iterator[Take]:
 
 
 def _runs(place: Path) -> tuple[Path, Path]:
-    """The folder of a run that is over, and of one that seems to go on."""
+    """The folders of a finished run and of one that seems to be in progress."""
     scenario = check_scenario(
         {
             "title": "over", "duration": 0.002, "law": "vsg-2", "link": {"type": "inproc"},
@@ -228,7 +228,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
 
 
 def _look_back(folder: Path) -> None:
-    """Everything that reads a run that is over."""
+    """Run everything that reads a finished run."""
     command("export", str(folder), "--format", "csv", "-o", str(folder.parent / "out.csv"))
     with contextlib.suppress(UserError):
         record = open_record(folder)
@@ -238,7 +238,7 @@ def _look_back(folder: Path) -> None:
 
 
 def _look_on(folder: Path) -> None:
-    """Everything that reads a run that goes on."""
+    """Run everything that reads a run in progress."""
     command("tell", str(folder))
     with contextlib.suppress(UserError):
         record = open_record(folder)
@@ -252,7 +252,7 @@ def _look_on(folder: Path) -> None:
 
 
 def command(*arguments: str) -> None:
-    """A command ends with an exit code and, if that is 2, in words."""
+    """Check that a command ends with an exit code and, if that is 2, with a message."""
     out, said = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
         code = main(arguments)
@@ -281,7 +281,7 @@ def _run_files() -> st.SearchStrategy[bytes]:
 
 @contextlib.contextmanager
 def _segment(place: Path) -> Iterator[Take]:
-    """An input is what the memory of a link holds; ``@owner@`` stands for a living owner."""
+    """An input is the content of a link's memory; ``@owner@`` stands for a living owner."""
     name = f"fuzz-{os.getpid()}"
     path = segment.FOLDER / f"{segment.PREFIX}{name}"
 

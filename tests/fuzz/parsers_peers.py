@@ -64,7 +64,7 @@ def _frame_seeds() -> list[bytes]:
 
 
 class Liar:
-    """The end of a link whose other side says what it likes."""
+    """The end of a link whose peer sends arbitrary messages."""
 
     port = None
 
@@ -81,12 +81,12 @@ class Liar:
         return bool(self.messages)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources."""
 
 
 @contextlib.contextmanager
 def _handshake(place: Path) -> Iterator[Take]:
-    """An input is what the other side says, a message a line; ``@name@`` stands for our value."""
+    """An input is the peer's messages, one per line; ``@name@`` stands for our value."""
     ours = {f"@{k}@".encode(): str(v).encode() for k, v in _what_runs(SCENARIO).items()}
 
     def take(script: bytes) -> None:
@@ -119,7 +119,7 @@ def _hellos() -> st.SearchStrategy[bytes]:
 
 @contextlib.contextmanager
 def _can(place: Path) -> Iterator[Take]:
-    """An input is frames one after the other: identifier (4 bytes), length (1), 64 of data."""
+    """An input is a sequence of frames: identifier (4 bytes), length (1), data (64)."""
     plans = {fd: plan_of(read_dbc(write_dbc(fd))) for fd in (True, False)}
 
     def take(content: bytes) -> None:
@@ -132,7 +132,7 @@ def _can(place: Path) -> Iterator[Take]:
             for at in range(0, len(content), 69):
                 frame, piece = np.zeros(1, frame_dtype), content[at : at + 69].ljust(69, b"\0")
                 frame["id"], frame["length"] = struct.unpack("<IB", piece[:5])
-                frame["length"] %= 65  # no kernel hands over more
+                frame["length"] %= 65  # no kernel delivers more
                 frame["data"] = np.frombuffer(piece[5:], np.uint8)
                 bring(node.handle, frame)
                 size = receive(node.handle, room[64:-64])

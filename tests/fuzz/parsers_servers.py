@@ -1,4 +1,4 @@
-"""The parsers of what operators send: Modbus requests, scope messages, commands to a side."""
+"""The parsers of operators' input: Modbus requests, scope messages, commands to a side."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PATIENCE_S = 60.0
 
 
 class Served:
-    """A server in an event loop of a thread of its own, and what goes wrong in it unseen."""
+    """A server in an event loop of a separate thread; collects the errors that it hides."""
 
     def __init__(self) -> None:
         self.loop, self.wrong = asyncio.new_event_loop(), list[str]()
@@ -54,18 +54,18 @@ class Served:
         logging.getLogger().addHandler(self._handler)
 
     def call(self, coroutine: Coroutine[Any, Any, Any]) -> Any:
-        """Run a coroutine over there."""
+        """Run a coroutine in that loop."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(PATIENCE_S)
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         logging.getLogger().removeHandler(self._handler)
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
         self.loop.close()
 
     def nothing_wrong(self) -> None:
-        """Nothing has been logged as an error, or ended unseen, since the last look."""
+        """Check that since the last call no error was logged and no task failed silently."""
         wrong, self.wrong[:] = list(self.wrong), []
         assert not wrong, wrong
 
@@ -100,7 +100,7 @@ def _modbus(place: Path) -> Iterator[Take]:
         one.sendall(struct.pack(">HHHBBHH", transaction, 0, 6, 1, 3, BASE, 2))
 
     def answers(one: socket.socket, until: int) -> None:
-        """Take whole answers until that transaction's, or the end of the connection."""
+        """Read whole answers until that of the transaction ``until``, or the connection's end."""
         seen = -1
         while seen != until:
             head = one.recv(7, socket.MSG_WAITALL)
@@ -118,7 +118,7 @@ def _modbus(place: Path) -> Iterator[Take]:
         ):
             one.sendall(message)
             ask(one, 0xFFFF)
-            one.settimeout(0.05)  # half a request has no answer
+            one.settimeout(0.05)  # an incomplete request gets no answer
             answers(one, 0xFFFF)
         with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as other:
             ask(other, 1)
@@ -147,7 +147,7 @@ def _requests() -> st.SearchStrategy[bytes]:
 
 @contextlib.contextmanager
 def _scope(place: Path) -> Iterator[Take]:
-    """An input is what a page says, a message a line; ``@token@`` stands for the token."""
+    """An input is a page's messages, one per line; ``@token@`` stands for the token."""
     run = {"title": "f", "duration": 0.1, "law": "vsg-2", "link": {"type": "inproc"}}
     done = run_scenario(check_scenario(run, ""), place / "run", figures=False)
     access, served, ports = Access(), Served(), list[int]()
@@ -199,7 +199,7 @@ LOOKS = (
 
 @contextlib.contextmanager
 def _desk(place: Path) -> Iterator[Take]:
-    """An input is what an operator sends, the parts of a message between line ends."""
+    """An input is an operator's message, its parts separated by line ends."""
     context = zmq.Context()
     with contextlib.ExitStack() as stack:
         stack.callback(context.destroy, linger=0)
@@ -223,7 +223,7 @@ def _desk(place: Path) -> Iterator[Take]:
 
 @contextlib.contextmanager
 def _loop(place: Path, side: Any) -> Iterator[tuple[str, list[bool]]]:
-    """A desk whose loop does nothing else than to carry out; where it is, and who stopped it."""
+    """A desk whose loop only carries out commands; yields its place and the stop requests."""
     bench, stopped, bell, over = make_bench(SCENARIO), [], threading.Event(), threading.Event()
     timeline = Timeline(bench, place / f"events_{side}.jsonl", (side,))
 

@@ -1,6 +1,6 @@
-"""Every parser reads what it is given or refuses it as documented, whatever it is given.
+"""Every parser reads any input or refuses it as documented.
 
-How many inputs are made up is said by hypothesis' profile, see CONTRIBUTING.md.
+Hypothesis' profile sets the number of generated inputs, see CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ readers = pytest.mark.parametrize(
     "57 of 200 inputs: a traceback, a wrong frame taken, or the end of the server",
 )
 def test_corpus(reader, attack_now):
-    """What once broke a parser, or is of a kind that may."""
+    """Inputs that once broke a parser, or are likely to."""
     files, broken = reader.corpus(), []
     for file in files:
         try:

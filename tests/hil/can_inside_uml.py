@@ -1,6 +1,6 @@
-"""Real SocketCAN: run by ``test_can_uml`` inside user-mode Linux, where vcan0 is a CAN FD bus.
+"""Real SocketCAN: ``test_can_uml`` runs it inside user-mode Linux, where vcan0 is a CAN FD bus.
 
-GFMHIL_TEST_BUS: an endpoint to use instead, to have all compiled where that is quicker.
+GFMHIL_TEST_BUS: an endpoint to use instead, to compile everything where that is faster.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import pytest
 
 from gfm_hil.core.roles import SIDES
 from gfm_hil.links.can.dbc import write_dbc
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.scenario.toml_out import toml_text
 
@@ -55,7 +55,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 
 
 def run_while(scenario: str, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
-    """``gfmhil run``, something else once it has done that many ticks; returns its summary."""
+    """``gfmhil run``; calls ``meanwhile`` after that many ticks; returns the summary."""
     process = start("run", scenario, "--out", "out", "--quiet")
     while True:
         part = Part.open(Path("out"), "plant")
@@ -87,7 +87,7 @@ def test_lockstep_over_vcan_is_a_run_in_process_in_counts(options):
 
 
 def test_a_flooded_bus():
-    """A third process, which wins every arbitration, sends bursts all the while."""
+    """A third process, which wins every arbitration, sends bursts during the whole run."""
     scenario = write("scenario.toml", {})
     with subprocess.Popen([sys.executable, "-c", _FLOOD], stdout=subprocess.PIPE) as flooder:
         assert flooder.stdout is not None and flooder.stdout.readline()
@@ -134,7 +134,7 @@ def test_an_interface_that_goes_down_ends_the_run_in_safe():
     finally:
         link("up")
     assert summary["status"] == "safe"
-    # whichever came first, a send or a look
+    # either a send or a poll detects it first
     assert re.match("the CAN bus vcan0 is gone: .*Network is down", summary["reason"])
 
 

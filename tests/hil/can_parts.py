@@ -1,4 +1,4 @@
-"""The parts of a CAN node one by one, with messages as bytes."""
+"""The parts of a CAN node separately, with messages as bytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gfm_runtime.signals import Group
 
 
 def frame_of(number: int, payload: bytes) -> np.ndarray:
-    """A CAN frame as the node has it, in an array."""
+    """A CAN frame in the node's format, in an array."""
     frame = np.zeros(1, frame_dtype)
     frame["id"], frame["length"] = number, len(payload)
     frame["data"][0, : len(payload)] = np.frombuffer(payload, np.uint8)
@@ -24,7 +24,7 @@ def frame_of(number: int, payload: bytes) -> np.ndarray:
 
 
 class VectorReceiver:
-    """Makes the frames of the bench again."""
+    """Converts CAN frames back to frames of the bench."""
 
     def __init__(self, plan: Plan, group: Group) -> None:
         self._record, self._message = np.zeros(1, receiver_dtype), np.zeros(100, np.uint8)
@@ -43,7 +43,7 @@ class VectorReceiver:
 
 
 class Joiner:
-    """Puts the other side's messages together; returns a code in place of a message."""
+    """Joins the other side's segments; returns a message or a code."""
 
     def __init__(self, plan: Plan, side: Side) -> None:
         self._record, self._message = np.zeros(1, joiner_dtype), np.zeros(LONGEST, np.uint8)
@@ -72,7 +72,7 @@ class Subrate:
         return bool(goes(self._record, np.frombuffer(message, np.uint8)))
 
     def receive(self) -> bytes | None:
-        """As ``node.receive`` does it."""
+        """As in ``node.receive``."""
         size = made(self._record, self._message)
         while size == NOTHING:
             message = self._receive()

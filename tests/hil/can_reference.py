@@ -1,4 +1,4 @@
-"""What a run over CAN must give: the same in one process, through cantools instead of our codec."""
+"""Reference of a run over CAN: the same run in one process, with cantools instead of our codec."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
-from gfm_hil.recording.recorder import PLANT_COLUMNS, record_command, record_sample
+from gfm_hil.recording.columns import PLANT_COLUMNS
+from gfm_hil.recording.recorder import record_command, record_sample
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.signals import Group, names
@@ -19,7 +20,7 @@ DBC = read_dbc(write_dbc(True))
 
 
 def through_cantools(name: Group, values: np.ndarray) -> None:
-    """What is left of a vector that went over CAN FD, by cantools alone."""
+    """Quantise a vector as CAN FD does, with cantools alone."""
     title = {"y": "Measurements", "u": "Commands"}[name]
     message = DBC.get_message_by_name(title)
     physical = dict(zip(names(name), values.tolist(), strict=True))
@@ -29,9 +30,9 @@ def through_cantools(name: Group, values: np.ndarray) -> None:
 
 
 def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str, np.ndarray]:
-    """The same run in one process, y and u through cantools on their way.
+    """The same run in one process; y and u pass through cantools.
 
-    Every n ticks only: y is held, and so is u, which takes n ticks to arrive.
+    With an exchange every n ticks, y is held, and so is u, which takes n ticks to arrive.
     """
     b = make_bench(scenario)
     timeline = Timeline(b, folder / "events.jsonl", SIDES)

@@ -1,4 +1,4 @@
-"""Scenarios made in a line, run in this process, and the command as a process of its own."""
+"""Scenarios made in one line, runs in this process, and the command as a separate process."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 
 def home_plant(law: str) -> dict[str, Any]:
-    """``plant`` with the grid that a law's defaults are meant for."""
+    """``plant`` with the grid for which a law's defaults are tuned."""
     grid = get_law(law).home_grid
     return {"factors": {"L_g": grid.L_g, "R_g": grid.R_g}}
 
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """A folder of short path, for an ipc endpoint."""
+    """A folder with a short path, for an ipc endpoint."""
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
         yield Path(folder)
 
 
 @pytest.fixture
 def make() -> Make:
-    """A checked scenario of a tenth of a second in process, with whatever is given instead."""
+    """Makes a checked scenario, by default a tenth of a second in process."""
 
     def build(**content: Any) -> Scenario:
         base = {"title": "test", "duration": 0.1, "link": {"type": "inproc"}}
@@ -50,7 +50,7 @@ def make() -> Make:
 
 @pytest.fixture
 def run(make: Make, tmp_path: Path) -> RunIt:
-    """Run such a scenario without figures."""
+    """Runs such a scenario without figures."""
     count = iter(range(100))
 
     def call(**content: Any) -> Run:
@@ -61,14 +61,14 @@ def run(make: Make, tmp_path: Path) -> RunIt:
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """A fresh ipc endpoint; its path must be short, which a test's own folder need not be."""
+    """A new ipc endpoint; its path must be short, and that of a test's own folder may be long."""
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
         yield f"ipc://{folder}/link"
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Start ``gfmhil …`` in the test's own folder; whatever still runs at the end is killed."""
+    """Starts ``gfmhil …`` in the test's own folder; kills processes that still run at the end."""
     started = []
 
     def call(*arguments: str) -> subprocess.Popen[str]:
@@ -90,19 +90,19 @@ _KERNEL: pytest.StashKey[Kernel] = pytest.StashKey()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What waits for a kernel that runs beside the other tests comes after them."""
+    """Put the tests that wait for the user-mode kernel last: it boots beside the other tests."""
     items.sort(key=lambda item: item.get_closest_marker("uml") is not None)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Boot that kernel, if a test wants it."""
+    """Boot that kernel, if a test needs it."""
     wanted = any(item.get_closest_marker("uml") for item in session.items)
     if wanted and "GFMHIL_UML" in os.environ and not session.config.option.collectonly:
         session.config.stash[_KERNEL] = Kernel()
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Leave nothing behind, however the session ended."""
+    """Clean up, however the session ended."""
     if _KERNEL in config.stash:
         config.stash[_KERNEL].clear()
 

@@ -1,4 +1,4 @@
-"""What the tests of the Modbus server start and wait for."""
+"""Helpers of the Modbus server's tests: start it, and wait for a condition."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SUNS = 40000
 
 
 def wait_for(condition):
-    """What the condition gives, once it gives something."""
+    """Poll the condition until its result is true; returns the result."""
     until = time.monotonic() + PATIENCE_S
     while not (found := condition()):
         assert time.monotonic() < until
@@ -46,7 +46,7 @@ def end(process: subprocess.Popen) -> None:
 
 
 def start(folder: Path, *options: str) -> tuple[subprocess.Popen, int]:
-    """A server and its port."""
+    """Start a server; returns it and its port."""
     command = [*GFMHIL, "modbus", str(folder), "--port", "0", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     said = process.stdout.readline()

@@ -18,8 +18,9 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.npz import Arrays
-from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 
 from .test_links import in_threads
@@ -30,7 +31,7 @@ Touch = Callable[[Side, Link], Link]
 
 @dataclass
 class Pair:
-    """What a run in two threads left.
+    """The results of a run in two threads.
 
     Attributes:
         signals, timing: as in signals.npz and timing.npz.
@@ -62,7 +63,7 @@ def run_pair(
     touch: Touch = lambda side, link: link,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Pair:
-    """Run a scenario over a link of its own; ``touch`` may wrap an end after the handshake."""
+    """Run a scenario over a new link; ``touch`` may wrap an end after the handshake."""
     folder.mkdir(parents=True, exist_ok=True)
     endpoint = link_kind(link).fresh(folder)
     benches = {side: make_bench(scenario) for side in SIDES}
@@ -93,7 +94,7 @@ def run_pair(
             raise problem
     pair.log = read_log(*sorted(folder.glob("events_*.jsonl")))
     merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    pair.signals = dict(Arrays(read_recording(folder)[0]))
+    pair.signals = {name: x[:] for name, x in read_recording(folder)[0].items()}
     with np.load(folder / "timing.npz") as file:
         pair.timing = dict(file)
     return pair

@@ -1,4 +1,4 @@
-"""For the scope's tests: a run on a rig with its scope, and a browser that looks at it."""
+"""Helpers of the scope's tests: a run on a rig with its scope, and a browser that shows it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 PATIENCE_S = 60.0
-# 1 kHz, so that two processors do for both sides and the browser
+# 1 kHz, so that two processors suffice for both sides and the browser
 RIG = """
 title = "A rig that is told what to do"
 duration = 300.0
@@ -46,7 +46,7 @@ HAS_BROWSER = None not in (shutil.which("chromium"), shutil.which("chromedriver"
 
 @dataclass
 class Rig:
-    """A run that goes on, and the addresses of its scope."""
+    """A run in progress, and the addresses of its scope."""
 
     folder: Path
     look: str
@@ -59,7 +59,7 @@ class Rig:
 
 
 def wait_for(what: Callable[[], Any], patience: float = PATIENCE_S) -> Any:
-    """Until it is true, and what it then is."""
+    """Poll until the result is true; returns the result."""
     until = time.monotonic() + patience
     while not (found := what()):
         assert time.monotonic() < until, "waited in vain"
@@ -68,7 +68,7 @@ def wait_for(what: Callable[[], Any], patience: float = PATIENCE_S) -> Any:
 
 
 def addresses(lines: Iterator[str]) -> tuple[str, str]:
-    """To look and to control, from what a scope prints."""
+    """The addresses to look and to control, from the output of a scope."""
     found: list[str] = []
     for line in lines:
         found += re.findall(r"https?://\S+", line)
@@ -97,7 +97,7 @@ def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
 
 @contextmanager
 def serving(scope: Any) -> Iterator[int]:
-    """Serve a ``Scope`` from a thread of this process; its port."""
+    """Serve a ``Scope`` from a thread of this process; yields its port."""
     loop = asyncio.new_event_loop()
     ports: list[int] = []
     ready = threading.Event()
@@ -126,7 +126,7 @@ def serving(scope: Any) -> Iterator[int]:
 
 @contextmanager
 def mute(port: int, *messages: str) -> Iterator[socket.socket]:
-    """A page that says hello to HTTP, sends messages, and from then on reads nothing."""
+    """A page that opens a WebSocket, sends messages, and then reads nothing."""
     with socket.socket() as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
         raw.connect(("127.0.0.1", port))
@@ -142,12 +142,12 @@ def mute(port: int, *messages: str) -> Iterator[socket.socket]:
 
 
 class Browser:
-    """Chromium, without a window.
+    """Headless Chromium.
 
     Args:
         width, height: of the page, CSS pixels.
-        dark: what the system is said to prefer.
-        phone: with touch and a fine screen.
+        dark: the emulated system preference for dark colours.
+        phone: emulate touch and a high-resolution screen.
     """
 
     def __init__(
@@ -186,21 +186,21 @@ class Browser:
         self.driver.quit()
 
     def js(self, text: str) -> Any:
-        """What a script returns."""
+        """Run a script; returns its result."""
         return self.driver.execute_script(text)
 
     def text(self, selector: str) -> str:
-        """The words of an element."""
+        """The text of an element."""
         return str(self.js(f"return document.querySelector({selector!r})?.textContent ?? ''"))
 
     def click(self, selector: str) -> None:
-        """As a person would: where it can be seen, and not if something lies over it."""
+        """Click like a user: only if the element is visible and nothing covers it."""
         from selenium.webdriver.common.by import By
 
         self.driver.find_element(By.CSS_SELECTOR, selector).click()
 
     def write(self, selector: str, text: str) -> None:
-        """Put text into a field."""
+        """Write text into a field."""
         from selenium.webdriver.common.by import By
 
         field = self.driver.find_element(By.CSS_SELECTOR, selector)
@@ -215,7 +215,7 @@ class Browser:
         Select(self.driver.find_element(By.CSS_SELECTOR, selector)).select_by_value(value)
 
     def drag(self, selector: str, start: tuple[int, int], by: tuple[int, int]) -> None:
-        """With the pointer, from a place against the element's middle."""
+        """Drag with the pointer, from a place relative to the element's centre."""
         from selenium.webdriver.common.action_chains import ActionChains
         from selenium.webdriver.common.by import By
 
@@ -225,7 +225,7 @@ class Browser:
         moves.move_by_offset(by[0] - by[0] // 2, by[1] - by[1] // 2).release().perform()
 
     def complaints(self) -> list[str]:
-        """What the browser complained of."""
+        """The errors and warnings of the browser."""
         return [str(line["message"]) for line in self.driver.get_log("browser")]
 
     def picture(self, strip: str) -> list[int]:

@@ -1,7 +1,7 @@
-"""One side of a shared-memory link as a process of its own: ``shm_peer.py side endpoint what n``.
+"""One side of a shared-memory link as a separate process: ``shm_peer.py side endpoint what n``.
 
 ``hold`` opens its end and sleeps until it is killed. ``flood`` sends n messages while it receives
-the other side's n, all in compiled code, and prints how many came and how many were not as sent.
+the other side's n, all in compiled code, and prints how many arrived and how many were wrong.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gfm_hil.realtime.clock import give_way
 
 @njit
 def fill(words, k, salt):
-    """Write message k of a side, every word another; returns its length in bytes."""
+    """Write message k of a side, all words different; returns its length in bytes."""
     x = np.uint64(2 * k + salt + 1) * np.uint64(0x9E3779B97F4A7C15)
     for i in range(len(words)):
         x ^= x >> np.uint64(29)

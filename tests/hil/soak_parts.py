@@ -1,4 +1,4 @@
-"""What the soak test measures of each process, and the clients that come and go meanwhile."""
+"""The soak test's measurements of each process, and its clients that connect and disconnect."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from gfm_hil.operator import Operator
 from gfm_hil.telemetry import BlockReader
 
 MB = 1e6
-SETTLE_S = 30.0  # how long a process may take to let go of clients that have left
-PATIENCE_S = 200.0  # with an answer, on a crowded machine
+SETTLE_S = 30.0  # how long a process may take to free the resources of former clients
+PATIENCE_S = 200.0  # timeout of an answer, on a crowded machine
 _LOOK = {
     "kind": "look", "id": 1, "channels": ["p", "q"], "bins": 64, "mode": "roll", "span": 1.0,
 }  # fmt: skip
@@ -40,8 +40,8 @@ class Sample:
 
     Attributes:
         t: since the start, s.
-        own: memory that the process has for itself alone (RssAnon), bytes.
-        pss: with its share of what it has in common with others, the recording above all, bytes.
+        own: private memory of the process (RssAnon), bytes.
+        pss: private memory and its share of shared memory, mainly the recording, bytes.
         descriptors, threads: their numbers.
     """
 
@@ -53,7 +53,7 @@ class Sample:
 
 
 def take_sample(pid: int, t: float) -> Sample:
-    """Read a process's numbers from /proc.
+    """Read a process's figures from /proc.
 
     Raises:
         OSError: the process is gone.
@@ -75,7 +75,7 @@ def take_sample(pid: int, t: float) -> Sample:
 
 @dataclass
 class Sampler:
-    """The samples of several processes, taken while no client is there.
+    """The samples of several processes, taken while no client is connected.
 
     Args:
         pids: process number by name.
@@ -86,7 +86,7 @@ class Sampler:
     samples: dict[str, list[Sample]] = field(default_factory=dict)
 
     def take(self) -> None:
-        """Take a sample of each, once they have let go of the clients of the last round."""
+        """Take a sample of each, once they have freed the resources of the last round's clients."""
         until = time.monotonic() + SETTLE_S
         while True:
             now = {n: take_sample(p, time.monotonic() - self.begin) for n, p in self.pids.items()}
@@ -103,7 +103,7 @@ class Sampler:
             self.samples.setdefault(name, []).append(one)
 
     def column(self, name: str, what: str) -> np.ndarray:
-        """One number of one process over all samples."""
+        """One figure of one process over all samples."""
         return np.array([getattr(sample, what) for sample in self.samples[name]], float)
 
     def rise(self, name: str, first: int) -> float:
@@ -112,7 +112,7 @@ class Sampler:
         return float(np.polyfit(t - t[0], own, 1)[0] * (t[-1] - t[0]))
 
     def table(self, first: int) -> list[str]:
-        """A line for each process."""
+        """One line per process."""
         head = ("process", "own MB: first", "last", "most", "rise", "Pss MB", "descr.", "threads")
         lines = ["".join(f"{word:>14}" for word in head)]
         for name in self.samples:
@@ -127,7 +127,7 @@ class Sampler:
         return lines
 
     def write_csv(self, path: Path) -> None:
-        """Every sample as a line."""
+        """Write one line per sample."""
         with path.open("w", encoding="utf-8", newline="") as file:
             out = csv.writer(file)
             out.writerow(["process", "t_s", "own_bytes", "pss_bytes", "descriptors", "threads"])
@@ -139,7 +139,7 @@ class Sampler:
 
 @dataclass
 class Clients:
-    """Everything that comes to a run and leaves again; one call of ``round`` is one visit of all.
+    """All kinds of clients of a run; in one ``round`` each connects and disconnects.
 
     Args:
         folder: of the run.
@@ -160,7 +160,7 @@ class Clients:
     rounds: int = 0
 
     def round(self) -> None:
-        """Every client comes, does something, and leaves."""
+        """Every client connects, does something, and disconnects."""
         k = self.rounds
         self.rounds += 1
         self._pages(k)
@@ -192,7 +192,7 @@ class Clients:
             for path, value in (("715.ControllerHb", k), (f"{VENDOR}.Law", 1 + k % 2)):
                 point = self.image.points[path]
                 assert not one.write_registers(point.address, point.encode(value)).isError()
-            assert one.write_registers(BASE, [0]).isError()  # refused, and not for ever
+            assert one.write_registers(BASE, [0]).isError()  # refused, but not for ever
 
     def _listeners(self) -> None:
         with zmq.Context() as context, context.socket(zmq.SUB) as juggler:
@@ -227,7 +227,7 @@ class Clients:
         assert told.returncode == 0, told.stderr
 
     def _strangers(self) -> None:
-        """Connections that say nothing sensible and are cut off."""
+        """Connections that send garbage and are closed."""
         web = int(self.scope.rpartition(":")[2].strip("/"))
         for port, said in itertools.product(
             (web, self.modbus, self.samples, self.blocks, self.metrics), (b"", b"\xff" * 40)
@@ -239,7 +239,7 @@ class Clients:
 
 
 def _until(take: Callable[[], Any], wanted: Callable[[Any], bool]) -> Any:
-    """Take until it is what is wanted."""
+    """Call ``take`` until its result is the wanted one."""
     until = time.monotonic() + PATIENCE_S
     while not wanted(found := take()):
         assert time.monotonic() < until, "waited in vain"
@@ -248,6 +248,6 @@ def _until(take: Callable[[], Any], wanted: Callable[[Any], bool]) -> Any:
 
 
 def ports_in(lines: Iterable[str], count: int) -> list[int]:
-    """The last number of each of the first lines, which name an address."""
+    """The last number of each of the first ``count`` lines: the ports of the addresses."""
     found = (line.split()[1].removesuffix("/metrics").rpartition(":")[2] for line in lines)
     return [int(port) for port in itertools.islice(found, count)]

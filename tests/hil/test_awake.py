@@ -1,4 +1,4 @@
-"""A processor that is kept from resting, and let go again."""
+"""A processor is kept from going idle, and released again."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import pytest
 
 from gfm_hil.realtime import prevent_idle as awake
 from gfm_hil.realtime.prevent_idle import kept_awake
+
+pytestmark = pytest.mark.processes
 
 HERE = sorted(os.sched_getaffinity(0))[0]
 _IDLE = 5  # SCHED_IDLE
@@ -35,7 +37,7 @@ def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
         assert os.sched_getscheduler(thread.native_id) == _IDLE
         assert os.sched_getaffinity(thread.native_id) == {HERE}
         until = time.monotonic() + 60
-        while used_s(thread) < 0.05:  # on a crowded machine it hardly gets to run
+        while used_s(thread) < 0.05:  # on a crowded machine it gets little time
             assert time.monotonic() < until
             time.sleep(0.05)
     thread.join(60)

@@ -1,4 +1,4 @@
-"""``gfmhil bench``: what it leaves, what it refuses. No figure is judged."""
+"""``gfmhil bench``: its files and its errors. The tests judge no figure."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
 
+pytestmark = pytest.mark.processes
+
 KEYS = {
     "link", "peer", "code", "mode", "load", "policy", "payload", "n", "ratio_to_baseline_p50",
     "p50_us", "p90_us", "p99_us", "p99_9_us", "p99_99_us", "max_us",
@@ -30,7 +32,7 @@ KEYS = {
 
 
 def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, Any]:
-    """A benchmark with hardly any work; what it prints."""
+    """Run a benchmark with minimal work; returns its result."""
     line = ["bench", kind, "--rounds", "2", *options, "--out", str(tmp_path / "bench"), "--json"]
     assert main(line) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -153,7 +155,7 @@ def processes_with(mark: str) -> int:
     """How many processes have a mark in their environment."""
     found = 0
     for place in Path("/proc").glob("[0-9]*/environ"):
-        with contextlib.suppress(OSError):  # gone meanwhile
+        with contextlib.suppress(OSError):  # it has ended
             found += mark.encode() in place.read_bytes()
     return found
 

@@ -1,4 +1,4 @@
-"""Causes of missed ticks, on timing that is made up with one thing wrong at a time."""
+"""Causes of missed ticks, on synthetic timing with one fault at a time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TICKS = 500
 
 
 def good() -> dict[str, np.ndarray]:
-    """Every tick on time: awake 300 ns late, 800 ns of work a side, 15 µs each way."""
+    """Every tick on time: wake-up 300 ns late, 800 ns of work per side, 15 µs each way."""
     due = 1_000_000 + T * np.arange(TICKS)
     heard = due + 300 + 800 + 15_000
     return {
@@ -70,7 +70,7 @@ def test_side_that_stood_still_while_it_looked(side: str) -> None:
 
 def test_work_that_is_too_long_for_the_tick() -> None:
     timing = good()
-    timing["controller_sent"][::5] += 95_000  # of every fifth tick: no accident
+    timing["controller_sent"][::5] += 95_000  # every fifth tick: not an outlier
     timing["plant_received"][::5] = -1
     assert found(timing) == ["own work"] * (TICKS // 5)
 
@@ -91,7 +91,7 @@ def test_event_on_the_tick_is_own_work() -> None:
 
 
 def test_ticks_that_follow_have_the_cause_of_the_first() -> None:
-    """The controller stands still for three ticks, then works off what has queued."""
+    """The controller stalls for three ticks, then processes the queued frames."""
     timing = good()
     back = timing["plant_scheduled"][7] + 3 * T + 20_000
     for k in (7, 8, 9, 10):
@@ -103,7 +103,7 @@ def test_ticks_that_follow_have_the_cause_of_the_first() -> None:
 
 
 def test_frames_lost_while_the_controller_stood_still_are_not_the_links() -> None:
-    """It was away for six ticks; of what was sent meanwhile the ring had room for two frames."""
+    """It stalled for six ticks; the ring had room for two of the frames sent meanwhile."""
     timing = good()
     back = timing["plant_scheduled"][12] + 95_000
     for k, late in ((7, 0), (8, 900)):
@@ -118,7 +118,7 @@ def test_frames_lost_while_the_controller_stood_still_are_not_the_links() -> Non
 
 
 def test_answer_that_was_held_up_with_its_sender_is_not_the_links() -> None:
-    """The controller stands still once it has sent u, before the link's own thread has done so."""
+    """The controller stalls after its send of u, before the link's own thread has sent it."""
     timing = good()
     back = timing["plant_scheduled"][9] + 80_000
     for k in (8, 9):
@@ -130,7 +130,7 @@ def test_answer_that_was_held_up_with_its_sender_is_not_the_links() -> None:
 
 
 def test_wait_that_was_longer_than_the_gap_in_it() -> None:
-    """y comes 50 µs after a gap of 600 µs: of nine ticks all were lost by the gap."""
+    """y arrives 50 µs after a gap of 600 µs: the gap caused all nine misses."""
     timing = good()
     back = timing["plant_scheduled"][7] + 750_000
     for k in range(7, 16):

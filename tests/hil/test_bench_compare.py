@@ -1,4 +1,4 @@
-"""The verdict on two results: the rank test against SciPy's, and made-up results."""
+"""The verdict on two results: the rank test against SciPy's, and synthetic results."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_too_few_rounds_are_said_to_be_too_few() -> None:
 
 
 def test_noise_is_rarely_taken_for_a_change() -> None:
-    """200 rows of pure noise: Holm's method keeps a single false alarm below 5 % a comparison."""
+    """200 rows of pure noise: Holm's method keeps the risk of any false alarm below 5 %."""
     names = [f"row {k}" for k in range(200)]
     a = result({n: noisy(40, 20, k) for k, n in enumerate(names)})
     b = result({n: noisy(40, 20, 1000 + k) for k, n in enumerate(names)})

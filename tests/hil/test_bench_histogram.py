@@ -40,7 +40,7 @@ def test_histograms_add(a: np.ndarray, b: np.ndarray) -> None:
 
 
 def test_buckets_leave_no_gap() -> None:
-    """A bucket's least value falls into it, the value before into the bucket before."""
+    """A bucket's smallest value falls into it, the next smaller value into the bucket before."""
     ends = lower_ends()[:-1].astype(np.int64)
     for shift in (0, 1):
         counts = histogram(np.maximum(ends - shift, 0))

@@ -1,4 +1,4 @@
-"""bench.html: everything of a result in one file that needs no network."""
+"""bench.html: all of a result in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def times(median_us: float, seed: int) -> dict[str, Any]:
 
 @pytest.fixture
 def content() -> dict[str, Any]:
-    """A result of everything, made up."""
+    """A synthetic result with all parts."""
     latency = [
         {
             "name": name, "link": link, "peer": peer, "code": code, "mode": mode, "load": load,
@@ -83,7 +83,7 @@ def content() -> dict[str, Any]:
 
 
 class Outline(HTMLParser):
-    """What a page holds."""
+    """The elements of a page."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What a peer sends takes no more memory than the longest message that there is."""
+"""A peer's messages take no more memory than the longest valid message."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ import zmq
 from gfm_hil.links.base import LONGEST
 from gfm_hil.telemetry import blocks
 
+pytestmark = pytest.mark.processes
+
 BIG = 50_000_000  # bytes
 LOOSE_KB = 20_000  # far less than one big message
 PATIENCE_S = 60
@@ -27,7 +29,7 @@ Child = Callable[[str], "subprocess.Popen[str]"]
 
 @pytest.fixture
 def child() -> Iterator[Child]:
-    """Run a program that says ``ready``, where it listens, and then waits for its end."""
+    """Run a program that prints ``ready`` and its endpoint, and then waits for its end."""
     started = []
 
     def call(program: str) -> subprocess.Popen[str]:
@@ -50,13 +52,13 @@ def line(process: subprocess.Popen[str]) -> str:
 
 
 def peak_kb(process: subprocess.Popen[str]) -> int:
-    """Most memory that a process has had, kB."""
+    """Peak memory of a process, kB."""
     status = Path(f"/proc/{process.pid}/status").read_text()
     return int(status.partition("VmHWM:")[2].split()[0])
 
 
 def flood(kind: int, endpoint: str, message: bytes, times: int, *, bind: bool = False) -> int:
-    """Send a message until the other side has parted so often; returns how often it did."""
+    """Send a message until the peer has disconnected ``times`` times; returns how often it did."""
     with zmq.Context() as context, context.socket(kind) as attacker:
         attacker.set(zmq.LINGER, 0)
         attacker.set(zmq.SNDTIMEO, 100)
@@ -80,7 +82,7 @@ def flood(kind: int, endpoint: str, message: bytes, times: int, *, bind: bool = 
 
 
 def subscribe(port: int, topic: bytes) -> bool:
-    """Subscribe by ZMTP 3.0, without a libzmq that would keep the topic; whether the other side
+    """Subscribe by ZMTP 3.0, without a libzmq that would store the topic; returns whether the peer
     closed the connection."""
     signature = b"\xff" + bytes(8) + b"\x7f"
     greeting = signature + b"\3\0" + b"NULL".ljust(20, b"\0") + bytes(32)

@@ -1,4 +1,4 @@
-"""gfmhil design box and deploy: what they print, write and refuse."""
+"""gfmhil design box and deploy: their output, files and errors."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def test_box_beside_the_rigs_source(capsys: Capture) -> None:
     assert rows["sigma, corners [1/s]"]["worst"] < -1.0
     assert 0.0 <= rows["sigma, corners [1/s]"]["mode_hz"] < 5000.0
     assert rows["delay margin [s]"]["worst"] is None  # none found
-    assert rows["gamma beside this source"]["worst"] == pytest.approx(3.58, abs=0.01)
+    assert rows["gamma with this source"]["worst"] == pytest.approx(3.58, abs=0.01)
     assert rows["bench overshoot, L_g x 3"]["worst"] < 0.05
-    assert out["gamma"] != rows["gamma beside this source"]["worst"]  # row 1 is the law's there
+    assert out["gamma"] != rows["gamma with this source"]["worst"]  # row 1 is the law's there
 
 
 def test_box_as_a_table(capsys: Capture) -> None:

@@ -88,7 +88,7 @@ def file(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a whole campaign, run by two workers, its file beside it."""
+    """The folder of a complete campaign, run by two workers, with its file beside it."""
     folder = tmp_path_factory.mktemp("campaign")
     (folder / "small.toml").write_text(TEXT, encoding="utf-8")
     arguments = ["campaign", str(folder / "small.toml"), "--out", str(folder / "two")]
@@ -116,7 +116,7 @@ def test_a_resumed_campaign_equals_an_uninterrupted_one(whole: Path, tmp_path: P
     folder = tmp_path / "resumed"
     shutil.copytree(whole / "two", folder)
     lines = (folder / "runs.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
-    kept = lines[:1] + lines[8:14] + [lines[15][:50]]  # as if the power had failed in a line
+    kept = lines[:1] + lines[8:14] + [lines[15][:50]]  # like a power failure within a line
     (folder / "runs.jsonl").write_text("".join(kept), encoding="utf-8")
     arguments = ["campaign", str(whole / "small.toml"), "--out", str(folder)]
     assert main([*arguments, "--resume", "--workers", "1", "--quiet"]) == 0
@@ -299,7 +299,7 @@ def test_ctrl_c_keeps_what_is_there(file: Callable[..., Path], tmp_path: Path) -
 
 
 def test_no_steady_state_is_a_result(file: Callable[..., Path], tmp_path: Path) -> None:
-    # lines so long that P_ref cannot be carried
+    # lines too long to transmit P_ref
     path = file(**{"low = 0.5\nhigh = 10.0": "low = 150.0\nhigh = 160.0"})
     campaign = load_campaign(str(path))
     records = run_chunk(campaign, [(0, "mimo-gfm")])
@@ -314,7 +314,7 @@ def test_no_steady_state_is_a_result(file: Callable[..., Path], tmp_path: Path) 
 def test_shipped_campaign_is_valid() -> None:
     campaign = load_campaign("rig_mimo_gfm")
     assert campaign.file.laws == ["mimo-gfm", "vsg-2"]
-    assert pickle_size(campaign) < 20_000  # it goes along with every task
+    assert pickle_size(campaign) < 20_000  # it is sent with every task
 
 
 def pickle_size(campaign: Campaign) -> int:

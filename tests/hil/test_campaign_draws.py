@@ -1,4 +1,4 @@
-"""What a campaign draws: within its bounds, distributed as told, a function of seed and run."""
+"""A campaign's draws: within bounds, with the set distribution, a function of seed and run."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_normal_stays_within_its_bounds(
     try:
         normal = Normal(type="normal", path="x", mean=mean, sigma=sigma, low=low, high=high)
     except ValidationError:
-        return  # nothing between the bounds, and it says so
+        return  # no number between the bounds: an error
     assert low <= normal.quantile(u) <= high
 
 

@@ -29,13 +29,16 @@ from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.recording.npz import Arrays
-from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
 
 from .can_reference import quantised_run
 from .test_links import in_threads
+
+pytestmark = pytest.mark.processes
 
 KIND = link_kind("can")
 PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
@@ -94,7 +97,7 @@ def both_sides(
         if isinstance(outcome, Exception):
             raise outcome
     merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    return dict(Arrays(read_recording(folder)[0])), found
+    return {name: x[:] for name, x in read_recording(folder)[0].items()}, found
 
 
 BOTH_WAYS = pytest.mark.parametrize("portable", [True, False])
@@ -115,10 +118,10 @@ def test_lockstep_over_can_is_a_run_in_process_in_counts(
     assert np.ptp(apart["true_p"]) > 0
     for name, column in expected.items():
         assert apart[name].tobytes() == column.tobytes(), name
-    for faults, counters in found.values():  # on a busy machine a tick may be asked for again
+    for faults, counters in found.values():  # on a busy machine a side may repeat a tick
         assert not {f: n for f, n in faults.items() if n and f != "repeated"}
         assert not any(counters.values())
-    if not plant:  # a rig's 12-bit D/A is coarser, and the rounding of one meets that of the other
+    if not plant:  # a rig's 12-bit D/A is coarser, and both roundings add up
         exact = run(**content).signals
         assert 0 < np.abs(exact["true_p"] - apart["true_p"]).max() < 2e-3
 
@@ -132,13 +135,13 @@ def test_every_nth_tick_only_is_a_hold_and_a_delay(every, fd, portable, make, tm
     expected = quantised_run(make(**content), tmp_path, every)
     for name, column in expected.items():
         assert apart[name].tobytes() == column.tobytes(), name
-    for faults, _ in found.values():  # on a busy machine a tick may be asked for again, and the bus
-        # carries that only for every n-th: the others are missing from the sequence
+    for faults, _ in found.values():  # on a busy machine a side may repeat a tick, and the bus
+        # carries repeats only of every n-th tick: the others are missing in the sequence
         assert not {f: n for f, n in faults.items() if n and f not in ("repeated", "lost")}
 
 
 def test_any_backend_of_python_can(make, tmp_path):
-    """Here the one for tests of python-can itself, on classic CAN: a vector in two frames."""
+    """With python-can's virtual bus for tests, classic CAN: a vector in two frames."""
     scenario = make(duration=0.02, law="vsg-2", link=PATIENT, events=EVENTS)
     options = {"interface": "virtual", "fd": False, "every": 4}
     apart, _ = both_sides(scenario, tmp_path, "can://test", **options)
@@ -156,15 +159,15 @@ def test_a_flood_of_frames_of_others_changes_nothing(portable, make, tmp_path, e
 
     def flood() -> None:
         for number in itertools.cycle(others):
-            if over.wait(1e-4):  # no bus carries more
+            if over.wait(1e-4):  # a real bus carries no more
                 return
             send(number)
 
     thread = threading.Thread(target=flood)
 
     def touch(side: Side, link: Link) -> Link:
-        if side == "controller":  # both are on the bus and have shaken hands
-            send(others[0])  # at least this, however seldom the other thread gets to run
+        if side == "controller":  # both are on the bus, after the handshake
+            send(others[0])  # at least one, even if the other thread hardly runs
             thread.start()
         return link
 
@@ -184,17 +187,17 @@ def test_a_flood_of_frames_of_others_changes_nothing(portable, make, tmp_path, e
 def test_frames_in_our_name_without_our_check_are_refused(
     portable, make, tmp_path, endpoint, stranger
 ):
-    """Each fault under its own name; the good frames go on, and so does the run."""
+    """Each fault counts under its name; good frames are still accepted, and the run continues."""
     scenario = make(duration=0.02, link=PATIENT, events=EVENTS)
     bad = 20
     disturbance = can.Message(
         arbitration_id=0x120, is_extended_id=False, is_fd=True, data=bytes(12)
     )
-    # a late greeting: a message between the frames
+    # a late greeting: a handshake message between the frames
     greeting = SegmentSender(load_plan(CanOptions()), "plant").frames(b"?" * 100)
 
     def touch(side: Side, link: Link) -> Link:
-        if side == "controller":  # both have shaken hands: what comes now is for the loops
+        if side == "controller":  # after the handshake: later frames go to the loops
             for _ in range(bad):
                 stranger.send(disturbance)
             for number, data in greeting:
@@ -208,7 +211,7 @@ def test_frames_in_our_name_without_our_check_are_refused(
     faults, _ = found["controller"]
     assert (faults["crc"], faults["size"]) == (bad, 1)
     assert sum(faults.values()) - faults["repeated"] == bad + 1
-    # to the plant they are frames of a vector that is not for it
+    # for the plant they are frames of the vector that it sends itself
     assert found["plant"][1]["foreign"] == bad + len(greeting)
 
 
@@ -272,14 +275,14 @@ def test_a_bus_that_goes_away_ends_it(pair, monkeypatch):
 
 
 def test_a_socket_that_goes_away_ends_it(pair):
-    """As the kernel says it: here of a socket that is closed."""
+    """The kernel's error: here of a closed socket."""
     end, said = pair["plant"], r"the CAN bus 127.* is gone: Bad file descriptor"
     end._node.sockets["fd"] = -1
     for call in (end.receive, lambda: end.wait(1)):
         with pytest.raises(PeerLost, match=said):
             call()
     message = np.zeros(100, np.uint8)
-    for _ in range(2):  # as long as nobody asks why
+    for _ in range(2):  # until ``receive`` raises the reason
         assert call_port(end.port.receive, end.port.handle, message) == -1
     with pytest.raises(PeerLost, match=said):
         end.receive()
@@ -290,7 +293,7 @@ def test_a_socket_that_goes_away_ends_it(pair):
 
 @njit
 def call_port(function, handle, message):
-    """As the loops do it."""
+    """Call it as the loops do."""
     return function(handle, message)
 
 

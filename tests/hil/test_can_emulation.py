@@ -1,4 +1,4 @@
-"""A virtual bus as late as a real one: who goes first, and when each is through."""
+"""A virtual bus with a real bus's delays: the order of frames, and when each is delivered."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAME = classic_time(8, BITRATE)
 
 
 class World:
-    """A node's account of the bus, and a clock that is set by hand."""
+    """A node's schedule of the bus, and a clock that the test sets."""
 
     def __init__(self, fd: bool = False) -> None:
         self.now = 100.0
@@ -40,17 +40,17 @@ class World:
         return round(self.now * 1e9)
 
     def send(self, number: int) -> None:
-        """A frame of our own."""
+        """Send a frame of our own."""
         arrive(self.bus, self.places, frame_of(number, bytes(8)), 0, self._ns())
 
     def arrive(self, *numbers: int, length: int = 8) -> None:
-        """Frames of other nodes."""
+        """Receive frames of other nodes."""
         for number in numbers:
             arrive(self.bus, self.places, frame_of(number, bytes(length)), 1, self._ns())
         assert not is_through(self.bus, self.places, self._ns())
 
     def heard_at(self, after: float) -> list[int]:
-        """What has come through that long after the start."""
+        """The frames delivered until ``after`` s after the start."""
         self.now = 100.0 + after
         out, frame = [], np.zeros(1, frame_dtype)
         while is_through(self.bus, self.places, self._ns()):
@@ -85,7 +85,7 @@ def test_ours_keeps_others_waiting():
 
 def test_the_lowest_of_those_that_wait_goes_next():
     world = World()
-    world.arrive(700)  # has the bus
+    world.arrive(700)  # occupies the bus
     world.now += 0.1 * FRAME
     world.arrive(300)
     world.now += 0.1 * FRAME

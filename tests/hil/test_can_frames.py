@@ -1,4 +1,4 @@
-"""CAN frames: as the DBC says, as cantools packs them, and every damage seen."""
+"""CAN frames: they match the DBC and cantools' packing, and every damage is detected."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ values = st.floats(-100, 100)
 
 
 def sample(name: Group, k: int = 0) -> np.ndarray:
-    """Values that 16 bits hold, other ones for each k."""
+    """Values that fit 16 bits, different for each k."""
     return np.array([s.default + s.scale * (j + 10 * k) for j, s in enumerate(group(name))])
 
 
 class Bus:
-    """A sender, a receiver and the bench's reader, with whatever happens in between."""
+    """A sender, a receiver and the bench's reader; the test changes frames in between."""
 
     def __init__(self, name: Group, fd: bool = True, heartbeat: int = 10**9) -> None:
         self.sender = VectorSender(PLAN[fd], name, heartbeat)
@@ -50,7 +50,7 @@ class Bus:
         return frames
 
     def hear(self, *frames) -> list:
-        """Ticks taken, or the faults for which the reader refused."""
+        """Ticks accepted, or the faults of refused frames."""
         out: list = []
         for number, payload in frames:
             assert self.receiver.knows(number)
@@ -190,7 +190,7 @@ def test_no_damaged_frame_is_taken(name, fd, data):
 
 
 def test_a_frame_of_another_definition_is_not_taken():
-    """The same identifier and length, another scale: the data id tells."""
+    """The same identifier and length, another scale: the data id differs."""
     other = write_dbc(True).replace("(0.0002,0.0)", "(0.0004,0.0)")
     sender = VectorSender(plan_of(read_dbc(other)), "y", 10)
     bus = Bus("y")
@@ -232,7 +232,7 @@ def test_an_old_status_moves_no_tick_back(name, fd, last):
     for tick in range(1, last):
         bus.hear(*bus.frames(tick))
     bus.hear(old)
-    for tick in range(last, last + 40):  # until a heartbeat says where the sender is
+    for tick in range(last, last + 40):  # until a heartbeat tells the sender's tick
         found = bus.hear(*bus.frames(tick))
         assert found in ([], ["tick"], [tick])
     assert found == [tick]
@@ -246,7 +246,7 @@ def test_after_a_long_gap_a_heartbeat_finds_in_again(gap):
         bus.frames(tick)
     ticks = [heard for tick in range(gap, gap + 100) for heard in bus.hear(*bus.frames(tick))]
     assert ticks[-50:] == list(range(gap + 50, gap + 100))
-    # before it, new values pass for older ones, never for newer
+    # before it, new values may count as older ones, never as newer
     assert all(t <= now for now, t in enumerate(ticks, gap) if isinstance(t, int))
     assert sum(bus.reader.faults.values()) >= bus.reader.faults["lost"] > 0
 
@@ -295,14 +295,14 @@ def test_the_last_word_under_a_tick_heard_already_is_heard():
 
 @given(vectors, either, st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans())))
 def test_a_tick_asked_for_again_is_never_taken_for_the_next(name, fd, story):
-    """Lockstep: a tick goes on only once it was heard; any frames may get lost."""
+    """Lockstep: a tick ends only once its frame was received; any frames may get lost."""
     bus = Bus(name, fd)
     tick, heard = 0, 0
     for status, *parts in story:
         kept = [
             f
             for f in bus.frames(tick)
-            if (status if f[0] < 0x110 else parts[f[0] % 2])  # which ones arrive
+            if (status if f[0] < 0x110 else parts[f[0] % 2])  # these frames arrive
         ]
         found = bus.hear(*kept)
         assert found in ([], [tick])
@@ -313,7 +313,7 @@ def test_a_tick_asked_for_again_is_never_taken_for_the_next(name, fd, story):
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.booleans())))
 def test_real_time_ticks_that_are_skipped_are_never_taken_for_newer_ones(story):
-    """A controller that misses measurements: its sequence goes on, its tick jumps."""
+    """A controller that misses measurements: its sequence continues, its tick jumps."""
     bus = Bus("u")
     tick, known = -1, True
     for skipped, kept in story:
@@ -385,7 +385,7 @@ def test_a_dbc_that_does_not_describe_the_link(old, new, fault):
 
 
 def test_a_dbc_may_move_signals_and_frames():
-    """Values come from where the DBC says, whatever the order: here p and q change places."""
+    """Values are read from their places in the DBC, in any order: here p and q are swapped."""
     text = write_dbc(True)
     text = text.replace("SG_ p : 32|", "SG_ p : X|").replace("SG_ q : 64|", "SG_ q : 32|")
     text = text.replace("SG_ p : X|", "SG_ p : 64|").replace(" 288 ", " 300 ")

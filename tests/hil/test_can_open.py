@@ -1,4 +1,4 @@
-"""Which buses and files a CAN link takes, what it says of others, and the bus of our own."""
+"""Buses and files that a CAN link accepts, its errors for others, and our loopback bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is held between two exchanges, and how its faults are counted."""
+"""The values held between two exchanges, and the count of faults."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EVERY = 4
 
 
 class Side:
-    """One side's stage, what the bus brings it, and the reader behind it."""
+    """One side's stage, its incoming messages, and the reader behind it."""
 
     def __init__(self, group: Group) -> None:
         self.inbox: list[bytes] = []
@@ -25,7 +25,7 @@ class Side:
         self.values = np.zeros(len(names(group)))
 
     def heard(self) -> list:
-        """(tick, value) of what was taken, or the fault."""
+        """(tick, value) of accepted frames, or the fault."""
         out: list = []
         while (message := self.stage.receive()) is not None:
             try:
@@ -59,7 +59,7 @@ def test_the_controller_gets_what_is_between_before_the_next():
     side.inbox = [frame("y", tick, tick) for tick in (0, 4, 8)]
     assert side.heard() == [(0, 0), *((t, 0) for t in (1, 2, 3)), (4, 4),
                             *((t, 4) for t in (5, 6, 7)), (8, 8)]  # fmt: skip
-    side.inbox = [frame("y", 8, 9)]  # asked again
+    side.inbox = [frame("y", 8, 9)]  # a repeat
     assert side.heard() == [(8, 8)]
     side.inbox = [frame("y", 12, 13), frame("y", 14, 15, STOPPED)]
     assert side.heard() == [*((t, 8) for t in (9, 10, 11)), (12, 12), (13, 12), (14, 14)]
@@ -116,7 +116,7 @@ def test_a_command_from_the_future_is_not_kept_until_it_fits(attack_now):
     found, lie = [], 16
     for tick in range(28):
         side.stage.goes(frame("y", tick, tick))
-        side.reader.record["newest"] = tick  # as the plant does
+        side.reader.record["newest"] = tick  # as the plant's loop does
         if tick == 0:
             side.inbox += [frame("u", 0, 0), frame("u", lie, 1)]
         elif tick % EVERY == 0 and tick != lie:

@@ -1,4 +1,4 @@
-"""Frame times: the longest of all frames, found by trying them; what fits a period."""
+"""Frame times: the longest of all frames, found by brute force; and what fits a period."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def bits_of(value: int, width: int) -> list[int]:
 
 
 def stuffed(bits: list[int]) -> tuple[list[int], list[int]]:
-    """The bits on the wire and, for each, the index of the bit that it is or follows."""
+    """The bits on the wire; for each, its index or, for a stuff bit, that of the bit before."""
     out, of, run = [], [], 0
     for k, bit in enumerate(bits):
         run = run + 1 if out and out[-1] == bit else 1
@@ -31,7 +31,7 @@ def stuffed(bits: list[int]) -> tuple[list[int], list[int]]:
 
 
 def crc_15(bits: list[int]) -> int:
-    """Long division, as in the standard's text."""
+    """CRC by long division, as in the standard's text."""
     crc = 0
     for bit in bits:
         top = bit ^ (crc >> 14)
@@ -55,7 +55,7 @@ def fd_bits(number: int, payload: bytes) -> tuple[int, int]:
     head = [0, *bits_of(number, 11), 0, 0, 1, 0, 1]
     bits = [*head, 0, *bits_of(len(payload), 4), *data]
     _, of = stuffed(bits)
-    of = [k for k in of if k < len(bits)]  # a fixed stuff bit stands where another would follow
+    of = [k for k in of if k < len(bits)]  # a fixed stuff bit replaces another
     slow = sum(k < len(head) for k in of)
     count_and_crc = 4 + 17
     fixed = len(range(0, count_and_crc + 1, 4))  # before its bits 0, 4, 8 … 20
@@ -99,11 +99,11 @@ def test_fd_frames_of_every_identifier():
 
 
 def test_the_longest_frames_that_the_link_sends():
-    """µs; of a CAN FD frame at 1/8 Mbit/s a stuff bit of the data is 0.125 µs."""
+    """In µs; a stuff bit in the data of a CAN FD frame at 1/8 Mbit/s takes 0.125 µs."""
     assert fd_time(12, 1e6, 8e6) * 1e6 == pytest.approx(51.0)
     assert fd_time(8, 1e6, 8e6) * 1e6 == pytest.approx(46.125)
     assert classic_time(8, 1e6) * 1e6 == pytest.approx(133)
-    # Davis et al. 2007 bound a classic frame by every fourth bit of all that are stuffed
+    # Davis et al. 2007 bound a classic frame by one stuff bit per four bits of the stuffed part
     assert classic_time(8, 1.0) <= 8 * 8 + 47 + (34 + 8 * 8 - 1) // 4
 
 

@@ -1,7 +1,7 @@
-"""SocketCAN for real, in a kernel that has it: user-mode Linux, booted on the host's files.
+"""Real SocketCAN, in a kernel that has it: user-mode Linux, booted on the host's files.
 
-Debian's packages ``user-mode-linux``, ``kmod`` and ``iproute2``. The kernel is a process of the
-user, but the tests inside write to the host's files, so they want to be asked for: GFMHIL_UML=1.
+Needs Debian's packages ``user-mode-linux``, ``kmod`` and ``iproute2``. The kernel is a process of
+the user, but the tests inside write to the host's files, so they run only with GFMHIL_UML=1.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ EVENT = {
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Each test in a folder of its own, on a terminal of 80 columns."""
+    """Run each test in its own folder, on a terminal of 80 columns."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     return tmp_path
@@ -50,7 +50,7 @@ def call(capsys):
 
 
 def scenario(**content: Any) -> str:
-    """A short scenario file in the folder."""
+    """Write a short scenario file to the folder."""
     content = {"title": "short [run]", "duration": 0.3, "link": {"type": "inproc"}, **content}
     Path("short.toml").write_text(toml_text(content))
     return "short.toml"
@@ -64,7 +64,7 @@ TRIP = {
 
 
 def assert_fits(text: str) -> None:
-    """A terminal of 80 columns shows it whole: no line is longer and no cell is cut."""
+    """Check that the text fits 80 columns: no line is longer and no cell is cut."""
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
 

@@ -1,4 +1,4 @@
-"""The frames' CRC-32, by tables and by whatever this processor has, against zlib's."""
+"""The frames' CRC-32, by tables and by this processor's instructions, against zlib's."""
 
 from __future__ import annotations
 

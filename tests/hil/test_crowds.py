@@ -1,4 +1,4 @@
-"""Both servers beside one run: hundreds of mute pages, thousands of half-open connections."""
+"""Both servers beside one run: hundreds of silent pages, thousands of half-open connections."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from gfm_hil.operator import Operator
 from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, at, wait_for
 from .scope_pages import addresses, mute
 
+pytestmark = pytest.mark.processes
+
 PAGES, CONNECTIONS, DESCRIPTORS = 200, 2000, 1024
 TURN_S = 5.0
 LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "roll", "span": 2.0}
@@ -33,7 +35,7 @@ LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "roll", 
 
 @pytest.fixture
 def lab(tmp_path) -> Iterator[tuple[Path, list[subprocess.Popen[str]]]]:
-    """A run, and the servers beside it, which have 1,024 descriptors each."""
+    """A run and the servers beside it, each limited to 1,024 descriptors."""
     (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
     folder = tmp_path / "run"
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -67,7 +69,7 @@ def lab(tmp_path) -> Iterator[tuple[Path, list[subprocess.Popen[str]]]]:
 
 
 class Page(threading.Thread):
-    """The operator's page: reads all it is sent, and notes answers and the number of pictures."""
+    """The operator's page: reads all messages, and stores answers and the number of pictures."""
 
     def __init__(self, socket: ClientConnection) -> None:
         super().__init__(daemon=True)
@@ -108,7 +110,7 @@ def test_the_operator_goes_on_in_a_crowd(lab, attack_now) -> None:
         device.close()
 
         def turn(page: Page, number: int) -> tuple[int, int, int]:
-            """A while with commands and heartbeats; ticks, misses and pictures in it."""
+            """Send commands and heartbeats for a while; returns ticks, misses and pictures."""
             first, pictures, answers = watch.snapshot(), page.pictures, len(page.answers)
             until, k = time.monotonic() + TURN_S, 0
             while time.monotonic() < until:

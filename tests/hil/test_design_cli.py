@@ -1,4 +1,4 @@
-"""gfmhil design gamma and tune: what they print, write and refuse."""
+"""gfmhil design gamma and tune: their output, files and errors."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_weights_of_ones_own(capsys: Capture, tmp_path: Path) -> None:
     path.write_text("[W_21]\nnum = [2.0]\nden = [1.0]\n")
     out = said(capsys, "gamma", "--law", "mimo-gfm", "--weights", str(path))
     assert len(out["channels"]) == 1
-    assert out["gamma"] == pytest.approx(2.0, rel=0.2)  # p follows P_ref, hardly above
+    assert out["gamma"] == pytest.approx(2.0, rel=0.2)  # p follows P_ref, with little overshoot
 
 
 def test_tune(capsys: Capture, tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ a = { value = 0.5, unit = "p.u.", source = "s", free = [-2.0, 2.0] }
     ("was", "becomes", "words"),
     [
         ("value = 0.5", "value = -1.0", "omega_u loop"),  # omega_u = ... + omega_u
-        ("", "", "no steady state"),  # nothing holds v_dc
+        ("", "", "no steady state"),  # nothing controls v_dc
         ("[-2.0, 2.0]", "[2.0, -2.0]", "parameters.a.free: [2, -2] must be finite and ascending"),
         ("[-2.0, 2.0]", "[1.0, 2.0]", "start 0.5 lies outside [1, 2]"),
     ],

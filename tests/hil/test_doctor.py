@@ -1,4 +1,4 @@
-"""gfmhil doctor: what it finds, what it advises, its exit codes, and that it only looks."""
+"""gfmhil doctor: its findings, its advice, its exit codes, and that it changes nothing."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ GOOD = {
 
 
 def facts(**changed: object) -> doctor.Facts:
-    """Those of a good machine, with what is given instead."""
+    """The facts of a good machine, with the given changes."""
     return {**environment(), **GOOD, **changed}
 
 
 def line(what: str, **changed: object) -> doctor.Finding:
-    """The line of that name."""
+    """The finding of that name."""
     return {f.what: f for f in doctor.judge(facts(**changed))}[what]
 
 
@@ -112,10 +112,10 @@ def test_it_reads_the_kernel_s_files(tmp_path):
         (tmp_path / name).write_text(text + "\n")
     seen = doctor.look(tmp_path)
     assert seen["governors"] == ["performance", "powersave"]
-    assert seen["deepest_idle_us"] == 3  # the deeper one is switched off
+    assert seen["deepest_idle_us"] == 3  # the deeper state is disabled
     assert (seen["smt"], seen["rt_share"], seen["rt_priority"]) == (True, 0.8, 99)
     assert (seen["can"], seen["can_modules"]) == ({"can0": "down"}, ["can-raw", "vcan"])
-    assert seen["shm_minutes"] is None  # there is none below that root
+    assert seen["shm_minutes"] is None  # no such file below that root
 
 
 def test_nothing_there_is_nothing_found(tmp_path):

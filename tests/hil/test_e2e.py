@@ -33,7 +33,7 @@ by_side = pytest.mark.parametrize("side", SIDES)
 
 
 class Forger(FrameWriter):
-    """Packs frames with a good CRC of any tick below 2**64."""
+    """Packs frames with a good CRC and any tick below 2**64."""
 
     def __init__(self, group: Group, sequence: int = 0) -> None:
         super().__init__(group)
@@ -55,7 +55,8 @@ def limited(side: Side, scenario: Scenario) -> FrameReader:
 
 
 def fault_of(reader: FrameReader, sequence: int, tick: int, state: int = 0, reason: int = 0) -> str:
-    """Why a reader refuses a frame with a good CRC, or "" if it takes it; refused, it is unused."""
+    """Fault of a frame with a good CRC, "" if the reader accepts it; checks that a refused frame
+    is not used."""
     message = Forger(reader.group, sequence).forge(tick, state, reason)
     values = np.full(len(names(reader.group)), 7.0)
     faults = ("faults", "fault")
@@ -75,7 +76,7 @@ def fault_of(reader: FrameReader, sequence: int, tick: int, state: int = 0, reas
 def test_a_tick_at_which_the_peer_cannot_be_is_refused(side, tick, make):
     reader = limited(side, make(**REALTIME))
     assert fault_of(reader, 1, tick) == "tick"
-    assert fault_of(reader, 1, 91) == ""  # as if the other had never come
+    assert fault_of(reader, 1, 91) == ""  # as if the refused one had never come
 
 
 @pytest.mark.attack("1.2", "a u from the future, or older than late_policy.hold", "acts")
@@ -102,7 +103,7 @@ def test_a_state_or_reason_without_a_meaning_is_refused(side, state, reason, mak
 @by_side
 def test_a_replay_after_the_wrap_is_refused_for_its_tick(side, make):
     reader = limited(side, make(**REALTIME))
-    reader.record["next"] = 5  # the sequence has wrapped; once, 7 belonged to tick 7
+    reader.record["next"] = 5  # the sequence has wrapped; 7 once belonged to tick 7
     assert fault_of(reader, 7, 7) == "tick"
     assert fault_of(reader, 5, 91) == ""
 
@@ -127,14 +128,14 @@ def test_a_peer_that_leaves_is_heard_under_its_last_tick_and_the_next(side, make
         assert fault_of(reader, 1, tick, STOPPED) == fault
         assert reader.left == (not fault)
     late = limited(side, make(**REALTIME, after_trip="wait"))
-    assert fault_of(late, 1, 90, SAFE) == "tick"  # there a side that is safe goes on running
+    assert fault_of(late, 1, 90, SAFE) == "tick"  # in this scenario a safe side keeps running
 
 
 def test_in_lockstep_a_tick_comes_again_as_often_as_the_plant_may_ask(make):
     link = {"type": "inproc", "peer_timeout_s": 0.1, "repeat_s": 0.01}
     reader = FrameReader.of("controller", make(link=link))
     assert [fault_of(reader, n, 0) for n in range(13)] == [""] * 11 + ["tick"] * 2
-    assert fault_of(reader, 13, 1) == ""  # a newer tick may come again as often
+    assert fault_of(reader, 13, 1) == ""  # a newer tick may repeat as often
     assert [fault_of(reader, 14 + n, 1) for n in range(11)] == [""] * 10 + ["tick"]
 
 
@@ -147,7 +148,7 @@ def test_the_states_of_the_protection(make):
     assert reader.e2e == "valid"
     reader.judge(True, False)
     assert reader.e2e == "invalid"
-    assert (fault_of(reader, 1, 1), reader.e2e) == ("", "invalid")  # a frame alone re-arms nothing
+    assert (fault_of(reader, 1, 1), reader.e2e) == ("", "invalid")  # a frame alone does not re-arm
     reader.judge(False, True)
     assert reader.e2e == "invalid"
     reader.judge(False, False)  # the safe state was reset
@@ -156,7 +157,7 @@ def test_the_states_of_the_protection(make):
 
 
 class Played:
-    """A link that brings what it was given and keeps what is sent."""
+    """A link that delivers given messages and stores sent ones."""
 
     port = None
 

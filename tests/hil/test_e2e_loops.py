@@ -1,10 +1,11 @@
-"""A peer that packs good CRCs and wrong content: no link's loop stays alive by it or acts on it.
+"""A peer that sends good CRCs and wrong content: no loop, on any link, stays alive or acts on it.
 
-One side runs its real loop; the other side is played by a peer that lies.
+One side runs its real loop; a lying peer plays the other side.
 """
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
@@ -23,14 +24,18 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
+from gfm_hil.results.run_folder import finish
 from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.signals import NU, Group, names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
 from .test_e2e import FAR, HOLD, REALTIME, T_NS, Forger
 from .test_faults import LINKS
+
+pytestmark = pytest.mark.processes
 
 BAD = np.array([0.9, 1.05, 0.8])  # a u that no honest frame of these tests carries
 GROUPS: dict[Side, Group] = {"plant": "u", "controller": "y"}  # what each side hears
@@ -42,7 +47,7 @@ by_link = pytest.mark.parametrize("link", LINKS)
 
 
 class Liar:
-    """The other side's end of the link, and what it heard: time, tick, state and reason."""
+    """The other side's end of the link, and its received frames: time, tick, state, reason."""
 
     def __init__(self, link: Link, side: Side) -> None:
         self._link, self.over = link, threading.Event()
@@ -58,7 +63,7 @@ class Liar:
             self.listen()  # ZeroMQ has no room before the other side has connected
 
     def listen(self) -> None:
-        """Take in what has come."""
+        """Read the received frames."""
         unused = np.zeros(len(names(self.reader.group)))
         while (message := self._link.receive()) is not None:
             self.reader.unpack(message, unused)
@@ -66,7 +71,7 @@ class Liar:
             self.heard.append((time.monotonic_ns(), r.tick, r.state, r.reason))
 
     def keep_saying(self, tick: int, pause_s: float = 0.0005) -> None:
-        """The same tick under new sequence numbers, until the other side has ended."""
+        """Send the same tick under new sequence numbers until the other side has ended."""
         give_up = time.monotonic() + LIMIT_S
         while not self.over.wait(pause_s) and time.monotonic() < give_up:
             self.say(tick)
@@ -81,7 +86,7 @@ class Liar:
 
 @dataclass
 class Found:
-    """What the side that was lied to left."""
+    """The results of the side under test."""
 
     reader: FrameReader
     part: Part
@@ -98,7 +103,7 @@ class Found:
 def lied_to(
     side: Side, scenario: Scenario, folder: Path, link: str, lie: Callable[[Liar], None]
 ) -> Found:
-    """Run one side over one of ``LINKS`` against a peer that does what ``lie`` says."""
+    """Run one side over one of ``LINKS`` against a peer that runs ``lie``."""
     name, options = LINKS[link]
     endpoint = link_kind(name).fresh(folder)
     bench, part = make_bench(scenario), Part.create(folder, side, scenario.ticks)
@@ -142,11 +147,19 @@ def honest_then_frozen(liar: Liar) -> None:
 @pytest.mark.attack("1.6", "a plant whose tick stands still", "RUNNING for ever")
 @by_link
 def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now):
-    found = lied_to("controller", make(**REALTIME), place, link, honest_then_frozen)
+    scenario = make(**REALTIME)
+    found = lied_to("controller", scenario, place, link, honest_then_frozen)
     status, reason, tick = found.end
     assert (status, reason) == ("safe", REASONS[STALE])
     assert set(found.refused) <= {"tick"}
     assert found.reader.e2e == "invalid"
+    faults = found.reader.faults
+    end = {"side": "controller", "faults": faults, "e2e": found.reader.e2e, "one_clock": True}
+    (place / "link_controller.json").write_text(json.dumps(end), encoding="utf-8")
+    (place / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
+    summary = finish(scenario, place, [scenario.law], 0.0, figures=False).summary
+    assert summary["e2e"] == {"controller": "invalid"}
+    assert summary["faults"] == {"controller": {f: n for f, n in faults.items() if n}}
     when, _, state, code = found.liar.last_words()
     assert (state, code) == (SAFE, STALE)
     ticks = (when - int(found.part.times[tick, 1])) / T_NS
@@ -212,7 +225,7 @@ def test_u_of_another_time_never_acts(link, make, place, attack_now):
     u = found.part.signals[: found.part.progress[0], 5 : 5 + NU]
     assert not np.isclose(u, BAD, atol=1e-3).all(axis=1).any()
     assert found.end[:2] == ("safe", NO_FRESH_U)
-    if link == "shm":  # there all frames have arrived before the first tick ends
+    if link == "shm":  # all frames arrive before the first tick ends
         assert found.refused == {"tick": 4}
     attack_now(f"{link}: none acts in {len(u)} ticks; refused: {found.refused.get('tick', 0)}")
 

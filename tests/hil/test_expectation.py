@@ -1,4 +1,4 @@
-"""What a scenario expects of its end: status, reason and time, each of which can fail alone."""
+"""A scenario's expected end: status, reason and time; each can fail alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs as files of other tools, read again by those tools' own libraries."""
+"""Runs exported to files of other tools, read back by those tools' libraries."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from scipy.io import loadmat
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.export import FORMATS, RunTable, export_run, load_run
-from gfm_hil.results.export.columns import all_columns, describe
+from gfm_hil.recording.columns import TABLE, describe
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.export import FORMATS, export_run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant.names import TRIP_REASONS
@@ -31,7 +32,7 @@ EVENTS = [
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory) -> RunTable:
+def table(tmp_path_factory) -> RecordedRun:
     """A run between two processes, so that there are times; its operator did something, too."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     content = {"title": "to be exported", "duration": 0.05, "link": {"type": "shm"}}
@@ -41,8 +42,9 @@ def table(tmp_path_factory) -> RunTable:
     first, *rest = log.read_text(encoding="utf-8").splitlines(keepends=True)
     line = json.dumps({**told, "by": "operator"}) + "\n"
     log.write_text("".join([first, line, *rest]), encoding="utf-8")
-    table = load_run(folder)
-    return replace(table, values={name: x[:] for name, x in table.values.items()})
+    run = RecordedRun.load(folder)
+    signals, timing = ({name: x[:] for name, x in c.items()} for c in (run.columns, run.timing))
+    return replace(run, columns=signals, timing=timing)
 
 
 def same(a: np.ndarray, b: np.ndarray) -> bool:
@@ -50,13 +52,13 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def test_the_table_has_every_column_of_the_recording(table):
-    assert list(table.values) == all_columns()
-    assert len({len(x) for x in table.values.values()}) == 1
-    assert table.values["plant_received"].min() > 0
+    assert list(table.recorded) == [*TABLE]
+    assert len({len(x) for x in table.recorded.values()}) == 1
+    assert table.recorded["plant_received"].min() > 0
 
 
 def test_every_column_is_described():
-    for name in all_columns():
+    for name in [*TABLE]:
         column = describe(name, ["a", "b"])
         assert column.comment
         assert bool(column.unit) != (bool(column.words) or name == "tick")
@@ -68,9 +70,9 @@ def test_csv_is_read_again_as_it_was(table, tmp_path):
     export_run(table.folder, "csv", tmp_path / "run.csv")
     with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as file:
         names, *lines = list(csv.reader(file))
-    assert names == list(table.values)
+    assert names == list(table.recorded)
     for name, texts in zip(names, zip(*lines, strict=True), strict=True):
-        x = table.values[name]
+        x = table.recorded[name]
         number = float if x.dtype.kind == "f" else int
         assert same(np.array([number(text) for text in texts], x.dtype), x), name
 
@@ -78,8 +80,8 @@ def test_csv_is_read_again_as_it_was(table, tmp_path):
 def test_mat_is_read_again_as_it_was(table, tmp_path):
     export_run(table.folder, "mat", tmp_path / "run.mat")
     found = loadmat(tmp_path / "run.mat", simplify_cells=True)
-    for column in table.columns:
-        assert same(found[column.name], table.values[column.name]), column
+    for column in table.described:
+        assert same(found[column.name], table.recorded[column.name]), column
         unit = found["unit"][column.name]  # an empty text comes back as an empty array
         assert (unit if len(unit) else "") == column.unit
         assert found["comment"][column.name] == column.comment
@@ -93,9 +95,9 @@ def test_mat_is_read_again_as_it_was(table, tmp_path):
 def test_parquet_is_read_again_as_it_was(table, tmp_path):
     export_run(table.folder, "parquet", tmp_path / "run.parquet")
     found = parquet.read_table(tmp_path / "run.parquet")
-    assert found.column_names == list(table.values)
-    for column in table.columns:
-        assert same(found[column.name].to_numpy(), table.values[column.name]), column
+    assert found.column_names == list(table.recorded)
+    for column in table.described:
+        assert same(found[column.name].to_numpy(), table.recorded[column.name]), column
         about = found.schema.field(column.name).metadata
         assert about[b"unit"].decode() == column.unit
         assert about[b"comment"].decode() == column.comment
@@ -111,19 +113,19 @@ def mdf(table, tmp_path):
 
 
 def test_mf4_is_read_again_as_it_was(table, mdf):
-    for column in table.columns:
+    for column in table.described:
         if column.name == "t":
             continue
         channel = mdf.get(column.name, raw=True)
-        assert same(channel.samples, table.values[column.name]), column
-        assert same(channel.timestamps, table.values["t"])
+        assert same(channel.samples, table.recorded[column.name]), column
+        assert same(channel.timestamps, table.recorded["t"])
         assert (channel.unit, channel.comment) == (column.unit, column.comment)
     began = (table.folder / "scenario.toml").stat().st_mtime
     assert abs(mdf.start_time - datetime.fromtimestamp(began, UTC)).total_seconds() < 1e-3
 
 
 def test_mf4_says_codes_in_words(table, mdf):
-    laws = [table.laws[int(k)].encode() for k in table.values["law"]]
+    laws = [table.laws[int(k)].encode() for k in table.recorded["law"]]
     assert mdf.get("law").samples.tolist() == laws
     assert {*laws} == {b"mimo-gfm", b"vsg-2"}
     assert {*mdf.get("state").samples.tolist()} == {b"RUNNING"}
@@ -143,7 +145,7 @@ def test_mf4_has_the_events_at_their_ticks_and_what_they_came_from(table, mdf):
 
 def test_a_package_that_is_missing_is_named(table, tmp_path, monkeypatch):
     monkeypatch.setattr("gfm_hil.results.export.formats.find_spec", lambda name: None)
-    for name in sorted(set(FORMATS) - {"csv"}):
+    for name in sorted(name for name, form in FORMATS.items() if form.needs):
         with pytest.raises(UserError, match=rf"--format {name} needs .*gfmhil\[export\]"):
             export_run(table.folder, name, tmp_path / "file")
     export_run(table.folder, "csv", tmp_path / "file")
@@ -182,4 +184,4 @@ def test_what_cannot_be_done_is_said_in_a_line(table, tmp_path, capsys, monkeypa
 def test_a_run_that_is_not_over_is_to_be_streamed(tmp_path):
     (tmp_path / "scenario.toml").touch()
     with pytest.raises(UserError, match="the run is not over, see gfmhil stream"):
-        load_run(tmp_path)
+        RecordedRun.load(tmp_path)

@@ -1,4 +1,4 @@
-"""CAN frames rebuilt from a recording, against what a third node saw on the bus."""
+"""CAN frames rebuilt from a recording, against those that a third node received."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.can.dbc import SEGMENT, STATUS, VECTORS
 from gfm_hil.links.can.loopback import LoopbackBus
-from gfm_hil.results.export import export_run, load_run
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.export import export_run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 
@@ -22,7 +23,7 @@ LAST = 4  # words of a side that end a run
 
 
 class Listener(threading.Thread):
-    """A third node on a loopback bus, which keeps what it hears."""
+    """A third node on a loopback bus, which stores all frames."""
 
     def __init__(self, channel: str) -> None:
         super().__init__()
@@ -48,7 +49,7 @@ CONTENT = {
 
 
 def run_over_can(folder: Path, port: int, content=CONTENT, **options) -> list[can.Message]:
-    """A short run over CAN; returns what was on the bus."""
+    """A short run over CAN; returns the frames on the bus."""
     channel = BUS.format(port=port)
     link = {"type": "can", "endpoint": f"can+udp://{channel}", "repeat_s": 5.0}
     content = {**content, "link": {**link, "options": {"heartbeat": 50, **options}}}
@@ -90,7 +91,7 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
         rebuilt = [(m.arbitration_id, bytes(m.data), m.is_fd) for m in found
                    if m.arbitration_id in numbers]  # fmt: skip
         assert rebuilt == there[: len(rebuilt)]
-        # the rest: what ends a run and, of u, what nobody took any more
+        # the rest: a side's last frames and, of u, frames that the plant no longer read
         said_last = (count + 1) * LAST
         nobody_took = count if side == "controller" and options.get("every", 1) > 1 else 0
         assert 0 < len(there) - len(rebuilt) <= said_last + nobody_took
@@ -102,16 +103,16 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
 def test_cantools_decodes_what_the_run_recorded(tmp_path):
     run_over_can(tmp_path / "run", 19530)
     found, dbc = exported(tmp_path / "run", tmp_path)
-    table = load_run(tmp_path / "run")
+    table = RecordedRun.load(tmp_path / "run")
     for group in ("y", "u"):
         message = dbc.get_message_by_name(VECTORS[group])
         frames = [m for m in found if m.arbitration_id == message.frame_id]
-        assert len(frames) == len(table.values["tick"])
-        np.testing.assert_allclose([m.timestamp for m in frames], table.values["t"][:], atol=1e-9)
+        assert len(frames) == len(table.recorded["tick"])
+        np.testing.assert_allclose([m.timestamp for m in frames], table.recorded["t"][:], atol=1e-9)
         values = [message.decode(m.data) for m in frames]
         for signal in message.signals[2:]:
             seen = np.array([v[signal.name] for v in values])
-            away = np.abs(seen - table.values[f"{group}_{signal.name}"][:])
+            away = np.abs(seen - table.recorded[f"{group}_{signal.name}"][:])
             # commands came over the bus in counts; measurements are recorded as the A/D read them
             assert away.max() <= (1e-12 if group == "u" else signal.scale / 2 + 1e-12)
 
@@ -121,11 +122,11 @@ def test_any_run_can_be_put_into_frames(run, tmp_path):
     assert [dbc.decode_message(m.arbitration_id, m.data).get("State") for m in found[:4]] == [
         "INIT", None, "RUNNING", None,
     ]  # fmt: skip
-    assert len(found) == 2 * 200 + 2 * 2  # each state is said with its first two vectors
+    assert len(found) == 2 * 200 + 2 * 2  # a status goes with the first two vectors of a state
 
 
 def test_a_safe_state_is_said_with_its_reason(tmp_path):
-    """The plant trips at a phase jump and both sides say so, until the reset."""
+    """The plant trips at a phase jump and both sides report it, until the reset."""
     content = {
         "title": "tripped on a bus",
         "duration": 0.04,

@@ -1,4 +1,4 @@
-"""Faults on purpose on every link, in lockstep: each is counted, none changes a result."""
+"""Deliberate faults on every link, in lockstep: each is counted, none changes a result."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from gfm_hil.core.roles import SIDES
 from gfm_hil.scenario.model import check_scenario
 
 from .pairs import PATIENT, Pair, run_pair
+
+pytestmark = pytest.mark.processes
 
 TICKS, MANY = 2_000, 100_000
 LINKS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -60,7 +62,7 @@ def unharmed(link: str, ticks: int) -> dict[str, np.ndarray]:
 
 
 def check(pair: Pair, link: str, ticks: int) -> None:
-    """Nothing changed, and every fault is in its class, none besides."""
+    """Check that the signals are unchanged, and that exactly the injected faults are counted."""
     assert {side: end[0] for side, end in pair.ends().items()} == dict.fromkeys(SIDES, "completed")
     plain = unharmed(link, ticks)
     for name in plain:
@@ -70,7 +72,7 @@ def check(pair: Pair, link: str, ticks: int) -> None:
         assert i["seen"] >= ticks
         assert faults["crc"] == i["corrupted"]
         gone = i["lost"] + i["corrupted"] + i["reordered"] + i["dropped"]
-        refused = pair.injected[other]["refused"]  # by a link without room, on a crowded machine
+        refused = pair.injected[other]["refused"]  # the link had no room, on a crowded machine
         assert gone <= faults["lost"] <= gone + refused
         late = faults["repeated"] + faults["out_of_sequence"]
         assert late <= i["duplicated"] + i["reordered"] <= late + i["waiting"]
@@ -95,7 +97,7 @@ def test_every_fault_is_counted_and_no_result_changes(link, kind, place):
 @pytest.mark.parametrize("kind", IMPAIRMENTS)
 @pytest.mark.parametrize("link", LINKS)
 def test_every_fault_is_counted_in_a_hundred_thousand_ticks(link, kind, place):
-    """And GFMHIL_FAULTS_REPORT, a file, gets a row of the table in docs/protection.md."""
+    """Appends a row of the table in docs/protection.md to the file GFMHIL_FAULTS_REPORT."""
     pair = lockstep(place, link, MANY, IMPAIRMENTS[kind])
     check(pair, link, MANY)
     with Path(os.environ["GFMHIL_FAULTS_REPORT"]).open("a", encoding="utf-8") as file:
@@ -103,7 +105,7 @@ def test_every_fault_is_counted_in_a_hundred_thousand_ticks(link, kind, place):
 
 
 def row(link: str, kind: str, pair: Pair) -> str:
-    """Both sides' counters together, as a row of a table in Markdown."""
+    """The sum of both sides' counters as a row of a table in Markdown."""
     i = {name: sum(pair.injected[s][name] for s in SIDES) for name in pair.injected["plant"]}
     f = {name: sum(pair.faults[s][name] for s in SIDES) for name in pair.faults["plant"]}
     told = [i[n] for n in ("seen", "lost", "corrupted", "duplicated", "reordered", "refused")]

@@ -1,4 +1,4 @@
-"""Figures of recordings that are whole, cut short, or lack a side."""
+"""Figures of recordings that are complete, cut short, or lack a side."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 
 
 
 def recording(ticks: int) -> dict[str, np.ndarray]:
-    """Signals with an oscillation, as a plant and a controller record them."""
+    """Signals with an oscillation, in the form that plant and controller record."""
     t = np.arange(ticks) * 1e-4
     names = ("p", "q", "omega_u", "omega_g", "V", "v_dc", "i")
     wave = 1 + 0.1 * np.sin(2 * np.pi * 50 * t)
@@ -31,7 +31,7 @@ def events(count: int) -> list[dict[str, object]]:
 def test_a_run_of_any_length_is_drawn_without_a_warning(ticks, make, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", ResourceWarning)  # of what another test has left
+        warnings.simplefilter("ignore", ResourceWarning)  # from another test
         pictures = draw_run(tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)})
     assert [p.name for p in pictures] == ["signals.png"]
     assert pictures[0].stat().st_size > 20_000
@@ -43,7 +43,7 @@ def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):
         signals[name][30_000:] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", ResourceWarning)  # of what another test has left
+        warnings.simplefilter("ignore", ResourceWarning)  # from another test
         draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []})
 
 

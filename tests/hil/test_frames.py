@@ -1,4 +1,4 @@
-"""A frame arrives as it was sent or not at all, and every fault is counted under its name."""
+"""A frame arrives unchanged or not at all, and every fault is counted under its name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def resealed(good: bytes, at: int, value: int) -> bytes:
 
 
 def refused(reader: FrameReader, message: bytes) -> str:
-    """The fault for which a frame is refused; the values in hand must not be touched."""
+    """The fault of a refused frame; checks that the last values are unchanged."""
     values = np.full(WIDTH[reader.group], 7.0)
     before = reader.tick, reader.state, reader.reason
     with pytest.raises(FrameError) as found:
@@ -96,7 +96,7 @@ def test_an_older_frame_is_refused_and_counted():
         reader.unpack(frame(sequence=sequence), values)
     with pytest.raises(FrameError, match="out_of_sequence"):
         reader.unpack(frame(sequence=1), values)
-    reader.unpack(frame(sequence=3), values)  # the stream goes on where it was
+    reader.unpack(frame(sequence=3), values)  # the sequence continues
     assert reader.faults == {**dict.fromkeys(FAULTS, 0), "out_of_sequence": 1}
 
 

@@ -1,4 +1,4 @@
-"""What a peer says in place of a greeting: refused in words and counted, and the wait goes on."""
+"""Messages in place of a greeting: refused with a notice and counted, and the wait continues."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from gfm_runtime.signals import NY
 from .test_links import PATIENT
 from .test_shm import endpoint as shm_endpoint
 
+pytestmark = pytest.mark.processes
+
 __all__ = ["shm_endpoint"]
 
 SHORT = {**PATIENT, "start_timeout_s": 0.8}
@@ -41,7 +43,7 @@ def ends(request, endpoint, shm_endpoint) -> Iterator[Ends]:
 
 
 def hello(scenario: Scenario, **other: Any) -> bytes:
-    """The plant's greeting, with whatever is given instead."""
+    """The plant's greeting, with the given changes."""
     said = {"kind": "hello", "side": "plant", "boot": handshake._boot()}
     return b"GFMHIL " + json.dumps({**said, **handshake._what_runs(scenario), **other}).encode()
 
@@ -51,7 +53,7 @@ def start(t0: str) -> bytes:
 
 
 def greet(link: Link, scenario: Scenario, notice: Callable[[str], None] = print) -> Start:
-    """As a controller."""
+    """Shake hands as a controller."""
     return shake_hands("controller", link, scenario, lambda: False, notice)
 
 
@@ -125,7 +127,7 @@ def test_what_a_peer_said_is_shown_escaped(ends, make, attack_now):
 
 @pytest.mark.attack("5.4", "a greeting of more than 504 bytes", "it was read, however long")
 def test_a_long_greeting_is_refused_before_it_is_read(make, attack_now):
-    """Over CAN, where a message may have 15 kB; other links do not carry it at all."""
+    """Over CAN, where a message may have 15 kB; other links do not carry such a message."""
     with pytest.raises(handshake._Refused, match="it has 521 bytes, at most 504 are allowed"):
         handshake._read(hello(make(), boot="x" * 300).ljust(521))
     attack_now(f"refused above {LONGEST} bytes")
@@ -139,7 +141,7 @@ def test_a_controller_whose_name_cannot_be_printed_is_refused(name, make):
 
 def test_a_peer_that_says_nothing_is_told_from_none(ends, make):
     said: list[str] = []
-    ends["plant"].send(b"x")  # so that it is there
+    ends["plant"].send(b"x")  # so that it is connected
     assert ends["controller"].wait(30)
     ends["controller"].receive()
     for side in SIDES:  # the controller first: the plant's greetings would wait for it
@@ -155,7 +157,7 @@ def test_a_peer_that_says_nothing_is_told_from_none(ends, make):
     "reported as if no peer had come",
 )
 def test_a_silent_peer_is_told_and_leaves_its_place(make, attack_now):
-    """libzmq takes HTTP for a ZeroMQ peer of its first version, as long as it stays."""
+    """libzmq takes an HTTP client for a ZeroMQ peer of version 1, as long as it is connected."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

@@ -1,4 +1,4 @@
-"""The start of a run: what both sides agree on, and how each is refused."""
+"""The start of a run: what both sides agree on, and the refusal of each mismatch."""
 
 from __future__ import annotations
 
@@ -24,9 +24,11 @@ from gfm_runtime.signals import NU, NY
 from .pairs import run_pair
 from .test_links import PATIENT, in_threads
 
+pytestmark = pytest.mark.processes
+
 
 def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
-    """Shake hands with a scenario each."""
+    """Shake hands, each side with its scenario."""
 
     def call(side: Side) -> Any:
         link = ZmqLink(side, endpoint)
@@ -47,7 +49,7 @@ def test_both_sides_agree_on_the_start(make, endpoint):
 
 
 def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):
-    """The plant's boot differs: tick 0 is told by when START came, and the drift is measured."""
+    """The plant booted at another time: START's arrival sets tick 0, and the drift is measured."""
     boots = iter(["one", "another"])
     monkeypatch.setattr("gfm_hil.engine.handshake._boot", lambda: next(boots))
     before = time.monotonic_ns()
@@ -57,7 +59,7 @@ def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):
 
 
 def test_the_drift_of_two_clocks_is_read_off_the_earliest_arrivals():
-    """A plant 37 ppm fast, frames 0 to 400 us on their way."""
+    """A plant clock 37 ppm fast; frames take 0 to 400 us."""
     k = np.arange(20_000)
     way = np.random.default_rng(1).exponential(4e4, len(k)).astype(np.int64)
     received = 5_000_000 + np.round(k * 1e5 / (1 + 37e-6)).astype(np.int64) + way
@@ -108,7 +110,7 @@ def test_a_misfit_of_signal_tables_is_named(what, name, make, endpoint, monkeypa
 
 
 def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
-    """From the first HELLO on, silence means what it always does."""
+    """From the first HELLO on, silence means that the peer is lost."""
     link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
     scenario = make(link={**PATIENT, "peer_timeout_s": 0.3})
     hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
@@ -122,7 +124,7 @@ def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
 
 
 def test_a_frame_says_that_the_plant_has_started(make, endpoint):
-    """And when, if START was lost; whatever else comes does not."""
+    """A frame also tells when, if START was lost; other messages do not."""
     link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
     scenario, frames = make(link=PATIENT), FrameWriter("y")
     hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
@@ -152,7 +154,7 @@ def test_a_frame_says_that_the_plant_has_started(make, endpoint):
     ],
 )
 def test_a_run_does_without_START(kind, end, options, make, tmp_path, monkeypatch):
-    """In lockstep nothing is lost by it."""
+    """In lockstep it loses nothing."""
     send = end.send
     dropped: list[bytes] = []
 

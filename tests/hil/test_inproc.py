@@ -1,4 +1,4 @@
-"""Both sides in one process: rest stays rest, every event does what it says, the run ends why."""
+"""Both sides in one process: a steady state stays, events have their effects, reasons of ends."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
 
 from ..runtime.support import every_law
@@ -83,10 +84,10 @@ def test_the_grid_frequency_steps_and_ramps(run):
     f = done.signals["true_omega_g"] * 50
     assert (f[:1000] == 50.0).all()
     np.testing.assert_allclose(f[1000:5000], 49.9, rtol=1e-12)
-    # 0.1 Hz at 0.5 Hz/s: there after 0.2 s, on a straight line
+    # 0.1 Hz at 0.5 Hz/s: a straight line for 0.2 s
     np.testing.assert_allclose(f[5001:7000], 49.9 + 0.5e-4 * np.arange(1, 2000), atol=1e-4)
     np.testing.assert_allclose(f[7001:], 50.0, rtol=1e-12)
-    # the converter takes up the grid's frequency: droop of 0.01 p.u. turns 0.1 Hz into 0.2 p.u.
+    # the converter follows the grid's frequency: droop of 0.01 p.u. turns 0.1 Hz into 0.2 p.u.
     assert done.signals["true_p"][4999] > 0.6
 
 
@@ -157,11 +158,11 @@ def test_events_at_the_first_and_the_last_tick(run):
     assert done.signals["ref_P_ref"][0] == 0.6
     assert list(done.signals["ref_P_ref"][-2:]) == [0.6, 0.7]
     assert done.summary["ticks"] == 1000
-    assert done.summary["events"][1]["p_peak"] is None  # one tick says nothing
+    assert done.summary["events"][1]["p_peak"] is None  # one tick is too short
 
 
 def test_a_scheduled_law_changes_its_stage_by_itself(run):
-    """It needs swings to see the line: P_ref steps back and forth on one ten times longer."""
+    """It needs excitation to see the line: P_ref steps back and forth on a ten times longer one."""
     steps = [at(1.0 + 0.75 * k, type="reference", P_ref=0.5 if k % 2 else 0.8) for k in range(5)]
     line = at(0.5, type="grid-impedance", L_g=10.0, R_g=10.0)
     done = run(law="mimo-gfm-scheduled", duration=5.0, events=[line, *steps])
@@ -178,7 +179,7 @@ def test_a_scheduled_law_changes_its_stage_by_itself(run):
 
 
 def test_a_law_file_may_bear_any_name(run, tmp_path):
-    """Even that of a law of the catalogue in the same run: it goes by its path."""
+    """Even the name of a catalogue law in the same run: the path identifies the file."""
     from importlib.resources import files
 
     text = (files("gfm_runtime") / "laws" / "vsg-2.toml").read_text()
@@ -209,7 +210,7 @@ def test_a_trip_ends_the_run_and_says_why(run):
 
 
 def test_a_measurement_out_of_range_leads_to_the_safe_state(run):
-    """Here p after a jump of the grid's angle that the protection is told to let pass."""
+    """Here p after a jump of the grid's angle that the protection is set to tolerate."""
     plant = {"protection": {"over_current": {"enabled": False}}}
     done = run(
         duration=1.0, plant=plant,

@@ -79,7 +79,7 @@ def test_an_experiment_measures_the_bench() -> None:
 
 
 def test_an_experiment_that_ends_early() -> None:
-    run = experiment("late", "mimo-gfm")  # the printed gains do not hold one sample late
+    run = experiment("late", "mimo-gfm")  # unstable with one sample of delay
     assert run["status"] == "tripped"
     assert 0.0 < run["end_s"] < 4.5
     assert "overshoot_pct" not in run

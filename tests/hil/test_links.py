@@ -23,8 +23,9 @@ from gfm_hil.links import Link, open_link
 from gfm_hil.links.frame import FrameReader, FrameWriter, frame_dtype
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.recording.log import read_log, worst
-from gfm_hil.recording.npz import Arrays
-from gfm_hil.recording.recorder import Part, merge, read_recording
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.states import RUNNING, SAFE
 
@@ -38,7 +39,7 @@ RIG = {
 
 
 def in_threads(call: Callable[[Side], Any]) -> dict[Side, Any]:
-    """The same call for both sides at a time: what each returns, or its exception."""
+    """The same call for both sides at once; returns each side's result or exception."""
     found: dict[Side, Any] = {}
 
     def one(side: Side) -> None:
@@ -63,7 +64,7 @@ def both_sides(
     name: str = "zmq",
     options: dict[str, Any] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run a scenario over a link; returns the signals and leaves the logs in ``folder``."""
+    """Run a scenario over a link; returns the signals and writes the logs to ``folder``."""
     benches = {side: make_bench(scenario) for side in SIDES}
     parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
     for side in SIDES:
@@ -84,18 +85,18 @@ def both_sides(
         if problem is not None:
             raise problem
     merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    return dict(Arrays(read_recording(folder)[0]))
+    return {name: x[:] for name, x in read_recording(folder)[0].items()}
 
 
 def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
-    """Bit for bit, NaN included."""
+    """Check that both are equal bit by bit, NaN included."""
     assert set(one) == set(other)
     for name in one:
         assert one[name].tobytes() == other[name].tobytes(), name
 
 
 class Tampering:
-    """A link whose messages go through ``change`` on their way out; None drops one.
+    """A link that passes outgoing messages through ``change``; None drops one.
 
     It has no port, so that every message passes through ``send``.
     """
@@ -136,13 +137,13 @@ def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
     outcome = worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None)
     assert outcome.status == "safe"
     assert "gone" in outcome.reason
-    # the plant may have sent a frame twice, or still hear the controller give up
+    # the plant may have repeated a frame, or still receive the controller's last frame
     assert 1 <= len(signals["tick"]) <= 21
 
 
 def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint):
     def damage(k: int, message: bytes) -> bytes:
-        tick = np.frombuffer(message, frame_dtype("u"))["tick"][0]  # not k: a slow plant asks again
+        tick = np.frombuffer(message, frame_dtype("u"))["tick"][0]  # not k: a slow plant repeats
         return message if tick < 20 else message[:30] + b"\xff\xff" + message[32:]
 
     def touch(side: Side, link: Link) -> Any:
@@ -153,7 +154,7 @@ def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
     signals = both_sides(scenario, tmp_path, endpoint, touch)
     assert worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None).status == "safe"
-    assert len(signals["tick"]) in (20, 21)  # tick 20 is recorded if the controller says it leaves
+    assert len(signals["tick"]) in (20, 21)  # with tick 20 if the controller's last frame came
     assert np.ptp(signals["u_omega_u"]) <= 1e-9
 
 
@@ -178,7 +179,7 @@ def test_an_ipc_endpoint_that_lives_is_not_taken_over(endpoint):
             ZmqLink("controller", endpoint)
         plant.send(FrameWriter("y").pack(0, RUNNING, 0, np.ones(5)))
         assert first.wait(30)
-        assert FrameReader("y").unpack(first.receive(), np.zeros(5)) == 0  # still in business
+        assert FrameReader("y").unpack(first.receive(), np.zeros(5)) == 0  # it still works
     finally:
         plant.close()
         first.close()
@@ -216,7 +217,7 @@ def test_an_unknown_link_names_the_known():
 
 
 def test_a_link_never_blocks_nor_queues_without_bound(endpoint):
-    link = ZmqLink("plant", endpoint)  # nobody there
+    link = ZmqLink("plant", endpoint)  # no controller
     try:
         sent = [link.send(b"x" * 60) for _ in range(1000)]
         assert not all(sent)
@@ -227,7 +228,7 @@ def test_a_link_never_blocks_nor_queues_without_bound(endpoint):
 
 
 def test_the_last_word_waits_for_room(endpoint):
-    """As it must when the other side is a hundred frames behind at the end of a run."""
+    """It must, if the peer is a hundred frames behind at the end of a run."""
     plant, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
     try:
         while plant.send(b"frame"):

@@ -1,4 +1,4 @@
-"""What no file may do to the loaders: every one ends as a value or as one line a mistake."""
+"""Attacks on the loaders: every file yields a value, or one line per mistake."""
 
 from __future__ import annotations
 
@@ -62,19 +62,19 @@ high = 1.1
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder with what is no file, and no warning on stderr beside the one line."""
+    """A folder with things that are not files; no warning on stderr besides the one line."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "zero.toml").symlink_to("/dev/zero")
     os.mkfifo(tmp_path / "pipe.toml")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", ResourceWarning)  # of what another test has left
+        warnings.simplefilter("ignore", ResourceWarning)  # from another test
         yield tmp_path
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line with which a command refuses wrong input."""
+    """The one-line error of a command for wrong input."""
     assert main(arguments) == 2
     said = capsys.readouterr()
     assert said.out == "" and len(said.err.splitlines()) == 1
@@ -140,7 +140,7 @@ def test_what_is_no_file(kind, capsys, attack_now):
 
 
 def numbers(kind: str, path: str, value: str) -> list[str]:
-    """The command that reads a good file in which one number was replaced."""
+    """The command that reads a valid file in which one number was replaced."""
     text = {"converter": CONVERTER.read_text(), "campaign": CAMPAIGN}.get(kind, BASE)
     content = tomllib.loads(text)
     *parents, last = path.split(".")
@@ -282,7 +282,7 @@ def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]
 
 
 def spoilt(content: dict[str, Any]) -> st.SearchStrategy[str]:
-    """The TOML of a file in which one to three values were replaced, or left out."""
+    """The TOML of a file in which one to three values were replaced or removed."""
     changes = st.lists(
         st.tuples(st.sampled_from(list(places(content))), st.one_of(st.just(None), WEIRD)),
         min_size=1, max_size=3,
@@ -299,21 +299,21 @@ def spoilt(content: dict[str, Any]) -> st.SearchStrategy[str]:
                 if value is None:
                     del at[last]
                 else:
-                    at[last] = copy.deepcopy(value)  # a list put into itself has no end
+                    at[last] = copy.deepcopy(value)  # else a list could contain itself
         return toml_text(changed).replace('"@date"', "1979-05-27")
 
     return changes.map(apply)
 
 
 def full(name: str) -> dict[str, Any]:
-    """A shipped scenario with every key written out, in process, of one event at least."""
+    """A shipped scenario with every key, in process, with at least one event."""
     content = tomllib.loads(scenario_toml(load_scenario(name)))
     content["plant"]["factors"] = {"L_g": 1.0, "R_f": 1.0}
     return content
 
 
 def holds(load: Callable[[str], Any], text: str) -> None:
-    """A file is read, or refused in one line a mistake."""
+    """Check that a file is read, or refused with one line per mistake."""
     file = Path("spoilt.toml")
     file.write_text(text, encoding="utf-8")
     try:
@@ -324,7 +324,7 @@ def holds(load: Callable[[str], Any], text: str) -> None:
 
 
 def ready(name: str) -> None:
-    """As far as ``gfmhil run`` comes before it writes anything."""
+    """Do what ``gfmhil run`` does before it writes anything."""
     make_bench(load_scenario(name, mode="lockstep", link__type="inproc"))
 
 
@@ -384,7 +384,7 @@ def test_any_weights_are_read_or_refused(data):
 @given(lines=st.lists(st.integers(0, 60), max_size=4), noise=st.text(max_size=10))
 @settings(max_examples=60, suppress_health_check=_SLOW)
 def test_any_text_is_read_or_refused_in_lines(lines, noise):
-    """Lines of a shipped file left out, with noise in their place."""
+    """Lines of a shipped file replaced by noise."""
     (folder,) = [f for f in SCENARIO_FOLDERS if f.is_dir()]
     text = (folder / "switchover.toml").read_text().splitlines()
     for k in lines:

@@ -1,4 +1,4 @@
-"""What timing.npz says of a run in lockstep over a link with a port."""
+"""timing.npz of a run in lockstep over a link with a port."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import pytest
 from .pairs import run_pair
 from .test_loops import PATIENT, PORTS
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.mark.parametrize("link", PORTS)
 @pytest.mark.parametrize("samples", [0, 1])
 def test_lockstep_tells_when_answers_came(samples, link, make, place):
-    """A sample late the next frame follows at once, and one look at the clock does for both."""
+    """With one sample of delay the next frame follows at once, and both share a clock reading."""
     content = {"duration": 0.03, "link": PATIENT, "plant": {"delay": {"samples": samples}}}
     content["events"] = [{"tick": 50, "type": "grid-frequency", "f_hz": 49.99}]
     times = run_pair(make(**content), place, link).timing

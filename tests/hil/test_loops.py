@@ -1,7 +1,7 @@
-"""The loops over a link do what the loop in process does, and what the rules of real time say.
+"""The loops over a link match the loop in process, and follow the rules of real time.
 
-Nothing here depends on how fast the machine is: what a run missed is read off its recording, and
-the rules must hold for it.
+No test depends on the machine's speed: the misses are read from the recording, and the rules must
+hold for them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, Port, open_link, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
@@ -34,13 +34,15 @@ from .pairs import PATIENT, run_pair
 from .test_frames import resealed
 from .test_links import RIG, assert_same
 
+pytestmark = pytest.mark.processes
+
 PORTS = ("shm", "zmq")
 
 
 def three_ways(content: dict[str, Any], link: str, make: Any, run: Any, place: Path) -> Any:
     """A run over a link with a port, over one without, and in process; returns first and last.
 
-    The log of all but the order in which the sides end must be the same too.
+    The logs must be the same too, except for the order in which the sides end.
     """
     scenario = make(**content)
     ported = run_pair(scenario, place / "c", link)
@@ -128,7 +130,7 @@ def _never(handle, message):
 
 
 class Deaf:
-    """An end that hears nothing and whose frames still go out."""
+    """An end that receives nothing but still sends."""
 
     def __init__(self, link: Link) -> None:
         self._link, p = link, link.port
@@ -170,14 +172,14 @@ def test_a_plant_that_hears_nothing_blocks_after_hold_and_one_more(hold, make, p
     assert pair.ends()["plant"] == ("safe", why, hold + 1)
     assert len(pair.signals["t"]) == hold + 1
     assert (pair.timing["plant_received"] == -1).all()
-    assert pair.ends()["controller"][1] in (  # it may have been late itself
+    assert pair.ends()["controller"][1] in (  # it may itself have been late
         "the plant ended before the scenario did",
         REASONS[STALE],
     )
 
 
 def frames(group: str, *ticks: int, state: int = RUNNING, reason: int = 0) -> list[bytes]:
-    """Good frames of those ticks, in sequence; the values tell them apart."""
+    """Good frames of those ticks, in sequence, with different values."""
     writer = FrameWriter(group)
     width = len(names(group))
     return [writer.pack(k, state, reason, ONES[group] + 0.001 * k * np.arange(width))
@@ -196,7 +198,7 @@ def after(sent: list[bytes], group: str, tick: int, state: int, reason: int = 0)
 
 @dataclass
 class Alone:
-    """What one side's loop left, whose other side was played."""
+    """The results of one side's loop against a played other side."""
 
     faults: dict[str, int]
     part: Part
@@ -218,7 +220,7 @@ def alone(
     link: str = "shm",
     stopped: Callable[[], bool] = lambda: False,
 ) -> Alone:
-    """Run one side's loop over messages that are there before it starts, however slow it is."""
+    """Run one side's loop over messages that are in the link before it starts."""
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
     bench = make_bench(scenario)
     part = Part.create(folder, side, scenario.ticks)
@@ -247,7 +249,7 @@ def alone(
 
 
 def answered(found: Alone) -> list[int]:
-    """Ticks of the frames that came before the last words."""
+    """Ticks of the frames before the last ones, which say that the side leaves."""
     return [tick for tick, state, _ in found.said if state == RUNNING]
 
 
@@ -269,7 +271,7 @@ def test_extrapolation_is_a_straight_line_through_the_last_two_and_then_hold(pla
 def test_a_controller_whose_plant_falls_silent_is_safe_after_hold_and_one_more(hold, place, make):
     scenario = make(**REALTIME, late_policy={"hold": hold})
     controller = alone("controller", scenario, place, frames("y", 0, 1, 2))
-    # before the third frame it may already have waited for too long
+    # it may have timed out before the third frame
     status, reason, tick = controller.end
     assert (status, reason) == ("safe", REASONS[STALE])
     assert controller.said[-1] == (tick, SAFE, STALE)
@@ -285,7 +287,7 @@ def test_silence_of_the_other_side_ends_either(side, mode, place, make):
     other = "plant" if side == "controller" else "controller"
     found = alone(side, scenario, place, [])
     assert found.end[:2] == ("safe", f"the {other}'s process is gone")
-    if side == "controller":  # the plant has filled the link with what nobody took
+    if side == "controller":  # the plant has filled the link with unread frames
         assert found.said[-1][1:] == (SAFE, LOST_PEER)
 
 
@@ -335,7 +337,7 @@ def test_frames_of_another_kind_are_counted_and_never_used(place, make):
         frames("u", 1)[0],
         good[0],
         good[1],
-        resealed(foreign[1], 11, 0xC0),  # a sequence from far behind
+        resealed(foreign[1], 11, 0xC0),  # a much older sequence
         good[1][:20] + bytes([good[1][20] ^ 4]) + good[1][21:],
         good[2],
         good[3],
@@ -366,11 +368,11 @@ def test_a_link_that_pauses_for_longer_than_hold_ends_in_safe(link, place, make)
     for attempt in range(5):
         pair = run_pair(make(**content, late_policy={"hold": hold}), place / str(attempt), link)
         if pair.ends()["plant"][1] != REASONS[STALE]:
-            break  # else the machine kept the plant from sending for longer than hold, first
+            break  # else the machine stalled the plant for longer than hold
     *end, tick = pair.ends()["plant"]
     assert end == ["safe", "no fresh u for longer than late_policy.hold allows"]
     received = pair.timing["plant_received"]
-    assert len(received) == tick  # latched: nothing is sampled any more
+    assert len(received) == tick  # latched: it samples nothing any more
     assert (received[-hold - 1 :] < 0).all()
     assert tick == hold + 1 or received[-hold - 2] >= 0
     status, reason, _ = pair.ends()["controller"]

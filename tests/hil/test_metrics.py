@@ -1,4 +1,4 @@
-"""Metrics against signals whose figures are known."""
+"""Metrics of signals with known values."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_frequency_nadir_peak_and_rocof_of_a_ramp():
 
 
 def test_rocof_is_a_slope_over_a_tenth_of_a_second():
-    f = np.where(t < 1.0, 50.0, 50.05)  # a step; no slope over a tick is meant
+    f = np.where(t < 1.0, 50.0, 50.05)  # a step, not a slope over a tick
     assert metrics(f=f)["rocof_hz_s"] == pytest.approx(0.5, rel=1e-6)
 
 

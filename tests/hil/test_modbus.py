@@ -1,4 +1,4 @@
-"""The SunSpec server as it is used: a run, the server and its clients as processes of their own."""
+"""The SunSpec server in use: a run, the server and its clients as separate processes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ from gfm_hil.operator import Operator
 
 from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Iterator[Path]:
-    """The folder of a run that goes on for as long as these tests take."""
+    """The folder of a run that lasts longer than these tests."""
     place = tmp_path_factory.mktemp("modbus")
     (place / "served.toml").write_text(SCENARIO, encoding="utf-8")
     folder = place / "run"
@@ -45,13 +47,13 @@ def run(tmp_path_factory) -> Iterator[Path]:
 def port(run) -> Iterator[int]:
     process, port = start(run)
     yield port
-    assert process.poll() is None  # whatever its clients have done
+    assert process.poll() is None  # it survived all its clients
     end(process)
 
 
 @pytest.fixture
 def device(port) -> Iterator[SunSpecModbusClientDeviceTCP]:
-    """pysunspec2's own client, that knows the vendor model's file."""
+    """pysunspec2's client, with the vendor model's file."""
     sunspec.set_model_defs_path([MODELS, sunspec.models_dir])
     found = SunSpecModbusClientDeviceTCP(slave_id=1, ipport=port, timeout=20)
     found.scan()
@@ -64,7 +66,7 @@ def device(port) -> Iterator[SunSpecModbusClientDeviceTCP]:
 
 
 def write(device, model: int, **values: float) -> None:
-    """Put values, in their units, into points of a model, in one write of the model."""
+    """Write values, in their units, to points of a model, in one write of the model."""
     target = device.models[model][0]
     for name, value in values.items():
         target.points[name].cvalue = value
@@ -106,7 +108,7 @@ def test_scan_and_read_all_models(device, run):
 
 
 def test_p_and_q(device, run):
-    write(device, 704, WSetEna=1, WSet=3000)  # the enable has the lower address: it comes first
+    write(device, 704, WSetEna=1, WSet=3000)  # the enable has the lower address: first
     write(device, 704, VarSetEna=1, VarSetMod=4, VarSet=400)
     wait_for(lambda: (last(run)["ref_P_ref"], last(run)["ref_Q_ref"]) == (0.75, 0.1))
     wait_for(lambda: abs(read(device, 701, "W") - 3000) < 100)
@@ -186,8 +188,8 @@ def test_the_client_s_heartbeat_and_ours(device, run):
         seen_ms = (time.monotonic() - before) * 1e3
         wait_for(lambda: last(run)["ref_P_ref"] == 0.5)
         wait_for(lambda: read(device, 704, "WSetEna") == 0)  # once the run has answered
-        # never early, but for the rounding to ms; that it is not late but by a tick of the clock
-        # test_modbus_device shows, where the clock is made up: this machine may be busy
+        # never early, except for the rounding to ms. It may be late by at most a tick of the clock:
+        # test_modbus_device tests that with a simulated clock, since this machine may be busy.
         assert seen_ms >= timeout_ms and read(device, VENDOR, "HbLate") >= timeout_ms - 1
     write(device, VENDOR, HbTms=0)
 
@@ -219,7 +221,7 @@ def frame(payload: bytes, transaction: int = 1, unit: int = 1) -> bytes:
 
 
 def answer(connection: socket.socket) -> tuple[int, bytes]:
-    """Transaction and PDU of the next answer; (-1, b"") if the server has hung up."""
+    """Transaction and PDU of the next answer; (-1, b"") if the server has disconnected."""
 
     def exactly(count: int) -> bytes:
         found = b""
@@ -248,15 +250,15 @@ def test_bad_writes_get_exceptions_and_change_nothing(device, run, port):
     with ModbusTcpClient("127.0.0.1", port=port) as plain:
         for address, registers, code in (
             (w_set, [0x7FFF, 0xFFFF], 3),  # out of range
-            (w_set, [0x7FFF], 2),  # half a point
+            (w_set, [0x7FFF], 2),  # part of a point
             (law, [0], 3),
             (law, [99], 3),
             (at(device, 704, "VarSetMod"), [2], 3),
             (at(device, 701, "W"), [0], 2),  # read-only
             (at(device, 702, "WMax"), [1], 2),
             (SUNS, [0, 0], 2),
-            (at(device, 704, "WSetEna"), [1] * 60, 2),  # over what is read-only
-            (50000, [1], 2),  # nowhere
+            (at(device, 704, "WSetEna"), [1] * 60, 2),  # includes read-only points
+            (50000, [1], 2),  # no such address
             (65535, [1], 2),
         ):
             found = plain.write_registers(address, registers, device_id=1)
@@ -272,7 +274,7 @@ def test_bad_writes_get_exceptions_and_change_nothing(device, run, port):
     many = struct.pack(">HHB", w_set, 124, 248) + bytes(248)
     for pdu, code in (
         (b"\x10" + many, 3),  # oversize
-        (b"\x10" + struct.pack(">HHB", w_set, 2, 2) + bytes(4), 3),  # counts that disagree
+        (b"\x10" + struct.pack(">HHB", w_set, 2, 2) + bytes(4), 3),  # contradictory counts
         (b"\x10" + struct.pack(">HHB", w_set, 0, 0), 3),
         (b"\x10" + struct.pack(">H", w_set), 3),  # cut short
         (b"\x03" + struct.pack(">HH", SUNS, 126), 3),
@@ -296,9 +298,9 @@ def test_bad_writes_get_exceptions_and_change_nothing(device, run, port):
     ):
         with socket.create_connection(("127.0.0.1", port), timeout=20) as raw:
             raw.sendall(garbage)
-            assert answer(raw) == (-1, b"")  # it has hung up
+            assert answer(raw) == (-1, b"")  # it has disconnected
     with socket.create_connection(("127.0.0.1", port), timeout=20) as raw:
-        raw.sendall(frame(b"\x10" + struct.pack(">HHB", law, 1, 2) + b"\0\2")[:-1])  # and no more
+        raw.sendall(frame(b"\x10" + struct.pack(">HHB", law, 1, 2) + b"\0\2")[:-1])  # then silence
     assert settings() == before
 
 

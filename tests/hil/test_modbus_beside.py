@@ -1,4 +1,4 @@
-"""The server beside runs that begin and end, and where there is none to serve."""
+"""The server beside runs that begin and end, and without a run."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 from gfm_hil.modbus.image import VENDOR
 
 from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
+
+pytestmark = pytest.mark.processes
 
 
 def test_a_folder_without_a_run(tmp_path):

@@ -1,4 +1,4 @@
-"""The Modbus server among many clients, mute ones, half-open ones and hasty ones."""
+"""The Modbus server among many clients: silent, half-open and flooding ones."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from gfm_hil.modbus.serve import Address
 from .modbus_parts import SUNS
 from .test_modbus_device import Bench
 
+pytestmark = pytest.mark.processes
+
 PATIENCE_S = 60.0
 READ = struct.pack(">BHH", 3, SUNS, 2)
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -39,7 +41,7 @@ def write_law(bench: Bench, law: int) -> bytes:
 
 
 async def ask(streams: Streams, pdu: bytes) -> bytes:
-    """The answer to one request."""
+    """Send one request; returns the answer."""
     reader, writer = streams
     writer.write(frame(pdu))
     async with asyncio.timeout(PATIENCE_S):
@@ -48,7 +50,7 @@ async def ask(streams: Streams, pdu: bytes) -> bytes:
 
 
 async def ended(streams: Streams) -> bool:
-    """The server has hung up; what it has sent before is read away."""
+    """Whether the server has disconnected; discards what it sent before."""
     try:
         async with asyncio.timeout(PATIENCE_S):
             while await streams[0].read(65536):
@@ -60,7 +62,7 @@ async def ended(streams: Streams) -> bool:
 
 @asynccontextmanager
 async def served(bench: Bench):
-    """A server of a run that is made up; connects a client at each call."""
+    """A server of a simulated run; connects a client at each call."""
     server = serve._server(bench.device, Address("127.0.0.1", 0), None)
     await server.serve_forever(background=True)
     async with AsyncExitStack() as stack:
@@ -77,7 +79,7 @@ async def served(bench: Bench):
 
 
 def among(work: Callable[[Bench, Server, Callable[[], Awaitable[Streams]]], Awaitable[Any]]) -> Any:
-    """Run a test's own coroutine with a server."""
+    """Run a test's coroutine with a server."""
 
     async def call() -> Any:
         bench = Bench()
@@ -166,7 +168,7 @@ def test_a_client_that_never_reads_is_dropped(monkeypatch, caplog, attack_now) -
                     await asyncio.sleep(0)
                 await asyncio.sleep(0)
             assert (await ask(other, READ))[0] == 3
-            while len(server.workers) > 1:  # nothing of it is left but the other's
+            while len(server.workers) > 1:  # until only the other client's is left
                 await asyncio.sleep(0.01)
 
     among(work)
@@ -189,7 +191,7 @@ def test_nothing_stays_of_a_client_that_speaks_no_modbus() -> None:
 
 @pytest.mark.attack("10.5", "500 writes at once from one Modbus client", "500 commands carried out")
 def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now) -> None:
-    standing = partial(connection.Rate, clock=lambda: 0.0)  # however slow this machine is
+    standing = partial(connection.Rate, clock=lambda: 0.0)  # on a machine of any speed
     monkeypatch.setattr(connection, "Rate", standing)
 
     async def work(bench: Bench, server: Server, connect: Any) -> None:
@@ -223,7 +225,7 @@ def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, a
         if failures[name]:
             raise failures[name].pop()
         seen[name] += 1
-        return min(seen.values()) < 5  # the run goes on until both have worked again
+        return min(seen.values()) < 5  # until both have worked again
 
     class Stub:
         slack = None

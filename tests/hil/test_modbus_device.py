@@ -1,4 +1,4 @@
-"""The SunSpec device with a run and a clock made up: what writes come to, in every order."""
+"""The SunSpec device with a simulated run and clock: the effect of writes, in every order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE, VENDOR, Image
 from gfm_hil.modbus.measures import Measures
 from gfm_hil.modbus.view import View
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_runtime.states import RUNNING, SAFE
 
@@ -25,7 +25,7 @@ S_N = 4000.0
 
 
 class Bench:
-    """A run that does what it is told at once, a clock that is set by hand, and a device."""
+    """A run that carries out commands at once, a clock that the test sets, and a device."""
 
     def __init__(self, heartbeat_ms: int = 0) -> None:
         self.row = dict.fromkeys((*PLANT_COLUMNS, *CONTROLLER_COLUMNS), 0.0)
@@ -61,7 +61,7 @@ class Bench:
                 self.row |= {"true_trip": 0.0, "state": float(RUNNING), "ref_P_ref": 0.5}
 
     def write(self, *wanted: tuple[str, float | str]) -> ExcCodes | None:
-        """One request with these points, which must lie one after the other."""
+        """One request with these points, which must be adjacent."""
         points = [(self.device.image.points[path], value) for path, value in wanted]
         registers = [r for point, value in points for r in point.encode(value)]
         return asyncio.run(self.device.access(16, points[0][0].address, registers))
@@ -71,7 +71,7 @@ class Bench:
         return self.device.image.get(path)
 
     def pass_by(self, seconds: float) -> None:
-        """Let the clock go on, every tick of it."""
+        """Advance the clock by every tick."""
         before = math.floor(self.now / TICK_S + 1e-6)
         asyncio.run(self._tick(before + 1, round(seconds / TICK_S)))
 
@@ -110,7 +110,7 @@ def test_what_clients_may_write_the_standard_lets_them_write():
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_value_mode_and_enable_take_effect_together_in_any_order(order, before):
     bench = Bench()
-    if before is not None:  # what a client of yesterday has left must not come back
+    if before is not None:  # an earlier client's values must not come back
         assert bench.write(("704.WSetPct", 100 * before / S_N)) is None
         assert bench.write(("704.WSetMod", 0)) is None
         assert bench.write(("704.WSetEna", 1)) is None
@@ -119,7 +119,7 @@ def test_value_mode_and_enable_take_effect_together_in_any_order(order, before):
     steps = [("704.WSetEna", 1), ("704.WSetMod", 1), ("704.WSet", 3000.0)]
     for k in order:
         assert bench.write(steps[k]) is None
-    assert {e["P_ref"] for e in bench.told} == {0.75}  # nothing else, not even for a moment
+    assert {e["P_ref"] for e in bench.told} == {0.75}  # never another value
     assert bench.read("704.WSet") == 3000.0 and bench.read("704.WSetPct") == 75.0
 
 
@@ -151,7 +151,7 @@ def test_the_timer_takes_the_set_point_back(back, P_ref, enabled):
         assert bench.write(step) is None
     bench.pass_by(1.5)
     assert bench.read("704.WSetRvrtRem") == 1
-    assert bench.write(("704.WSet", 3200.0)) is None  # the timer begins again
+    assert bench.write(("704.WSet", 3200.0)) is None  # the timer restarts
     bench.pass_by(1.9)
     assert bench.P_ref == 0.8
     bench.pass_by(0.2)
@@ -181,7 +181,7 @@ def test_a_heartbeat_expires_within_one_tick_of_its_setting(timeout_ms, at):
     assert bench.read(f"{VENDOR}.HbLost") == 1
     assert bench.read("701.MnAlrmInfo") == "heartbeat of the client lost"
     bench.pass_by(2 * timeout_ms * 1e-3)
-    assert bench.read(f"{VENDOR}.HbLost") == 1  # until it has come back
+    assert bench.read(f"{VENDOR}.HbLost") == 1  # until the heartbeat returns
     assert bench.write(("715.ControllerHb", 8)) is None
     assert bench.read("701.MnAlrmInfo") is None
 
@@ -317,7 +317,7 @@ def test_what_expires_and_cannot_be_carried_out_is_tried_again(what):
 @pytest.mark.parametrize("how", [("715.AlarmReset", 1), ("715.OpCtl", 1)])
 def test_reset_from_a_trip_and_from_nothing(how):
     bench = Bench()
-    assert bench.write(how) is None and bench.told == []  # there is nothing to reset
+    assert bench.write(how) is None and bench.told == []  # nothing to reset
     for step in (("704.WSetRvrtTms", 1), ("704.WSetEna", 1), ("704.WSet", 3000.0)):
         assert bench.write(step) is None
     bench.row |= {"true_trip": 1.0, "state": float(SAFE)}
@@ -328,7 +328,7 @@ def test_reset_from_a_trip_and_from_nothing(how):
     assert bench.read("701.InvSt") == 3 and bench.read("704.WSetEna") == 0
     told = len(bench.told)
     bench.pass_by(3.0)
-    assert len(bench.told) == told  # what was commanded before is forgotten
+    assert len(bench.told) == told  # earlier commands are forgotten
 
 
 def test_stop():

@@ -1,4 +1,4 @@
-"""The register image as a whole: what it holds, its scale, its page, and its server's faults."""
+"""The whole register image: content, scale factors, page, and the server's errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands to runs that are going on: two processes, really started."""
+"""Commands to runs in progress, with two real processes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.announcement import present
 from gfm_hil.operator import Operator
 from gfm_hil.recording.log import read_log
+
+pytestmark = pytest.mark.processes
 
 SCENARIO = """
 title = "told"
@@ -39,7 +41,7 @@ PATIENCE_S = 100.0
     ids=["shm", "zmq", "zmq portable"],
 )
 def going(request, tmp_path):
-    """A run that would take a long while, its folder."""
+    """The folder of a long run in progress."""
     file, folder = tmp_path / "told.toml", tmp_path / "run"
     link, options = request.param
     file.write_text(SCENARIO.format(link=link, options=options), encoding="utf-8")
@@ -174,7 +176,7 @@ def test_what_a_killed_run_has_announced_is_not_going_on(tmp_path):
         (tmp_path / "desk_plant.json").write_text(json.dumps(endpoint), encoding="utf-8")
         assert present(tmp_path) == ["plant"]
         Operator(tmp_path).close()
-    place.mkdir()  # as SIGKILL leaves it
+    place.mkdir()  # as after SIGKILL
     try:
         assert present(tmp_path) == []
         with pytest.raises(UserError, match="no run is going on there"):

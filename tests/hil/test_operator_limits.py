@@ -1,4 +1,4 @@
-"""The command server against what may come to its socket, and what looks like the end of a run."""
+"""The command server: arbitrary messages to its socket, and situations like the end of a run."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ from gfm_hil.recording.log import read_log
 from gfm_hil.scenario.events import Reference
 from gfm_hil.scope.record import open_record
 
+pytestmark = pytest.mark.processes
+
 
 class Ends:
-    """A command server with a timeline that carries out at once, and no loop."""
+    """A command server without a loop; its timeline carries out commands at once."""
 
     def __init__(self, folder: Path, bench: Any) -> None:
         self.timeline = Timeline(bench, folder / "events_controller.jsonl", ("controller",))
@@ -50,7 +52,7 @@ def ends(make, tmp_path):
 
 
 def ask(folder: Path, *messages: bytes) -> list[dict[str, Any]]:
-    """What the command server answers to bytes."""
+    """The command server's answers to raw messages."""
     desk = announced(folder, "controller")
     assert desk is not None
     answers = []
@@ -142,7 +144,7 @@ def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
     "10.3", "1,000 commands at once to the command server, then a stop", "1,000 carried out"
 )
 def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_now) -> None:
-    ends.desk._rate._clock = lambda: ends.desk._rate._since  # however slow this machine is
+    ends.desk._rate._clock = lambda: ends.desk._rate._since  # on a machine of any speed
     answers = ask(tmp_path, *[json.dumps(P_REF).encode()] * 1000, b'{"type": "stop"}')
     refused = [a["error"] for a in answers if not a["ok"]]
     assert all(a["ok"] for a in answers[:200]) and answers[-1] == {"ok": True}

@@ -1,6 +1,6 @@
-"""Other users of the machine: what they plant, lock or listen at is neither used nor removed.
+"""Other users of the machine: we neither use nor remove their files, locks and sockets.
 
-The other user is a second uid, which takes a runner that is root.
+The other user is a second uid, for which the tests must run as root.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
-from gfm_hil.recording import recorder as recording
+from gfm_hil.recording import parts as recording
 
 from .test_shm import header
+
+pytestmark = pytest.mark.processes
 
 OTHER = 65534  # nobody
 SECRET = b"readable by its owner alone"
@@ -49,7 +51,7 @@ def other(shared) -> Iterator[Act]:
     started = []
 
     def call(program: str, content: bytes = b"") -> subprocess.Popen[bytes]:
-        # the interpreter may lie where only root can read, so the program itself changes its user
+        # only root may be able to read the interpreter, so the program itself changes its user
         begin = f"""
 import fcntl, os, socket, sys, time
 os.setgroups([]), os.setgid({OTHER}), os.setuid({OTHER}), os.umask(0)
@@ -103,7 +105,7 @@ os.symlink(here + "/gfmhil-parts-x", "run/parts")
     recording.remove_parts(folder)
     assert not [p for p in copies_of_the_secret(shared) if not p.is_symlink()]
     assert (shared / "run" / "parts").is_symlink()
-    assert (shared / "gfmhil-parts-x" / "home").is_symlink()  # it is not ours to remove
+    assert (shared / "gfmhil-parts-x" / "home").is_symlink()  # we must not remove it
     copied = [p for p in (shared / "run").rglob("*") if not p.is_symlink()]
     assert copied == []
     attack_now(f"ignored: {len(copied)} files copied, the folder stays as it was")
@@ -122,7 +124,7 @@ def test_only_recorded_files_are_rescued(tmp_path, monkeypatch, attack_now):
     monkeypatch.setattr(recording, "_MEMORY", memory)
 
     def left(name: str, *, link: bool) -> None:
-        """What a killed run leaves."""
+        """Make the files of a killed run."""
         place, handle = scratch.make("gfmhil-parts-", memory)
         (place / "home").symlink_to(folder / "parts")
         (folder / "parts").symlink_to(place)
@@ -139,7 +141,7 @@ def test_only_recorded_files_are_rescued(tmp_path, monkeypatch, attack_now):
     left("plant_signals.npy", link=True)
     recording.keep_in_memory(another, 10)
     recording.remove_parts(another)
-    assert (folder / "parts").is_symlink()  # it stays in memory, for a person to look at
+    assert (folder / "parts").is_symlink()  # it stays in memory, for inspection
     assert {path.name for path in folder.iterdir()} == {"parts"}
     shutil.rmtree((folder / "parts").readlink())
     (folder / "parts").unlink()
@@ -161,7 +163,7 @@ START = """
 import sys
 from pathlib import Path
 from gfm_hil.core import temporary as scratch
-from gfm_hil.recording import recorder as recording
+from gfm_hil.recording import parts as recording
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 recording._MEMORY = segment.FOLDER = shared = Path(sys.argv[1])
@@ -302,7 +304,7 @@ def test_a_plant_that_came_first_refuses_it_too(shared, other):
 
 @as_root
 def test_a_plant_does_not_connect_again_to_another_users_socket(shared, other):
-    """libzmq by itself would, as soon as the controller has gone."""
+    """libzmq would, as soon as the controller has gone."""
     endpoint = f"ipc://{shared}/link"
     controller = ZmqLink("controller", endpoint)
     plant = ZmqLink("plant", endpoint)
@@ -351,7 +353,7 @@ sys.exit("it got in") if said else None
     "it took the plant's place where the umask or the mode let it",
 )
 def test_another_user_does_not_get_in(mode, shared, other, attack_now):
-    """ZeroMQ greets a peer that it has let in."""
+    """ZeroMQ sends a greeting to a peer that it has accepted."""
     controller = ZmqLink("controller", f"ipc://{shared}/link")
     try:
         path = shared / "link"

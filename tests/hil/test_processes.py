@@ -1,4 +1,4 @@
-"""Two real processes: they start, meet, run, and end together however one of them is ended."""
+"""Two real processes: they start, connect, run, and end together, however one of them ends."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import SIDES
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.toml_out import toml_text
+
+pytestmark = pytest.mark.processes
 
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
 PATIENCE_S = 90.0
 
 
 def write(folder: Path, **content: Any) -> str:
-    """A scenario file in ``folder``; returns its path."""
+    """Write a scenario file to ``folder``; returns its path."""
     path = folder / "scenario.toml"
     path.write_text(toml_text({"title": "test", "duration": 0.1, **content}))
     return str(path)
@@ -37,7 +39,7 @@ def free_endpoint() -> str:
 
 
 def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
-    """Poll until ``what()`` is true; give up when the process has ended or patience has."""
+    """Poll until ``what()`` is true; fail if the process ends or the timeout expires."""
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         found = what()
@@ -49,7 +51,7 @@ def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
 
 
 def has_run(folder: Path, ticks: int) -> bool:
-    """The plant has recorded that many ticks."""
+    """Whether the plant has recorded that many ticks."""
     part = Part.open(folder, "plant")
     return part is not None and int(part.progress[0]) >= ticks
 
@@ -88,7 +90,7 @@ def signals(folder: Path) -> dict[str, np.ndarray]:
 
 
 def assert_same(one: Path, other: Path) -> None:
-    """Two runs recorded the same, bit for bit."""
+    """Check that two runs recorded the same, bit by bit."""
     a, b = signals(one), signals(other)
     assert set(a) == set(b)
     for name in a:
@@ -118,6 +120,7 @@ def test_two_processes_in_lockstep_are_bit_for_bit_one(start, tmp_path):
     assert (code, err) == (0, "")
     assert json.loads(out) == summary(tmp_path / "apart")
     assert json.loads(out)["link"] == "zmq"
+    assert json.loads(out)["e2e"] == {"controller": "valid", "plant": "valid"}
     code, out, _ = end(start("run", scenario, "--link", "inproc", "--out", "together", "--json",
                              "--no-figures"))  # fmt: skip
     assert (code, json.loads(out)["link"]) == (0, "inproc")
@@ -165,7 +168,7 @@ def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
 
 
 def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
-    """At rest, so that no lateness of a loaded machine can make the plant do anything."""
+    """In a steady state, so that late frames on a loaded machine do not change the signals."""
     scenario = write(
         tmp_path,
         law="vsg-2",
@@ -182,7 +185,7 @@ def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
     with np.load(tmp_path / "run" / "timing.npz") as file:
         timing = dict(file)
     due, sent, received = (timing[f"plant_{n}"] for n in ("scheduled", "sent", "received"))
-    assert (np.diff(due) == 100_000).all()  # absolute deadlines: no drift whatever happened
+    assert (np.diff(due) == 100_000).all()  # absolute deadlines: no drift
     assert (timing["plant_woke"] >= due).all()
     there = received >= 0
     assert found["misses"] == (~there).sum()

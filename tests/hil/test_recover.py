@@ -1,4 +1,4 @@
-"""Run folders after kills and full disks: whole, or made whole by ``gfmhil recover``."""
+"""Run folders after kills and full disks: complete, or completed by ``gfmhil recover``."""
 
 from __future__ import annotations
 
@@ -26,14 +26,18 @@ from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording import npz
-from gfm_hil.recording.recorder import Part, merge
-from gfm_hil.results.export import export_run, load_run
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.export import export_run
 from gfm_hil.results.run_folder import finish, recover
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 
 from .test_processes import has_run, sides_of, signals, summary, wait_for, write
+
+pytestmark = pytest.mark.processes
 
 EVENTS = [
     {"type": "reference", "t": 0.02, "P_ref": 0.6},
@@ -58,7 +62,7 @@ def names(folder: Path) -> set[str]:
 
 
 def same_run(one: Path, other: Path) -> None:
-    """Two folders hold the same, but for how long the run took."""
+    """Check that two folders hold the same, except for the run's duration."""
     a, b = signals(one), signals(other)
     assert list(a) == list(b)
     assert all(a[name].tobytes() == b[name].tobytes() for name in a)
@@ -69,7 +73,7 @@ def same_run(one: Path, other: Path) -> None:
 
 @pytest.fixture
 def left(make, tmp_path, monkeypatch):
-    """A folder as a run leaves it before ``finish``, and the arguments of that."""
+    """A run folder before ``finish``, and the arguments of ``finish``."""
     found = []
 
     def stop(scenario, folder, laws, wall_s, figures, outside):
@@ -139,18 +143,18 @@ def test_a_kill_between_any_two_files_is_recovered(left, tmp_path, attack_now):
         shutil.copytree(folder, place)
         killed = finish_killed_at(count, scenario, place, rest)
         present = {n for n in ("signals.npz", "timing.npz") if (place / n).exists()}
-        for name in present:  # never half a file under its name
+        for name in present:  # never an incomplete file under its name
             with np.load(place / name) as file:
                 assert all(file[n] is not None for n in file.files)
         recover(place)
         same_run(place, whole)
-        assert names(place) in (WHOLE, DRAWN)  # drawn if it was killed before it said how it ended
+        assert names(place) in (WHOLE, DRAWN)  # DRAWN if killed before it stored its end
     assert count > 15
     attack_now(f"recovered after a kill at each of {count - 1} places, bit for bit the same")
 
 
 def finish_killed_at(number: int, scenario, folder: Path, rest) -> bool:
-    """Finish a folder in a process that kills itself before the n-th renaming or removal."""
+    """Finish a folder in a process that kills itself before the n-th rename or removal."""
     child = os.fork()
     if child == 0:
         count = 0
@@ -262,7 +266,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
 
 
 def fill(place: Path) -> Path:
-    """Take all the room that is left."""
+    """Fill the remaining space."""
     with (place / "ballast").open("wb", buffering=0) as file:
         try:
             while True:
@@ -292,7 +296,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
     run = recover(folder)
     assert run.summary["status"] == "safe"
     assert run.summary["reason"] == ("events_both.jsonl cannot be written: No space left on device")
-    told = [e for e in load_run(folder).events if e["event"] == "reference"]
+    told = [e for e in RecordedRun.load(folder).events if e["event"] == "reference"]
     assert 0 < len(told) < 249
     assert 0 <= run.summary["ticks"] - told[-1]["tick"] <= 10  # the run ended where its log did
     assert np.isfinite(run.signals["true_p"]).all()
@@ -357,7 +361,7 @@ def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, att
         run = run_scenario(make(duration=ticks * 1e-4, events=events), tmp_path / "run")
     starts = [e["tick"] for e in run.summary["events"]]
     assert len(starts) == 8000 and starts == sorted(starts)
-    assert read < 40 * ticks  # every column a few times, however many events there are
+    assert read < 40 * ticks  # every column a few times, for any number of events
     assert 20 < len(labels) <= 40
     attack_now(f"each row is read {read / ticks:.0f} times in all; {len(labels)} labels are drawn")
 
@@ -374,18 +378,20 @@ def test_metrics_of_a_file_are_those_of_arrays(run, make):
 
 @pytest.mark.parametrize("piece", [7, 100, 1 << 18])
 def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeypatch):
+    from gfm_hil.recording import columns
     from gfm_hil.results import metrics
 
     whole = dict(run(duration=0.3, events=EVENTS).signals)
     expected = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
-    monkeypatch.setattr(metrics, "_PIECE", piece)
+    for module in (columns, metrics):
+        monkeypatch.setattr(module, "PIECE", piece)
     found = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
     for name, value in expected.items():
         assert found[name] == (value if value is None else pytest.approx(value, rel=1e-12)), name
 
 
 def test_finishing_takes_the_memory_of_pieces(make, tmp_path):
-    """Of 20 s, whose columns take 45 MB."""
+    """A run of 20 s, whose columns take 45 MB."""
     scenario = make(duration=20.0)
     tracemalloc.start()
     try:

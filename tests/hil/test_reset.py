@@ -1,4 +1,4 @@
-"""Runs that wait after a trip or a safe state, and what a reset brings back."""
+"""Runs that wait after a trip or a safe state, and what a reset restores."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_after_a_reset_the_run_is_that_of_a_fresh_start(tmp_path):
     assert (s["ref_P_ref"][RESET + 1 :] == 0.5).all()
     fresh = run_scenario(scenario(events=[]), tmp_path / "b", figures=False).signals
     again = s["tick"] > RESET
-    for name in s.keys() - {"tick", "t"}:  # the same bits as a run that just began
+    for name in s.keys() - {"tick", "t"}:  # the same bits as a new run
         assert np.array_equal(s[name][again], fresh[name][: again.sum()]), name
 
 
@@ -88,7 +88,7 @@ def test_without_a_reset_it_ends_as_what_it_waits_for(tmp_path):
 
 @pytest.mark.parametrize("kind", ["inproc", "shm"])
 def test_a_safe_controller_blocks_the_plant_and_both_come_back(kind, tmp_path):
-    """Power beyond the measurement's range, after a jump that the protection lets pass."""
+    """Power beyond the measurement's range, after a jump that the protection tolerates."""
     events = [{"type": "grid-phase-jump", "tick": TRIP, "degrees": 120.0}, FALLS[-1]]
     what = scenario(events=events, plant={"protection": {"over_current": {"enabled": False}}})
     if kind == "inproc":
@@ -119,7 +119,7 @@ def test_a_reset_needs_a_run_that_waits():
 
 
 def test_other_gains_are_those_of_a_law_that_has_them(tmp_path):
-    """From rest, a change of D_p is the run of a law file that had it from the start."""
+    """From a steady state, a change of D_p gives the run of a law file with that D_p."""
     gains = {"type": "gains", "tick": 0, "values": {"D_p": 0.02}}
     step = {"type": "reference", "tick": 100, "P_ref": 0.6}
     ours = run_scenario(scenario(events=[gains, step]), tmp_path / "a", figures=False)
@@ -142,7 +142,7 @@ def test_a_gain_that_a_law_does_not_have_is_refused_before_anything_starts(tmp_p
 
 @pytest.mark.parametrize("kind", ["shm", "portable"])
 def test_answers_that_come_twice_while_it_waits_are_not_taken_for_new_ones(kind, tmp_path):
-    """The plant asks again so soon that most answers come more than once."""
+    """The plant repeats y so soon that most answers come more than once."""
     ours = run_scenario(scenario(), tmp_path / "a", figures=False).signals
     impairment = {"duplicate": 0.2, "loss": 0.05, "seed": 3}
     link = {**PATIENT, "repeat_s": 0.0005, "impairment": impairment}

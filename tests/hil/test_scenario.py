@@ -1,4 +1,4 @@
-"""Scenario files: what ships loads, what is written is read back, what is wrong is one line."""
+"""Scenario files: shipped ones load, written ones are read back, a mistake gives one line."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def test_a_scenario_that_is_nearly_right_is_suggested():
 
 
 def gfmhil(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
+    """Run the command in a separate process."""
     return subprocess.run(
         [sys.executable, "-m", "gfm_hil", *arguments], capture_output=True, text=True
     )

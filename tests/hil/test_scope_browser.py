@@ -1,4 +1,4 @@
-"""The scope in Chromium: a run is looked at, told what to do, trips, and is reset."""
+"""The scope in Chromium: a run is shown, commanded, trips, and is reset."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from websockets.sync.client import connect
 from .scope_pages import HAS_BROWSER, Browser, Rig, rig, wait_for
 
 pytestmark = [
+    pytest.mark.systems,
     pytest.mark.apt,
     pytest.mark.full,
     pytest.mark.timeout(300),
@@ -35,7 +36,7 @@ def going(tmp_path_factory) -> Iterator[Rig]:
 
 @pytest.fixture
 def page(going: Rig) -> Iterator[Browser]:
-    """A page with the token, its traces moving."""
+    """A page with the token and moving traces."""
     with Browser() as browser:
         browser.driver.get(going.control)
         wait_for(lambda: browser.text("#state") in ("RUNNING", "SAFE"))
@@ -44,7 +45,7 @@ def page(going: Rig) -> Iterator[Browser]:
 
 
 def said(page: Browser, title: str) -> str:
-    """What was answered under a heading of the panel."""
+    """The answer under a heading of the panel."""
     return str(
         page.js(
             "return [...document.querySelectorAll('#knobs section')].find((s) =>"
@@ -54,7 +55,7 @@ def said(page: Browser, title: str) -> str:
 
 
 def moves(page: Browser) -> None:
-    """The traces change, and so does the time."""
+    """Wait until the traces and the time change."""
     before, time = page.picture("power"), page.text("#time")
     wait_for(lambda: page.picture("power") != before and page.text("#time") != time)
 
@@ -77,7 +78,7 @@ def test_drive(page: Browser) -> None:
         "mimo-gfm-deployable"
     )
 
-    page.click("[data-law=vsg-2]")  # which this rig's small resistance does not bear
+    page.click("[data-law=vsg-2]")  # unstable with this rig's small resistance
     wait_for(lambda: page.text("#state") == "SAFE")
     assert "over-current" in wait_for(lambda: page.text("#knobs .why"))
     wait_for(lambda: "tripped: over-current" in page.text("#log"))
@@ -124,7 +125,7 @@ def test_without_the_token_one_may_look_not_touch(going: Rig, page: Browser) -> 
         assert page.js(
             f"return [...document.querySelectorAll('{knobs}')].filter((k) => !k.disabled).length"
         )
-        # a page that greys nothing is refused all the same
+        # the server refuses even a page that disables nothing
         other.js("document.querySelectorAll('button').forEach((b) => { b.disabled = false; })")
         other.js("document.getElementById('set-P_ref').disabled = false")
         other.write("#set-P_ref", "1")

@@ -1,4 +1,4 @@
-"""The scope among many pages, some mute and some malicious: none of them harms another."""
+"""The scope among many pages, some silent and some malicious: none of them harms another."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ from gfm_hil.scope.view import View
 
 from .scope_pages import Rig, mute, rig, serving, wait_for
 
+pytestmark = pytest.mark.processes
+
 LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "held", "span": 0.1}
 
 
 @pytest.fixture
 def scope(run) -> Scope:
-    """Of a run that is over."""
+    """The scope of a finished run."""
     return Scope(open_record(run().folder), Access())
 
 
@@ -54,7 +56,7 @@ def say(socket: ClientConnection, **content: Any) -> None:
 
 
 def gone(peer: ClientConnection) -> bool:
-    """The server has ended the connection; what it has sent before is read away."""
+    """Whether the server has closed the connection; discards what it sent before."""
     with contextlib.suppress(TimeoutError):
         try:
             while True:
@@ -198,7 +200,7 @@ def test_half_open_connections_end_by_themselves(scope, monkeypatch) -> None:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory) -> Iterator[Rig]:
-    """A run that goes on, with its scope."""
+    """A run in progress with its scope."""
     with rig(tmp_path_factory.mktemp("crowd")) as found:
         wait_for(lambda: len(list(found.folder.glob("desk_*.json"))) == 2)
         yield found

@@ -1,4 +1,4 @@
-"""The scope's server: what it serves, to whom, and what it makes of messages."""
+"""The scope's server: its files, its access rules, and its answers to messages."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from gfm_hil.scope.server import Scope, static_files
 from gfm_hil.scope.view import HEAD
 
 from .scope_pages import addresses, serving
+
+pytestmark = pytest.mark.processes
 
 LOOK = {"kind": "look", "id": 1, "channels": ["p", "omega_u"], "bins": 50, "mode": "held"}
 
@@ -87,7 +89,7 @@ def test_nothing_is_fetched_from_elsewhere() -> None:
 @pytest.mark.parametrize(
     "headers",
     [
-        {"Host": "evil.example"},  # a name of somebody's that points here
+        {"Host": "evil.example"},  # a foreign name that resolves to us
         {"Host": "evil.example:80@127.0.0.1"},
         {"Host": "["},
         {"Origin": "http://evil.example"},
@@ -220,7 +222,7 @@ def test_pages_beyond_the_limit_are_put_off(served) -> None:
     ],
 )
 def test_wrong_options_are_one_line(run, capsys, tmp_path, monkeypatch, options, message) -> None:
-    monkeypatch.setattr(os, "nice", lambda by: by)  # of pytest, for good
+    monkeypatch.setattr(os, "nice", lambda by: by)  # it would last for all of pytest
     monkeypatch.chdir(tmp_path)
     folder = str(run(duration=0.01).folder) if "{run}" in options else ""
     assert main(["scope", *(o.replace("{run}", folder) for o in options)]) == 2

@@ -1,4 +1,4 @@
-"""What a scope shows of a recording: no peak is lost, whatever the window; the trigger's edge."""
+"""A scope's view of a recording: no window loses a peak; the trigger's edge."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.record import Record
@@ -14,7 +15,7 @@ from gfm_hil.scope.trigger import ARMED, AUTO, FILLING, HELD, Acquisition, Trigg
 from gfm_hil.scope.view import HEAD, Look, View
 
 T_S = 1e-4
-SCENARIO = {"T_s": T_S, "duration": 2.0}
+SCENARIO = Scenario(title="growing", duration=2.0, T_s=T_S)
 TICKS = 20_000
 
 

@@ -1,4 +1,4 @@
-"""Folders that last as long as their processes, and recordings in memory that outlive theirs."""
+"""Folders that exist as long as their processes, and recordings in memory that outlive theirs."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from gfm_hil.core import temporary as scratch
-from gfm_hil.recording import recorder as recording
+from gfm_hil.recording import parts as recording
+
+pytestmark = pytest.mark.processes
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from gfm_hil.recording.recorder import Part, keep_in_memory
+from gfm_hil.recording.parts import Part, keep_in_memory
 folder = Path(sys.argv[1])
 keep_in_memory(folder, 100)
 part = Part.create(folder, sys.argv[2], 100)
@@ -30,7 +32,7 @@ Record = Callable[[Path, str], "subprocess.Popen[str]"]
 
 @pytest.fixture
 def memory(tmp_path, monkeypatch) -> Path:
-    """A folder in place of /dev/shm, for this process."""
+    """A folder that replaces /dev/shm for this process."""
     place = tmp_path / "memory"
     place.mkdir()
     monkeypatch.setattr(recording, "_MEMORY", place)
@@ -45,7 +47,7 @@ def record(memory) -> Iterator[Record]:
     def call(folder: Path, side: str) -> subprocess.Popen[str]:
         folder.mkdir(exist_ok=True)
         where = (
-            "import gfm_hil.recording.recorder as r, pathlib; "
+            "import gfm_hil.recording.parts as r, pathlib; "
             f"r._MEMORY = pathlib.Path({str(memory)!r})"
         )
         process = subprocess.Popen(
@@ -69,7 +71,7 @@ def kill(process: subprocess.Popen[str]) -> None:
 
 
 def another_run(tmp_path: Path) -> list[str]:
-    """What any run in real time does at its start and its end; returns what it said."""
+    """Do what any run in real time does at its start and its end; returns its notices."""
     folder, said = tmp_path / "another", []
     folder.mkdir()
     recording.keep_in_memory(folder, 10, said.append)
@@ -87,7 +89,7 @@ def test_a_folder_is_left_behind_once_nobody_holds_it(tmp_path):
     scratch.let_go(second)
     ((found, handle),) = scratch.left_behind("x-", tmp_path)
     assert found == place
-    assert list(scratch.left_behind("x-", tmp_path)) == []  # whoever clears up is alone
+    assert list(scratch.left_behind("x-", tmp_path)) == []  # only one process can remove them
     scratch.let_go(handle)
 
 
@@ -171,5 +173,5 @@ def test_it_stays_where_its_folder_has_no_room(record, memory, tmp_path, monkeyp
     monkeypatch.setattr("shutil.copyfileobj", full)
     another_run(tmp_path)
     assert (folder / "parts").is_symlink()
-    assert {path.name for path in folder.iterdir()} == {"parts"}  # no half of a copy
+    assert {path.name for path in folder.iterdir()} == {"parts"}  # no incomplete copy
     assert recording.Part.open(folder, "plant") is not None

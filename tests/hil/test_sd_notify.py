@@ -1,4 +1,4 @@
-"""What a side tells systemd, heard on a real datagram socket in systemd's place."""
+"""A side's messages to systemd, received on a real datagram socket in systemd's place."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ import pytest
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.scenario.toml_out import toml_text
 
+pytestmark = pytest.mark.processes
+
 PATIENCE_S = 90.0
 
 
@@ -28,7 +30,7 @@ class Manager:
         sock.setblocking(False)
 
     def lines(self) -> list[str]:
-        """Every line that has come since this was asked last."""
+        """All lines received since the last call."""
         fresh = []
         while True:
             try:
@@ -38,7 +40,7 @@ class Manager:
                 return fresh
 
     def wait_for(self, line: str) -> None:
-        """Until that line has come after this call."""
+        """Wait until that line arrives after this call."""
         end = time.monotonic() + PATIENCE_S
         while line not in self.lines():
             assert time.monotonic() < end, (line, self.heard)
@@ -75,7 +77,7 @@ def test_watchdog_is_fed_only_while_the_count_of_ticks_grows(manager, make, monk
     monkeypatch.setenv("WATCHDOG_USEC", "200000")
     progress = np.zeros(2, np.int64)
     with Watched(make(link={"type": "inproc", "peer_timeout_s": 0.05}), progress):
-        time.sleep(0.4)  # eight looks
+        time.sleep(0.4)  # eight polls
         assert manager.lines() == ["READY=1", "STATUS=met the other side"]
         progress[:] = 7, 3
         manager.wait_for("WATCHDOG=1")
@@ -118,7 +120,7 @@ def test_side_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
     manager.wait_for("WATCHDOG=1")
     manager.wait_for("WATCHDOG=1")  # and goes on
     plant.send_signal(signal.SIGSTOP)
-    time.sleep(1.5)  # what was computed before it stopped may still be told
+    time.sleep(1.5)  # it may still send what it computed before the stop
     manager.lines()
     time.sleep(3.0)
     assert manager.lines() == []

@@ -1,4 +1,4 @@
-"""The shared-memory link in this process: the same runs, its ring, whom it refuses."""
+"""The shared-memory link in this process: the same runs, its ring, refused peers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def segment_of(endpoint: str) -> Path:
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """A fresh endpoint of which nothing may be left."""
+    """A new endpoint; checks at the end that nothing of it is left."""
     endpoint = f"shm://test-{secrets.token_hex(8)}"
     yield endpoint
     left = segment_of(endpoint).exists()
@@ -140,7 +140,7 @@ def test_waiting_ends_when_a_message_comes(pair):
     thread.start()
     begin = time.monotonic()
     assert receiver.wait(60)
-    assert time.monotonic() - begin < 50  # it was the message, not the time
+    assert time.monotonic() - begin < 50  # the message ended it, not the timeout
     thread.join()
 
 
@@ -202,7 +202,7 @@ def test_a_file_that_is_none_of_ours_is_refused_and_kept(endpoint):
 
 @pytest.mark.parametrize("shift", [(0, 1, 0), (2**30, 0, 0)])
 def test_an_owner_is_known_by_its_start_too(shift, endpoint):
-    """A process number is used again some day."""
+    """The kernel reuses process ids."""
     owner = tuple(np.add(segment.myself(), shift).tolist())
     segment_of(endpoint).write_bytes(header(segment.VERSION, owner))
     ShmLink("controller", endpoint).close()
@@ -253,8 +253,8 @@ def test_of_many_that_replace_a_dead_one_at_a_time_one_wins(endpoint):
 
 
 def emitted(function: object) -> tuple[str, str]:
-    """LLVM's code after optimisation and the machine's, of a function compiled anew: what comes
-    from the cache cannot be inspected."""
+    """LLVM's optimised code and the machine code of a newly compiled function: cached ones cannot
+    be inspected."""
     fresh = njit(PORT_CALL)(function.py_func)  # type: ignore[attr-defined]
     (signature,) = fresh.signatures
     return fresh.inspect_llvm(signature), fresh.inspect_asm(signature)
@@ -273,7 +273,7 @@ def test_the_emitted_code_keeps_the_order(function):
     assert "cmpxchg" not in code.split("define")[1]
     if platform.machine() == "x86_64":
         own = machine.split(".Lfunc_end0")[0]
-        assert "NRT_" not in own  # no counting of references
+        assert "NRT_" not in own  # no reference counting
         assert "mfence" not in own
         assert "lock" not in own  # both orders are plain moves on x86
         after_copy = own[own.index("callq") :]

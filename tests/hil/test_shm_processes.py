@@ -1,4 +1,4 @@
-"""The shared-memory link between processes: nothing torn, and what a killed one leaves."""
+"""The shared-memory link between processes: no torn message, and the rests of killed processes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from gfm_hil.links.shm.link import ShmLink
 
 from .test_shm import endpoint, segment_of
 
+pytestmark = pytest.mark.processes
+
 __all__ = ["endpoint"]
 
 Peer = Callable[..., "subprocess.Popen[str]"]
@@ -21,7 +23,7 @@ Peer = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def peer(endpoint: str) -> Iterator[Peer]:
-    """Start a side as a process, and wait until it has opened its end."""
+    """Start a side as a process and wait until it has opened its end."""
     started = []
 
     def call(side: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:

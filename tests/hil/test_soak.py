@@ -1,7 +1,7 @@
-"""A run in real time with clients that come and go for as long as GFMHIL_SOAK_S says, s.
+"""A run in real time for GFMHIL_SOAK_S seconds with clients that connect and disconnect.
 
-``GFMHIL_SOAK_S=900 python -m pytest tests/hil/test_soak.py`` takes a quarter of an hour for each
-link. With GFMHIL_SOAK_CSV=FOLDER each link leaves its samples there as ``soak_LINK.csv``.
+``GFMHIL_SOAK_S=900 python -m pytest tests/hil/test_soak.py`` takes a quarter of an hour per link.
+With GFMHIL_SOAK_CSV=FOLDER the test of each link writes its samples there as ``soak_LINK.csv``.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ from .soak_parts import MB, Clients, Sampler, ports_in
 from .test_kill import places
 from .test_processes import PATIENCE_S, has_run, sides_of, signals, summary, wait_for
 
+pytestmark = pytest.mark.systems
+
 SOAK_S = float(os.environ.get("GFMHIL_SOAK_S", "0"))
 CSV = os.environ.get("GFMHIL_SOAK_CSV")
 FAULTS = """
@@ -45,7 +47,7 @@ jitter = 2e-4
 """
 WARM_UP = 0.25  # of the rounds: imports, caches and threads that a process makes once
 GROWTH = 8 * MB  # of a process's own memory after the warm-up
-# glibc gives freed memory back at once: what it would keep for later is no growth of ours
+# glibc returns freed memory at once: memory that it would keep is not our growth
 AT_ONCE = {
     "MALLOC_ARENA_MAX": "1",
     "MALLOC_MMAP_THRESHOLD_": "65536",
@@ -57,7 +59,7 @@ EXTREMES = 2 * 4 / 7  # bytes of the scope's pyramid, for each channel and tick
 
 @contextlib.contextmanager
 def bench(link: str, place: Path) -> Iterator[tuple[Clients, dict[str, subprocess.Popen[str]]]]:
-    """A run with its three servers, all of them processes of their own, and clients for them."""
+    """A run with its three servers, all in separate processes, and their clients."""
     file, folder = place / "soak.toml", place / "run"
     faulty = RIG.replace('type = "shm"', f'type = "{link}"').replace("[plant]", f"{FAULTS}[plant]")
     file.write_text(faulty.replace("duration = 300.0", f"duration = {SOAK_S + 600}"), "utf-8")

@@ -1,4 +1,4 @@
-"""Signals become a flag while a run lasts, and are what they were before and after."""
+"""Signals set a flag during a run, and the handlers are restored after it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import threading
 import pytest
 
 from gfm_hil.core.stopping import Interrupt
+
+pytestmark = pytest.mark.processes
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -1,4 +1,4 @@
-"""Six laws in one run, switched while the power moves: no bump, no trip."""
+"""Six laws in one run, switched during a change of power: no bump, no trip."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_each_bump_is_below_a_millionth(chain):
 
 
 def test_the_commands_themselves_show_no_step(chain):
-    """Not by the controller's word: u goes on as in the ticks before, within its own curvature."""
+    """Measured, not reported: u continues from the ticks before, within its own curvature."""
     changes = [e["tick"] for e in chain.summary["events"] if e["type"] == "law"]
     for tick in changes:
         for name in COMMANDS:
@@ -43,7 +43,7 @@ def test_the_commands_themselves_show_no_step(chain):
 
 
 def test_the_power_moves_at_each_change(chain):
-    """Else the chain would be no test: an equilibrium is easily carried over."""
+    """Else the chain would prove nothing: a switch in a steady state is easy."""
     for event in chain.summary["events"]:
         if event["type"] == "law":
             window = chain.signals["true_p"][event["tick"] - 1000 : event["tick"]]

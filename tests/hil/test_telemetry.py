@@ -1,4 +1,4 @@
-"""What a run sends on: to a subscriber made from PlotJuggler's documented format and to ours."""
+"""A run's streams, to a subscriber of PlotJuggler's documented format and to ours."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.operator import Operator
-from gfm_hil.recording.recorder import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
+from gfm_hil.recording.parts import Part
 from gfm_hil.telemetry import BlockReader
 from gfm_hil.telemetry.blocks import block_dtype, messages
 from gfm_hil.telemetry.follow import Follower, Rows
 from gfm_hil.telemetry.publish import Ports, Publisher
 from gfm_hil.telemetry.samples import Sampler
+
+pytestmark = pytest.mark.processes
 
 SCENARIO = """
 title = "sent on"
@@ -38,9 +41,9 @@ PATIENCE_S = 100.0
 
 
 class PlotJuggler:
-    """The ZeroMQ subscriber of PlotJuggler 3 as its page and its source say: a SUB that connects
-    and takes all topics; one part is a payload, of two the first is the topic, a third would be
-    the time; JSON whose numbers become series by their path below the topic."""
+    """PlotJuggler 3's ZeroMQ subscriber, after its documentation and source: a SUB that connects
+    and takes all topics; a single part is a payload, of two parts the first is the topic, a third
+    would be the time; JSON whose numbers become series by their path below the topic."""
 
     def __init__(self, port: str) -> None:
         self.context = zmq.Context()
@@ -53,7 +56,7 @@ class PlotJuggler:
         if not self.socket.poll(timeout_s * 1e3):
             return False
         parts = self.socket.recv_multipart()
-        assert len(parts) in (1, 2)  # its versions to date spoil the payload before a third
+        assert len(parts) in (1, 2)  # its versions to date corrupt the payload if there is a third
         topic = parts[0].decode() if len(parts) == 2 else ""
         sample = json.loads(parts[-1], parse_constant=pytest.fail)  # NaN is not JSON
         self._flatten(topic, sample, sample["timestamp"])
@@ -69,7 +72,7 @@ class PlotJuggler:
 
 @pytest.fixture
 def listen() -> Iterator[Callable[[str], PlotJuggler]]:
-    """Makes subscribers; none is left to the garbage collector, which would wait for its socket."""
+    """Makes subscribers and closes them: the garbage collector would wait for their sockets."""
     made = []
 
     def call(port: str) -> PlotJuggler:
@@ -82,7 +85,7 @@ def listen() -> Iterator[Callable[[str], PlotJuggler]]:
 
 
 def run_and_stream(start, folder: Path, mode: str, *options: str):
-    """A run and its stream; returns both processes and the ports of samples and blocks."""
+    """Start a run and its stream; returns both processes and the ports of samples and blocks."""
     file = folder.parent / "sent.toml"
     file.write_text(SCENARIO.format(mode=mode), encoding="utf-8")
     stream = start("stream", str(folder), "--wait", "--port", "0", *options)
@@ -92,7 +95,7 @@ def run_and_stream(start, folder: Path, mode: str, *options: str):
 
 
 def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[str, np.ndarray]:
-    """End the run; returns what it recorded."""
+    """Stop the run; returns its recording."""
     until = time.monotonic() + PATIENCE_S
     while not all((folder / f"desk_{side}.json").exists() for side in SIDES):
         assert time.monotonic() < until
@@ -182,7 +185,7 @@ def test_samples_of_a_run_in_real_time_tell_misses_and_slack(start, listen, tmp_
 
 
 def rows(first: int, count: int, **columns: np.ndarray) -> Rows:
-    """Rows of a plant in real time in which all is well but what is given."""
+    """Rows of a plant in real time without misses, with the given changes."""
     times = np.zeros((count, len(PLANT_TIMES)), np.int64)
     times[:, 0] = 1_000_000_000 + (first + np.arange(count)) * 100_000
     times[:, 3] = times[:, 0] + 40_000
@@ -197,7 +200,7 @@ def parsed(found: list[list[bytes]]) -> list[dict]:
 
 def test_samples_count_misses_on_and_keep_the_least_slack():
     sampler = Sampler(1e-4, 1000.0, misses=5)
-    received = rows(3, 25).time("received").copy()
+    received = rows(3, 25).columns["plant_received"].copy()
     received[[4, 20]] = -1  # ticks 7 and 23
     received[9] += 30_000  # tick 12
     found = parsed(sampler.messages(rows(3, 25, received=received), 25e-4))
@@ -211,7 +214,7 @@ def test_a_run_faster_than_real_time_is_thinned_out():
     sampler = Sampler(1e-4, 1000.0, misses=0)
     assert len(sampler.messages(rows(0, 2000), 0.2)) == 200
     assert len(sampler.messages(rows(2000, 2000), 0.02)) == 20
-    assert len(sampler.messages(rows(4000, 2000), 0.19)) == 200  # not for a moment's haste
+    assert len(sampler.messages(rows(4000, 2000), 0.19)) == 200  # a short burst does not thin out
 
 
 def test_ticks_never_recorded_and_numbers_that_json_has_not_are_left_out():
@@ -321,15 +324,15 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
             shutil.rmtree(tmp_path / "parts", ignore_errors=True)
         return False
 
-    find, calls = follower._find, iter(range(100))
+    find, calls = Part.open, iter(range(100))
     problems = {2: OSError(24, "Too many open files"), 3: ValueError("a mistake of ours")}
 
-    def sometimes(from_now: bool) -> None:
-        if problem := problems.get(next(calls)):
+    def sometimes(folder: Path, side: Side) -> Part | None:
+        if problem := problems.get(next(calls, 0)):
             raise problem
-        find(from_now)
+        return find(folder, side)
 
-    monkeypatch.setattr(follower, "_find", sometimes)
+    monkeypatch.setattr(Part, "open", sometimes)
     with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:
         sent = publisher.follow(follower, 500.0, stopped)
     assert sent == ticks

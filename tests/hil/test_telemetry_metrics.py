@@ -1,4 +1,4 @@
-"""Metrics of a run, collected as Prometheus does."""
+"""Metrics of a run, scraped as by Prometheus."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from gfm_hil.cli import main
 from gfm_hil.operator import Operator
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics
+
+pytestmark = pytest.mark.processes
 
 PATIENCE_S = 100.0
 SCENARIO = """
@@ -31,7 +33,7 @@ peer_timeout_s = 30.0
 
 
 def scraped(port: int | str) -> dict[tuple[str, str], float]:
-    """Every sample by its name and the value of its label."""
+    """All samples by name and label value."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10.0) as answer:
         text = answer.read().decode()
     return {
@@ -75,7 +77,7 @@ def test_a_run_is_collected_while_it_goes_on(start, tmp_path):
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Follower:
-    """A run of an hour in real time, 30 s into it, as its files say."""
+    """The files of an hour's run in real time after 30 s."""
     (tmp_path / "scenario.toml").write_text('T_s = 1e-4\nmode = "realtime"\n', encoding="utf-8")
     ticks = 300_000
     part = Part.create(tmp_path, "plant", ticks + 10)
@@ -101,7 +103,7 @@ def test_quantiles_are_of_the_last_ten_seconds(recorded):
     assert found["gfmhil_slack_seconds", "0"] == pytest.approx(5e-6)
     assert found["gfmhil_round_trip_seconds", "0.999"] == pytest.approx(30e-6)
     assert found["gfmhil_round_trip_seconds", "1"] == pytest.approx(95e-6)
-    # without a desk the law has a number only
+    # without a desk the law has only a number
     assert found["gfmhil_law_info", "1"] == 1
     assert found["gfmhil_state", "SAFE"] == 1
 

@@ -1,4 +1,4 @@
-"""The pytest plugin: a project of somebody's own, made in a folder and tested by pytest itself."""
+"""The pytest plugin: a user's project, made in a folder and run by pytest itself."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.checks import Window, damped, envelope, overshoot, read_envelope, settles
 
+pytestmark = pytest.mark.processes
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CONTROLLER = EXAMPLES / "own_controller" / "controller.py"
 
@@ -26,7 +28,7 @@ pytest_plugins = ["pytester"]
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Lab:
-    """An experiment as the fixture makes it, begun with what is given."""
+    """Makes an experiment like the fixture's, started with the given arguments."""
     count = iter(range(100))
 
     def make(scenario: str | None = None, **setting: object) -> Experiment:
@@ -165,7 +167,7 @@ def test_unused_plugin_imports_nothing_heavy() -> None:
 
 
 def project(name: str, tmp_path: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """What pytest alone says in a copy of an example project."""
+    """Run pytest in a copy of an example project."""
     copy = tmp_path / name
     shutil.copytree(EXAMPLES / name, copy, ignore=shutil.ignore_patterns("__pycache__"))
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options]
@@ -204,7 +206,7 @@ def test_example_controller_in_c_passes_its_tests(tmp_path: Path) -> None:
 
 
 def test_example_controller_is_droop_5_but_for_its_integrator(lab: Lab, tmp_path: Path) -> None:
-    """Euler there, Tustin here: a response of the same law, to a part in a hundred."""
+    """Euler there, Tustin here: the responses of the same law agree within 1 %."""
     source = (EXAMPLES / "own_law" / "laws" / "my-droop.toml").read_text(encoding="utf-8")
     (tmp_path / "law.toml").write_text(source, encoding="utf-8")
     p = []
@@ -302,7 +304,7 @@ def test_other_gains_and_a_way_back_from_a_trip(lab: Lab) -> None:
     bench.run(0.1)
     bench.gains(D_p=0.002)
     bench.run(0.1)
-    assert np.ptp(bench.signals["p"]) < 1e-6  # bumpless, at rest
+    assert np.ptp(bench.signals["p"]) < 1e-6  # no bump, steady state
     bench.phase_jump(150)
     bench.run(0.05)
     with pytest.raises(AssertionError, match="tripped: over-current"):
@@ -327,7 +329,7 @@ def test_results_over_can_are_those_in_process_but_for_its_sixteen_bits(lab: Lab
 
 
 def test_real_time_is_run_once_and_counts_its_misses(lab: Lab) -> None:
-    patient = {"late_policy__hold": 10**6, "link__peer_timeout_s": 10.0}  # of a busy machine
+    patient = {"late_policy__hold": 10**6, "link__peer_timeout_s": 10.0}  # for a busy machine
     bench = lab("rig_pref_step", events=[], link="shm", mode="realtime", **patient)
     bench.run(0.05)
     bench.set(P_ref=0.6)

@@ -1,4 +1,4 @@
-"""ZeroMQ beyond one machine: encrypted, with the one plant that is known, or refused."""
+"""ZeroMQ beyond one machine: encrypted, with the one known plant, or refused."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from gfm_hil.links.zeromq.options import ZmqOptions, beyond_loopback
 from .test_links import PATIENT, assert_same, both_sides, in_threads
 from .test_zmq_port import deliver
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def tcp() -> str:
@@ -40,7 +42,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys of somebody else, who knows our controller's public key as all may."""
+    """Keys of a stranger who knows our controller's public key, which is public."""
     folder = tmp_path_factory.mktemp("others")
     write_keys(folder)
     return folder
@@ -80,7 +82,7 @@ def test_an_encrypted_run_is_bit_for_bit_in_process(make, run, tmp_path, tcp, ke
 
 
 def test_frames_are_not_readable_on_the_wire(tcp, keys):
-    """Through a relay that listens in."""
+    """Through a relay that eavesdrops."""
     heard = bytearray()
     with socket.create_server(("127.0.0.1", 0)) as server:
         host, port = server.getsockname()
@@ -123,7 +125,7 @@ def test_only_the_plant_whose_key_is_known_gets_in(controller, tcp, keys, others
         intruder.send(b"forged")
         plain.send(b"forged")
         assert not controller.wait(1.0)
-        plant = ZmqLink("plant", tcp, curve(keys))  # and they do not take its place
+        plant = ZmqLink("plant", tcp, curve(keys))  # and the strangers do not take its place
         try:
             assert arrives(plant, controller)
         finally:
@@ -134,7 +136,7 @@ def test_only_the_plant_whose_key_is_known_gets_in(controller, tcp, keys, others
 
 
 def test_nobody_gets_in_while_there_is_nobody_to_ask(controller, tcp, keys, others, tmp_path):
-    """libzmq by itself would let in whoever knows the controller's public key."""
+    """By default libzmq accepts every peer that knows the controller's public key."""
     controller._curve.close()
     intruder = ZmqLink("plant", tcp, curve(mixed(tmp_path, others, keys)))
     try:

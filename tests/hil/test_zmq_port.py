@@ -1,4 +1,4 @@
-"""ZeroMQ called from compiled code: the same messages as by pyzmq, to the byte."""
+"""ZeroMQ called from compiled code: the same messages as with pyzmq, byte by byte."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def compiled(function, handle, message):
 
 
 def deliver(link: Link, message: bytes) -> None:
-    """Send it as soon as there is room."""
+    """Send a message as soon as there is room."""
     while not link.send(message):
         time.sleep(0.001)
 
 
 class ByPort:
-    """A link whose messages all go through its port."""
+    """A link that sends and receives through its port."""
 
     def __init__(self, link: Link, size: int = 512) -> None:
         assert link.port is not None
@@ -91,7 +91,7 @@ def test_messages_of_any_size_either_way_in_order(ends):
     for side, other in zip(SIDES, SIDES[::-1], strict=True):
         for message in sent:
             assert ByPort(ends[side]).send(message)
-        for k, message in enumerate(sent):  # by turns through the port and through pyzmq
+        for k, message in enumerate(sent):  # alternately through port and pyzmq
             link = ByPort(ends[other]) if k % 2 else ends[other]
             assert ends[other].wait(30)
             assert link.receive() == message
@@ -138,7 +138,7 @@ def test_portable_leaves_the_frames_to_pyzmq(endpoint):
 
 @pytest.mark.parametrize("missing", ["zmq.backend.cython", "ctypes"])
 def test_without_a_libzmq_to_call_it_says_so_and_goes_on(missing, endpoint):
-    """As with PyPy, or a pyzmq whose extension does not show the library linked into it."""
+    """As with PyPy, or a pyzmq whose extension hides the library linked into it."""
     hide = {
         "zmq.backend.cython": "import sys; sys.modules['zmq.backend.cython'] = None",
         "ctypes": "import ctypes; ctypes.CDLL = lambda path: object()",
@@ -160,7 +160,7 @@ for end in ends:
 
 
 def test_a_plant_that_was_turned_away_reaches_the_controller_when_the_other_has_left(endpoint):
-    """As when a run starts anew while the plant of the one before is still in its patience."""
+    """As when a new run starts while the previous run's plant still waits for its peer."""
     with contextlib.ExitStack() as stack:
         controller, old = ZmqLink("controller", endpoint), ZmqLink("plant", endpoint)
         stack.callback(controller.close)
@@ -169,7 +169,7 @@ def test_a_plant_that_was_turned_away_reaches_the_controller_when_the_other_has_
         assert controller.receive() == b"old"
         new = ZmqLink("plant", endpoint)
         stack.callback(new.close)
-        time.sleep(0.1)  # for it to be turned away
+        time.sleep(0.1)  # until it is refused
         old.close()
         until = time.monotonic() + 60
         while controller.receive() != b"new":

@@ -1,4 +1,4 @@
-"""A kernel with CAN as a process, user-mode Linux on the host's files, that runs one job."""
+"""A kernel with CAN as a process: user-mode Linux on the host's files, which runs one job."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ PACKAGES = ("hil", "runtime", "plant_emulator", "design")
 class Kernel:
     """Boots and runs ``can_inside_uml.py`` under pytest; takes some minutes.
 
-    So it is started before the other tests, and looked at after them. Inside, where every system
-    call takes its time, compiling would take ten minutes; what is compiled for a bus on the
-    loopback device is the same, so the host does that first. Numba takes what is cached only if a
-    source has the time that it had, and inside times are cut to seconds: both use a copy whose
-    times are whole seconds.
+    So it starts before the other tests, and its result is checked after them. Inside, where system
+    calls are slow, compiling would take ten minutes; a bus on the loopback device needs the same
+    compiled code, so the host compiles it first. Numba uses a cached function only if its source
+    has the same time, and inside times are truncated to seconds: both use a copy of the sources
+    with times in whole seconds.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class Kernel:
             "OPENBLAS_NUM_THREADS": "1",
         }
         test = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", TESTS]
-        # in the host's, what no process of the host owns is tidied up
+        # in the host's folder, the host would remove files that none of its processes owns
         inside = {**settings, "TMPDIR": "/dev/shm"}
         lines = [
             *(f"export {name}={shlex.quote(value)}" for name, value in inside.items()),
@@ -63,7 +63,7 @@ class Kernel:
         self._kernel = subprocess.Popen(
             ["sh", "-c", f"{shlex.join(compiling)}; exec {shlex.join(kernel)}"],
             cwd=source,
-            # its memory is a file in TMPDIR: /dev/shm may be small
+            # its memory is a file in TMPDIR, since /dev/shm may be small
             env={
                 **os.environ, **settings, "TMPDIR": str(folder),
                 "GFMHIL_TEST_BUS": link_kind("can").fresh(folder),
@@ -72,12 +72,12 @@ class Kernel:
             stdout=self._console.open("wb"),
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            # its processes take turns; a processor that falls asleep between made it 5 times slower
+            # its processes take turns; a processor that went idle in between made it 5 times slower
             preexec_fn=lambda: os.sched_setaffinity(0, {max(os.sched_getaffinity(0))}),
         )  # fmt: skip
 
     def result(self, timeout: float) -> tuple[str, str]:
-        """Exit status of the job ("" if it did not end) and what it or the kernel said."""
+        """Exit status of the job ("" if it did not end), and its or the kernel's output."""
         try:
             self._kernel.wait(timeout=timeout)
         except subprocess.TimeoutExpired:
@@ -87,7 +87,7 @@ class Kernel:
         return status, said.read_text(encoding="utf-8", errors="replace")[-6000:]
 
     def end(self) -> None:
-        """Kill it, if it is still there: it is several processes."""
+        """Kill all its processes that still run."""
         if self._kernel.poll() is None:
             os.killpg(self._kernel.pid, signal.SIGKILL)
             self._kernel.wait()
@@ -99,7 +99,7 @@ class Kernel:
 
 
 def _copy(target: Path) -> Path:
-    """Our packages and tests as they are, with times cut to seconds; returns ``target``."""
+    """Copy our packages and tests, with times truncated to seconds; returns ``target``."""
 
     def cut(source: str, copy: str) -> None:
         shutil.copyfile(source, copy)

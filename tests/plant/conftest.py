@@ -1,4 +1,4 @@
-"""A plant at rest, as most tests of the plant start from it."""
+"""A plant in equilibrium, the start of most tests of the plant."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Rest(NamedTuple):
     u: NDArray[np.float64]
 
     def near(self, i_u: float = 0.0, omega_u: float = 0.0, E_u: float = 0.0) -> NDArray[np.float64]:
-        """Return the command of the equilibrium, nudged by so much."""
+        """Return the command of the equilibrium plus these offsets."""
         return self.u + np.array([i_u, omega_u, E_u])
 
     def advance(self, ticks: int = 1, u: NDArray[np.float64] | None = None) -> None:
@@ -50,7 +50,7 @@ class Rest(NamedTuple):
 
 @pytest.fixture
 def rest() -> Callable[..., Rest]:
-    """Return a maker: options of the plant as keywords, T_s in s, P and V in p.u."""
+    """Return a factory: options of the plant as keywords, T_s in s, P and V in p.u."""
 
     def make(T_s: float = 1e-4, P: float = 0.5, V: float = 1.0, **options: Any) -> Rest:
         par, st = make_plant(Plant.model_validate(options), T_s)

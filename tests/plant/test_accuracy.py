@@ -13,7 +13,7 @@ from gfm_plant.model import f
 T_S = 1e-4
 D = np.array([1.0, 1.0])
 
-Segments = list[tuple[int, NDArray[np.float64]]]  # (ticks, the u held for so long)
+Segments = list[tuple[int, NDArray[np.float64]]]  # (ticks, u held for these ticks)
 
 
 def reference(rest: Any, segments: Segments) -> NDArray[np.float64]:
@@ -46,16 +46,16 @@ def emulated(rest: Any, segments: Segments) -> NDArray[np.float64]:
 
 
 def test_one_second_open_loop(rest: Callable[..., Any]) -> None:
-    """The paper's DC source while it charges, where v_dc is stable without a control."""
+    """The paper's DC source while it charges: v_dc is then stable without control."""
     plant = rest(P=-0.5)
     segments = [(10_000, plant.near(E_u=1e-3))]
     x = emulated(plant, segments)
-    assert np.ptp(x[:, 4]) > 0.03  # there was something to follow
+    assert np.ptp(x[:, 4]) > 0.03  # the state did move
     assert np.abs(x - reference(plant, segments)).max() < 1e-7
 
 
 def test_one_second_with_the_regulated_source(rest: Callable[..., Any]) -> None:
-    """The angle moves by 50 ms at +0.001 p.u., that is 0.45 p.u. of power; then it is held."""
+    """The angle moves for 50 ms at +0.001 p.u., which is 0.45 p.u. of power; then it is held."""
     plant = rest(dc_source={"mode": "regulated"})
     segments = [(500, plant.near(omega_u=1e-3)), (9500, plant.u)]
     x = emulated(plant, segments)
@@ -64,7 +64,7 @@ def test_one_second_with_the_regulated_source(rest: Callable[..., Any]) -> None:
 
 
 def test_fourth_order(rest: Callable[..., Any]) -> None:
-    """Twice the sub-steps, a sixteenth of the error."""
+    """Twice the sub-steps give a sixteenth of the error."""
     errors = []
     for substeps in (4, 8, 16):
         plant = rest(substeps=substeps)
@@ -75,7 +75,7 @@ def test_fourth_order(rest: Callable[..., Any]) -> None:
 
 
 def test_power_balance_of_a_run(rest: Callable[..., Any]) -> None:
-    """What leaves C_dc and the DC source is lost, stored or delivered, by Simpson's rule."""
+    """Energy from C_dc and the DC source is lost, stored or delivered, by Simpson's rule."""
     plant = rest(T_s=1e-5, substeps=1)
     u = plant.near(i_u=0.2, omega_u=5e-4, E_u=2e-3)
     n = 10_000  # even

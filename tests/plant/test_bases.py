@@ -1,4 +1,4 @@
-"""Per-unit conversions against values worked by hand."""
+"""Per-unit conversions against values computed by hand."""
 
 import math
 

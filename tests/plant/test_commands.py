@@ -1,4 +1,4 @@
-"""How a command reaches the bridge and the DC source: D/A, delay, limits, regulation."""
+"""The path of a command to the bridge and the DC source: D/A, delay, limits, regulation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +25,7 @@ def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) 
         late.advance(u=u[k])
         prompt.advance(u=shifted[k])
         assert (late.st["x"] == prompt.st["x"]).all()
-        assert late.sample()[2] == shifted[k, 1]  # the omega_u that acts
+        assert late.sample()[2] == shifted[k, 1]  # the omega_u in effect
 
 
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])
@@ -33,7 +33,7 @@ def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) 
 def test_fraction_splits_the_period_exactly(
     rest: Callable[..., Any], samples: int, fraction: float
 ) -> None:
-    """Reference: a plant at a hundredth of the period, its command changed at the right one."""
+    """Reference: a plant with a hundredth of the period; its command changes at the right tick."""
     late = rest(delay={"samples": samples, "fraction": fraction}, substeps=20)
     fine = rest(T_s=1e-6, substeps=1)
     u = commands(20, late.u)
@@ -79,7 +79,7 @@ def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -
 
 
 def test_regulated_source_does_not_wind_up(rest: Callable[..., Any]) -> None:
-    """Short of current the integral stands still, so that v_dc does not overshoot after."""
+    """At the current limit the integral is frozen, so that v_dc does not overshoot afterwards."""
     plant = rest(P=0.3, dc_source={"mode": "regulated", "i_max": 0.5})
     plant.advance(50, plant.near(omega_u=0.01))  # the power rises beyond 0.5 p.u.
     plant.advance(300, plant.u)
@@ -116,4 +116,4 @@ def test_no_allocation_in_a_tick(rest: Callable[..., Any]) -> None:
     run(*arguments, 1000)
     after = rtsys.get_allocation_stats().alloc
     _nrt_python.memsys_disable_stats()
-    assert after - before <= len(arguments)  # wrapping these, once a call; nothing per tick
+    assert after - before <= len(arguments)  # their boxing, once per call; nothing per tick

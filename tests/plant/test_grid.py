@@ -1,4 +1,4 @@
-"""Every action of the grid simulator does what it says."""
+"""Every action of the grid simulator has its effect."""
 
 import math
 from collections.abc import Callable
@@ -81,7 +81,7 @@ def test_phase_jump_of_the_grid(rest: Callable[..., Any]) -> None:
     phase_jump(plant.st, 10.0)
     assert plant.truth()["delta"] == pytest.approx(plant.x[DELTA] - math.radians(10))
     plant.advance(5)
-    assert plant.truth()["p"] < 0.5  # a grid that leads takes less power
+    assert plant.truth()["p"] < 0.5  # a leading grid takes less power
 
 
 def test_a_full_turn_changes_nothing(rest: Callable[..., Any]) -> None:
@@ -142,18 +142,18 @@ def test_local_load_follows_the_grid(rest: Callable[..., Any]) -> None:
 
 
 def test_island_runs_at_the_converters_frequency(rest: Callable[..., Any]) -> None:
-    """Its waveform in a fixed frame turns at omega_u, whatever the grid left behind does."""
+    """Its waveform in a fixed frame rotates at omega_u, independent of the disconnected grid."""
     plant = rest(dc_source={"mode": "regulated"}, grid=LOAD)
     breaker(plant.par, plant.st, closed=False)
     grid_frequency(plant.st, 0.9)
     u = plant.near(omega_u=0.02)
-    plant.advance(10_000, u)  # 1 s: transients are gone
+    plant.advance(10_000, u)  # 1 s: transients have decayed
     x = plant.st["x"][0]
     settled = x.copy()
     plant.advance(100, u)
     assert x[:6] == pytest.approx(settled[:6], abs=1e-8)  # constant in the frame of omega_u
     assert plant.truth()["omega_u"] == pytest.approx(1.02)
-    # and the current is what the load draws at that frequency
+    # and the current is the load's at that frequency
     v, i_o = complex(x[2], x[3]), complex(x[4], x[5])
     Z = complex(2.0 + 0.06 / 36.1, 1.02 * (0.4351236 + 0.0174049446))
     assert i_o == pytest.approx(v / Z, abs=1e-7)

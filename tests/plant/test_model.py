@@ -1,4 +1,4 @@
-"""The equations themselves: Eq. (1)-(8) by hand, complex step, power balance."""
+"""The equations: Eq. (1)-(8) by hand, complex step, power balance."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Options: defaults are ideal, and what is wrong is named with its value and what is allowed."""
+"""Options: defaults are ideal; an error names the option, its value and what is allowed."""
 
 import tomllib
 from typing import Any

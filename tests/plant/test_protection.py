@@ -17,7 +17,7 @@ def code_of(reason: str) -> int:
 @pytest.mark.parametrize(
     ("name", "threshold", "text"),
     [
-        # at rest with P = 0.5: |i| = 0.569, V = 1, v_dc = 1, omega_u = 1
+        # in equilibrium with P = 0.5: |i| = 0.569, V = 1, v_dc = 1, omega_u = 1
         ("over_current", 0.5, "over-current: |i_dq| = 0.569"),
         ("over_voltage", 0.9, "over-voltage: V = 1 p.u. > 0.9"),
         ("under_voltage", 1.1, "under-voltage: V = 1 p.u. < 1.1"),
@@ -66,8 +66,8 @@ def test_trip_latches_blocks_and_the_network_goes_on(rest: Callable[..., Any]) -
     truth = plant.truth()
     assert (truth["i"], int(plant.st[0]["trip_tick"])) == (0.0, tick)
     assert truth["v_dc"] == v_dc  # source off, bridge blocked
-    assert truth["omega_u"] == 1.0  # no command is obeyed
-    # what is left is the grid feeding C_f through the line
+    assert truth["omega_u"] == 1.0  # commands are ignored
+    # only the grid still feeds C_f through the line
     r = plant.par[0]
     Z_g = complex(r["R_g"], r["L_g"])
     v = 1 / (1 + 1j * r["C_f"] * Z_g)

@@ -20,9 +20,9 @@ def test_ideal_sensors_see_the_truth(rest: Callable[..., Any]) -> None:
 
 
 def test_low_pass_against_the_exact_first_order(rest: Callable[..., Any]) -> None:
-    """A step of the DC current makes v_dc a known ramp; the filter trails it exponentially."""
+    """A step of the DC current makes v_dc a known ramp; the filter lags it exponentially."""
     plant = rest(P=0.0, V=1.0, sensors={"bandwidth_hz": 200.0})
-    # A DC current of 0.1 p.u. and no power: v_dc = 1 + a t, but for what R_f takes.
+    # A DC current of 0.1 p.u. and no power: v_dc = 1 + a t, apart from the loss in R_f.
     u = plant.near(i_u=0.1)
     a = 0.1 * 100 * math.pi / 19.242255
     tau = 1 / (2 * math.pi * 200)
@@ -35,7 +35,7 @@ def test_low_pass_against_the_exact_first_order(rest: Callable[..., Any]) -> Non
 
 
 def test_low_pass_of_a_step(rest: Callable[..., Any]) -> None:
-    """A held truth after a jump of the filter's state: a pure exponential."""
+    """A constant true value after a jump of the filter's state: a pure exponential."""
     plant = rest(sensors={"bandwidth_hz": 1000.0})
     plant.st["sensed"][0, :] += [0.1, 0.2, -0.3, 0.4]
     before = plant.sample() - [0.1, 0.2, 0.0, -0.3, 0.4]
@@ -92,7 +92,7 @@ def test_noise_depends_on_seed_tick_and_channel_alone() -> None:
         st["tick"] = ticks
         y = np.empty(5)
         plant_sample(par, st, y)
-        plant_sample(par, st, y)  # sampling again draws nothing new
+        plant_sample(par, st, y)  # sampling again draws no new noise
         samples.append(y)
     assert (samples[0] == samples[2]).all()
     assert samples[0][1] != samples[1][1]

@@ -1,4 +1,4 @@
-"""Equilibria: where the plant says it rests, it does."""
+"""Equilibria: the plant stays in the equilibrium that it computes."""
 
 import math
 

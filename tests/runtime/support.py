@@ -1,4 +1,4 @@
-"""What several tests of the runtime use: rows and blocks in the plainest form, plausible inputs."""
+"""Helpers of the runtime's tests: rows and blocks in the simplest form, plausible inputs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Vector = NDArray[np.float64]
 
 REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
 
-#: Every law that ships, each stage of a scheduled one by itself.
+#: Every shipped law, each stage of a scheduled law separately.
 LAWS = {
     law.name if len(s.laws) == 1 else f"{law.name}[{k}]": law
     for s in map(load_law, law_names())
@@ -52,7 +52,7 @@ def every_law() -> list[Any]:
 class Blocks:
     """dx/dt = A x + B w, u = C x + D w with w = (r, y, u_0), element by element, loop closed.
 
-    Written without ``realisation``: each element is its own block from SciPy, nothing is
+    It does not use ``realisation``: each element is a separate block from SciPy, no state is
     shared, and the omega_u loop is closed in continuous time.
     """
 
@@ -63,7 +63,7 @@ class Blocks:
 
 
 def blocks(law: Law) -> Blocks:
-    """A law in its plainest form, with far more states than it needs."""
+    """A law in its simplest form, with far more states than it needs."""
     parts = []
     for sign_r, cells in ((1.0, law.phi), (0.0, law.psi)):
         for (i, j), e in cells.items():
@@ -108,7 +108,7 @@ def mapped(law: Law, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
 
 @njit
 def drive(law, state, ref, y, u, ticks):
-    """That many ticks with the same inputs; ``u`` is that of the last one."""
+    """Run ``ticks`` ticks with the same inputs; ``u`` is that of the last one."""
     for _ in range(ticks):
         step(law[0], state[0], ref, y, u)
 
@@ -130,13 +130,13 @@ class Running:
         return u
 
     def settle(self, ticks: int, ref: Vector = REF, y: Vector = REF) -> Vector:
-        """u after that many ticks with the same inputs."""
+        """u after ``ticks`` ticks with the same inputs."""
         u = np.zeros(NU)
         drive(self.law, self.state, ref, y, u, ticks)
         return u
 
     def run(self, refs: Vector, ys: Vector) -> Vector:
-        """One row of u for each row of references and measurements."""
+        """One row of u per row of references and measurements."""
         return np.array([self.step(r, y) for r, y in zip(refs, ys, strict=True)])
 
     def unlimited(self) -> Running:
@@ -146,7 +146,7 @@ class Running:
 
 
 def wander(ticks: int, seed: int = 1, size: float = 0.05) -> tuple[Vector, Vector]:
-    """References and measurements (ticks, 5) that wander about the operating point."""
+    """References and measurements (ticks, 5) that vary randomly about the operating point."""
     rng = np.random.default_rng(seed)
     slow = np.cumsum(rng.normal(size=(2, ticks, NY)), axis=1) / np.sqrt(ticks)
     return REF + size * slow[0], REF + size * (slow[1] + 0.1 * rng.normal(size=(ticks, NY)))

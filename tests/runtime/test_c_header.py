@@ -1,4 +1,4 @@
-"""The generated C header: what it says, and that a compiler lays its structs out likewise."""
+"""The generated C header: its content, and that a compiler gives its structs the same layout."""
 
 import subprocess
 from pathlib import Path
@@ -40,7 +40,7 @@ def test_what_is_not_a_record_is_refused() -> None:
 @pytest.mark.apt
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_a_compiler_agrees(real: str, tmp_path: Path) -> None:
-    """Every size and offset is a static assertion in the header itself."""
+    """The header asserts every size and offset statically."""
     (tmp_path / "law.h").write_text(c_header(real), encoding="utf-8")
     (tmp_path / "law.c").write_text('#include "law.h"\n', encoding="utf-8")
     command = ["cc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "law.c"]

@@ -1,4 +1,4 @@
-"""What runs in a tick is compiled without numba's runtime."""
+"""The functions of a tick are compiled without numba's runtime."""
 
 from __future__ import annotations
 

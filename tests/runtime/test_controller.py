@@ -180,7 +180,7 @@ def test_set_point_step() -> None:
 @pytest.mark.parametrize("name", REF_NAMES)
 @pytest.mark.parametrize("away", [0.05, -0.05])
 def test_set_point_ramp(name: str, away: float) -> None:
-    """Even steps, the target met exactly and not passed."""
+    """Equal steps; the ramp reaches the target exactly, without overshoot."""
     c, u, j = started(), np.zeros(3), REF_NAMES.index(name)
     c.set(name, REF[j] + away, ramp_s=10 * T_S)
     seen = []
@@ -253,7 +253,7 @@ def test_change_of_law_at_the_next_tick() -> None:
 
 
 def test_a_change_equals_the_old_law_at_its_tick() -> None:
-    """The tick of change, told once with the change and once without."""
+    """The tick of change, computed once with the change and once without."""
     us = []
     for changes in (True, False):
         c, u = started("vsg-2", "droop-5"), np.zeros(3)

@@ -1,4 +1,4 @@
-"""Tustin's discretisation and the kernel against SciPy, and the checks that keep a law out."""
+"""Tustin's discretisation and the kernel against SciPy, and the checks that reject a law."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ T_S = 1e-4
 
 
 def scipy_bilinear(law: Law, refs: Vector, ys: Vector, T_s: float) -> Vector:
-    """The law's answer by SciPy: loop closed in continuous time, cont2discrete, dlsim."""
+    """The law's response by SciPy: loop closed in continuous time, cont2discrete, dlsim."""
     b = blocks(law)
     w = np.array(
         [np.concatenate([*mapped(law, r, y), u_0(law, r)]) for r, y in zip(refs, ys, strict=True)]
@@ -65,7 +65,7 @@ def test_closed_matrices_are_what_the_kernel_does(name: str) -> None:
     x = np.zeros(discrete.order)
     for ref, y in zip(*wander(50, seed=2), strict=True):
         r, m = mapped(law, ref, y)
-        # what is added to omega_u from outside, u_0, passes through the closed loop as well
+        # u_0, which is added to omega_u from outside, passes through the closed loop as well
         gain = 1.0 / (1.0 - discrete.D_y[1, 2])
         extra = u_0(law, ref) + discrete.D_y[:, 2] * gain * u_0(law, ref)[1]
         u = extra + C @ x + D_r @ r + D_y @ m
@@ -74,13 +74,13 @@ def test_closed_matrices_are_what_the_kernel_does(name: str) -> None:
 
 
 def smooth(t: float) -> tuple[Vector, Vector]:
-    """References and measurements that start at rest and have all derivatives."""
+    """Smooth references and measurements that start in equilibrium."""
     ref = REF + 0.02 * np.sin(np.array([30.0, 50.0, 20.0, 40.0, 60.0]) * t)
     return ref, REF + 0.03 * np.sin(np.array([45.0, 70.0, 0.0, 25.0, 55.0]) * t)
 
 
 def error_at(law: Law, T_s: float, t_end: float) -> Vector:
-    """Largest distance of the kernel's u from the continuous law's, each u by itself."""
+    """Largest distance of the kernel's u from the continuous law's, per element of u."""
     b = blocks(law)
 
     def w(t: float) -> Vector:
@@ -180,7 +180,7 @@ def test_loops_without_a_stable_solution(cells: dict[str, Element], says: str) -
 
 
 def test_integrators_that_only_look_in_series() -> None:
-    """phi_23's integrator closes its own loop, so omega_u is no integral of anything."""
+    """phi_23's integrator closes its own loop, so omega_u is not an integral."""
     discretise(law_of(phi_22=I(1.0), phi_23=I(1.0), phi_33=I(1.0)), T_S)
     discretise(law_of(phi_22=I(1.0), phi_34=I(1.0), phi_11=I(1.0)), T_S)
     discretise(law_of(phi_22=IF(1.0, 1.0), phi_33=I(1.0)), T_S)

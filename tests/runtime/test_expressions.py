@@ -33,11 +33,11 @@ texts = st.recursive(
 @repeatable
 @given(texts)
 def test_as_python_does_it(text: str) -> None:
-    """Python on floats: integers of a law file are floats as well."""
+    """As Python computes with floats: integers of a law file are floats too."""
     try:
         expected = eval(
             compile(text.strip(), "", "eval"), {"__builtins__": {}}, dict(NUMBERS)
-        )  # a text made above of numbers, names and operators only
+        )  # safe: the text has only numbers, names and operators, see above
         expected = expected if isinstance(expected, complex) else float(expected)
     except ArithmeticError:
         expected = math.nan

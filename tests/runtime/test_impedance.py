@@ -16,7 +16,7 @@ OMEGA_B = 100 * math.pi
 
 @njit
 def feed(est, p, omega_u, V):
-    """All samples; returns the estimate after each."""
+    """Feed all samples; returns the estimate after each."""
     out = np.empty(len(p))
     for k in range(len(p)):
         out[k] = estimate(est[0], p[k], omega_u[k], V[k])
@@ -39,7 +39,7 @@ def swing(  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("hz", [2.0, 8.0])
 @pytest.mark.parametrize("omega_g", [1.0, 0.998])
 def test_a_swing_tells_x(X: float, hz: float, omega_g: float) -> None:
-    """Whatever the frequency of the grid, which is not told."""
+    """At any frequency of the grid, which the estimator does not know."""
     est = make_impedance(T_S, 1.0)
     found = feed(est, *swing(X, hz, dp=0.15, omega_g=omega_g))
     np.testing.assert_allclose(found[-5000:], X, rtol=0.05)
@@ -47,7 +47,7 @@ def test_a_swing_tells_x(X: float, hz: float, omega_g: float) -> None:
 
 @pytest.mark.parametrize("P", [0.0, 0.5, 1.0])
 def test_at_any_operating_point(P: float) -> None:
-    """On a weak grid sin(delta) is no longer delta, which the term p^2 allows for."""
+    """On a weak grid sin(delta) differs from delta; the term p^2 corrects for it."""
     est = make_impedance(T_S, 0.02)
     found = feed(est, *swing(0.6, 4.0, dp=0.05, P=P))
     np.testing.assert_allclose(found[-5000:], 0.6, rtol=0.05)
@@ -71,7 +71,7 @@ def test_noise_does_not_bias_it_much() -> None:
 
 @pytest.mark.parametrize("omega_g", [1.0, 0.99])
 def test_held_without_excitation(omega_g: float) -> None:
-    """A steady state, and noise on p alone, say nothing of X."""
+    """A steady state, or noise on p alone, contains no information about X."""
     rng = np.random.default_rng(2)
     est = make_impedance(T_S, 0.3)
     n = 30_000
@@ -89,7 +89,7 @@ def test_held_once_the_swing_is_over() -> None:
 
 
 def test_a_swing_the_wrong_way_round_is_not_believed() -> None:
-    """p that falls while delta rises is no grid."""
+    """p that falls while delta rises does not come from a grid."""
     p, omega_u, V = swing(0.1, 4.0, dp=0.2)
     est = make_impedance(T_S, 0.3)
     found = feed(est, 1.0 - p, omega_u, V)
@@ -105,7 +105,7 @@ def test_wrong_settings_are_named(name: str, value: float) -> None:
 
 
 def test_a_step_of_the_grids_frequency_is_not_taken_for_a_swing() -> None:
-    """p moves because the grid moved: the angle seen from here says nothing for a moment."""
+    """p moves because the grid moved: for a moment the converter's own angle has no meaning."""
     p, omega_u, V = swing(0.1, 4.0, dp=0.15, seconds=4.0)
     est = make_impedance(T_S, 1.0)
     feed(est, p, omega_u, V)

@@ -38,7 +38,7 @@ def ticks_at(law, state, ref, y, u, i, limit, most):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_float32_stays_close_to_float64(name: str) -> None:
-    """Over 0.5 s; an integrator adds up rounding, which the tolerance allows for."""
+    """Over 0.5 s; the tolerance covers the rounding that an integrator accumulates."""
     discrete = discretise(LAWS[name], T_S)
     refs, ys = wander(5000, seed=4, size=0.01)
     double = Running.of(discrete).run(refs, ys)
@@ -47,7 +47,7 @@ def test_float32_stays_close_to_float64(name: str) -> None:
 
 
 def in_float32(discrete: Running, refs: Vector, ys: Vector) -> list[list[np.float32]]:
-    """The recursion of a linear law once more, by NumPy's float32 scalars alone."""
+    """The recursion of a linear law, with NumPy's float32 scalars alone."""
     law, n = discrete.law[0], int(discrete.law[0]["n"])
     x = [f32(0)] * n
     out = []
@@ -84,7 +84,7 @@ def in_float32(discrete: Running, refs: Vector, ys: Vector) -> list[list[np.floa
 
 @pytest.mark.parametrize("name", [n for n, law in LAWS.items() if law.error_map == "linear"])
 def test_a_float32_law_computes_in_float32(name: str) -> None:
-    """Bit for bit, though references, measurements and u arrive in float64."""
+    """Equal bit by bit, although references, measurements and u are float64."""
     loop = Running.of(discretise(LAWS[name], T_S), f32).unlimited()
     refs, ys = wander(40, seed=6)
     np.testing.assert_array_equal(loop.run(refs, ys), np.array(in_float32(loop, refs, ys)))
@@ -142,13 +142,13 @@ def test_a_step_allocates_nothing(real: type) -> None:
     for loop in loops:
         drive(loop.law, loop.state, REF, REF, u, 1000)
     after = rtsys.get_allocation_stats()
-    # what remains is the boxing of the arguments, once a call from Python and none a tick
+    # the rest is the boxing of the arguments: once per call from Python, none per tick
     assert after.alloc - before.alloc <= 10 * len(loops)
     assert after.mi_alloc - before.mi_alloc <= 10 * len(loops)
 
 
 def test_what_decays_ends_at_zero() -> None:
-    """Subnormal numbers are slow; a filter left alone must not crawl through them."""
+    """Subnormal numbers are slow; a decaying filter must not pass through them."""
     law = Law("a", "", "", {(1, 1): IF(1.0, 1e-3)})
     loop = Running.of(discretise(law, T_S))
     loop.step(REF, REF + 0.01)
@@ -227,7 +227,7 @@ def into_the_limit(
 def test_each_integrator_leaves_its_limit(
     name: str, matrix: str, cell: tuple[int, int], upper: bool
 ) -> None:
-    """Within T_t, where without anti-windup it stays for seconds."""
+    """Within T_t; without anti-windup it stays there for seconds."""
     assert matrix == "phi"
     stays, T_t = into_the_limit(LAWS[name], cell, upper)
     assert stays <= T_t
@@ -248,7 +248,7 @@ def test_there_is_an_integrator_of_each_kind() -> None:
 @pytest.mark.parametrize("T_t", [1e-5, 0.005, 0.1])
 @pytest.mark.parametrize("column_3", [None, P(10.0), P(-0.5), IF(5.0, 0.01)])
 def test_anti_windup_of_omega_u_with_its_loop(T_t: float, column_3: Element | None) -> None:
-    """The tracking time is T_t whatever the gain of the loop that column 3 makes."""
+    """The tracking time is T_t for any gain of the loop through column 3."""
     cells = {(1, 1): PI(0.01, 0.05)} | ({(1, 2): column_3} if column_3 else {})
     law = limited(Law("a", "", "", cells), T_t=T_t)
     for upper in (True, False):
@@ -257,7 +257,7 @@ def test_anti_windup_of_omega_u_with_its_loop(T_t: float, column_3: Element | No
 
 
 def test_back_calculation_settles_where_it_should() -> None:
-    """Held at a limit by an error e, an I ends k_i e T_t beyond it, within a few T_t."""
+    """With an error e that holds it at a limit, an I settles k_i e T_t beyond it in a few T_t."""
     law = limited(Law("a", "", "", {(2, 4): I(0.5)}, u_0=(0.0, 1.0, 1.0)), T_t=0.02)
     loop = Running.of(discretise(law, T_S))
     e = np.array([0.0, 0.0, 0.0, 0.0, 0.4])
@@ -277,7 +277,7 @@ def test_other_rows_do_not_feel_a_limit() -> None:
 
 
 def test_column_3_is_fed_the_omega_u_that_is_applied() -> None:
-    """VSG-3 puts omega_u on E_u: at the limit it must be the limited one."""
+    """VSG-3 feeds omega_u to E_u: at the limit it must be the limited omega_u."""
     law = get_law("vsg-3", k_33=2.0, k_34=0.0, D_p=0.1)
     law = limited(law, low=(-5.0, 0.99, 0.0), high=(5.0, 1.01, 1.5))
     loop = Running.of(discretise(law, T_S))

@@ -1,4 +1,4 @@
-"""The laws with tuned gains: apart from the catalogue's list, by name like the others."""
+"""The laws with tuned gains: not in the catalogue's list, but available by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Law files: what is written comes out, and every mistake is one clear line."""
+"""Law files: values are read as written, and every mistake gives one clear line."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_a_shape_may_be_a_list_of_one() -> None:
 
 
 MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    # name: what is replaced, by what, and what the message has to say
+    # name: the replaced text, its replacement, and the expected message
     "unknown key": (
         '"IF", k = 1.0, T = 0.2',
         '"IF", gain = 3, k = 1.0, T = 0.2',
@@ -302,7 +302,7 @@ factor = st.fixed_dictionaries(
     {"type": st.sampled_from(["P", "I", "D", "PI", "PD", "IF", "O", "X"])},
     optional={name: number for name in ("k", "k_i", "T", "xi", "T_f", "gain")},
 )
-# such as stand a chance of being right
+# elements that are likely to be valid
 sound = st.one_of(
     st.fixed_dictionaries({"type": st.sampled_from(["P"]), "k": st.floats(-5, 5)}),
     st.fixed_dictionaries(

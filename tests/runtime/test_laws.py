@@ -1,4 +1,4 @@
-"""The catalogue against the paper: Table II, Section IV-A and what Section II-C says."""
+"""The catalogue against the paper: Table II, Section IV-A and the statements of Section II-C."""
 
 import itertools
 
@@ -167,7 +167,7 @@ def loewner_rank(law: Law) -> int:
         ]
         return np.array(rows)
 
-    # each row by itself, since gains of 100 and of 0.001 do not fit one tolerance
+    # row by row, since gains of 100 and of 0.001 need different tolerances
     total = 0
     left, right = np.geomspace(0.7, 900.0, 7), np.geomspace(1.1, 1400.0, 7)
     for i in range(NU):
@@ -187,7 +187,7 @@ def test_order_is_the_mcmillan_degree(name: str) -> None:
 
 @pytest.mark.parametrize("name", LAWS)
 def test_realisation_is_minimal(name: str) -> None:
-    """Hautus: every mode is reached from (r, y) and seen in u."""
+    """Hautus: every mode is controllable from (r, y) and observable in u."""
     ss = realise(LAWS[name])
     for pole in np.linalg.eigvals(ss.A):
         shifted = ss.A - pole * np.eye(ss.order)
@@ -211,7 +211,7 @@ def test_realisation_has_the_elements_values(name: str, s: complex) -> None:
 
 
 def cascade(T: float) -> Law:
-    """Row 2 of three factors five decades apart."""
+    """A law whose row 2 has three factors five decades apart."""
     slow, fast = IF(1.0, 1e4 * T), IF(1.0, T / 10)
     return Law("cascade", "", "", {(1, 1): P(2.0) * slow * IF(1.0, T) * fast})
 
@@ -228,14 +228,14 @@ def answer(name: str, column: int, on_reference: bool, ticks: int = 4000) -> np.
     lag = {"T": 0.2} if name == "droop-5" else {"k_22": 5.0}
     loop = Running.of(discretise(get_law(name, D_p=0.01, **lag), 1e-4))
     ref, y = REF.copy(), REF.copy()
-    loop.settle(60_000)  # the washout of droop-5 forgets the start
+    loop.settle(60_000)  # until the washout of droop-5 has decayed
     (ref if on_reference else y)[column] += 1.0
     loop.unlimited()
     return np.array([loop.step(ref, y)[1] for _ in range(ticks)]) - 1.0
 
 
 def test_droop_5_is_vsg_2_from_p_and_not_from_p_ref() -> None:
-    """Section II-C: alike where the disturbance is at the output side, not at the input side."""
+    """Section II-C: equal for a disturbance at the output side, not at the input side."""
     t = (np.arange(4000) + 0.5) * 1e-4  # Tustin sees a step in the middle of its first interval
     lag = 0.01 * (1 - np.exp(-t / 0.2))
     for name in ("droop-5", "vsg-2"):

@@ -42,7 +42,7 @@ def scheduled(dwell_s: float = 0.0, hysteresis: float = 0.1) -> Controller:
 
 
 def at(c: Controller, X: float, ticks: int = 2) -> str:
-    """Label of the stage once the estimate says X; it is held, since nothing swings."""
+    """Label of the stage with the estimate X, which stays constant without swings."""
     c.est["X"] = X
     run(c, ticks)
     return c.active

@@ -1,4 +1,4 @@
-"""A change of law: no bump, the trend goes on, what is left decays."""
+"""A change of law: no bump, the trend continues, the remaining difference decays."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def change(
 
 @pytest.mark.parametrize("old", LAWS)
 def test_no_bump_from_any_law_to_any_other(old: str) -> None:
-    """u of the new law at the tick of change is what the old one would have given."""
+    """At the tick of change the new law's u equals the old law's."""
     for k, new in enumerate(LAWS):
         before = running(old, seed=k)
         ref, y = (a[0] for a in wander(1, seed=100 + k, size=0.004))
@@ -74,7 +74,7 @@ WITH_TREND = {
 
 @pytest.mark.parametrize("name", WITH_TREND)
 def test_trend_is_carried_by_rows_with_two_states(name: str) -> None:
-    """With the inputs held, u goes on as it went."""
+    """With constant inputs, u continues its trend."""
     before = running("vsg-2", seed=0)
     ref = y = REF.copy()
     for k in range(3000):  # a steady ramp of p makes a steady ramp of omega_u
@@ -92,7 +92,7 @@ def test_trend_is_carried_by_rows_with_two_states(name: str) -> None:
 
 
 def test_trend_survives_the_change_itself() -> None:
-    """A second change right after the first still knows how u was going."""
+    """A second change right after the first still knows the trend of u."""
     before = running("vsg-2", seed=0)
     for k in range(3000):
         before.step(REF, REF - [0.0, 1e-4 * k, 0.0, 0.0, 0.0])
@@ -105,7 +105,7 @@ def test_trend_survives_the_change_itself() -> None:
 
 @pytest.mark.parametrize("T_off", [0.05, 0.2])
 def test_offset_of_stateless_rows_decays(T_off: float) -> None:
-    """matching-2 has no states: what it cannot absorb is exp(-t/T_off)."""
+    """matching-2 has no states: the difference that it cannot absorb decays as exp(-t/T_off)."""
     law = replace(get_law("matching-2", k_dc=-1.0, k_31=-2.0), limits=Limits(T_off=T_off))
     before = running("vsg-2", seed=1)
     before.state["x"][0, :3] += [0.2, 1e-3, 0.02]
@@ -140,7 +140,7 @@ def test_tighter_limits_are_reported_as_a_bump() -> None:
 
 
 def test_limited_omega_u_does_not_spoil_the_other_rows() -> None:
-    """VSG-3 feeds omega_u to E_u: a tighter limit of omega_u is a bump of omega_u alone."""
+    """VSG-3 feeds omega_u to E_u: a tighter limit of omega_u makes a bump of omega_u alone."""
     before = running("vsg-2", seed=1)
     expected = running("vsg-2", seed=1).step(REF, REF)
     tight = Limits(low=(-5.0, float(expected[1]) + 0.001, 0.0))
@@ -158,7 +158,7 @@ def test_a_law_at_rest_is_taken_over_at_rest(name: str) -> None:
     before.step(REF, REF)
     before.state["offset"] = 0.0
     target = settled(discrete)
-    # an old law that gives exactly that u, and goes nowhere
+    # an old law with exactly this constant u
     before.law["u_0"], before.law["D_u0"], before.law["D_r"], before.law["D_y"] = target, 0, 0, 0
     before.state["u"], before.state["trend"] = target, 0.0
     after, _, bump = change(before, discrete, REF, REF)
@@ -206,7 +206,7 @@ def test_set_points_that_follow_a_reference() -> None:
     before = running("vsg-2", seed=5)
     after, _, bump = change(before, DISCRETE["matching-1"], ref, ref)
     assert bump <= 1e-12
-    # all errors are 0, so that row 3's integrator holds what E_u is away from E_0
+    # all errors are 0, so that row 3's integrator holds the difference of E_u and E_0
     E_u = after.step(ref, ref)[2]
     np.testing.assert_allclose(u_0(LAWS["matching-1"], ref), [0.8, 1.0, 1.02])
     assert after.state["x"][0, 0] == pytest.approx(E_u - 1.02, abs=1e-12)

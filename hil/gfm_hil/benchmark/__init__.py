@@ -1,1 +1,1 @@
-"""``gfmhil bench``: what the links, the clock, the kernel and the loop cost on this machine."""
+"""``gfmhil bench``: measures the links, the clock, the kernel and the loop on this machine."""

@@ -1,16 +1,15 @@
-"""Why ticks were missed, from the times that both sides recorded.
+"""Causes of missed ticks, from the times that both sides recorded.
 
-A tick is missed if u[k] has not arrived at the plant by the next deadline. Its time went into four
-parts, and the one that took most beyond what it takes in a tick that was met is the cause:
+A tick is missed if u[k] has not arrived at the plant by the next deadline. Its time has four parts;
+the part that exceeds its usual time in a met tick by most is the cause:
 
-- late wake-up: the plant began after its deadline, though nothing kept it busy;
-- own work: the plant's or the controller's computing, or an event that fell on the tick;
-- stalled host: a side that was looking for a frame, or computing, did not run for a while, or the
-  controller slept beyond its time: the host of a virtual machine, the kernel or other work had its
-  processor;
-- link: all else between y[k] sent and u[k] received.
+- late wake-up: the plant began after its deadline, though it had no other work;
+- own work: the plant's or the controller's computation, or an event at the tick;
+- stalled host: a side that polled for a frame, or computed, did not run for a while, or the
+  controller overslept: the host of a virtual machine, the kernel or other work used its processor;
+- link: the rest of the time between y[k] sent and u[k] received.
 
-A tick that began while a side was still behind from the missed one before has the cause of that.
+If a tick began while a side was still late from the missed tick before it, it has the same cause.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from numpy.typing import NDArray
 
 CAUSES = ("own work", "link", "late wake-up", "stalled host")
 _OWN, _LINK, _WAKE, _STALL = range(len(CAUSES))
-#: what is neither the kernel's nor the host's doing
+#: causes that are neither the kernel's nor the host's
 OURS = (CAUSES[_OWN], CAUSES[_LINK])
 
-_INTERRUPTED = 10.0  # times what one tick in a hundred computes: it was not the computing
-_AFTER_EVENT = 2  # ticks: an event is carried out between two of them
+_INTERRUPTED = 10.0  # times the 99th percentile of computation: it was interrupted
+_AFTER_EVENT = 2  # ticks that an event may delay: it is carried out between two of them
 
 Timing = Mapping[str, NDArray[np.int64]]
 
@@ -43,7 +42,7 @@ def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> NDArray[
     Args:
         timing: arrays of ``timing.npz``, each (ticks,), ns; of a run in real time.
         T_ns: sampling time.
-        events: ticks at which something was changed.
+        events: ticks of events.
     """
     missed = missed_ticks(timing)
     shares = _parts(timing, T_ns)
@@ -57,7 +56,7 @@ def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> NDArray[
     interrupted = own[missed] > limit
     excess[_STALL, interrupted] += excess[_OWN, interrupted]
     excess[_OWN, interrupted] = 0.0
-    excess[_LINK] -= excess[_STALL].clip(min=0)  # a gap between looks is part of the wait
+    excess[_LINK] -= excess[_STALL].clip(min=0)  # a gap between polls is part of the wait
     causes = np.argmax(excess, axis=0)
 
     at_event = {k + after for k in events for after in range(_AFTER_EVENT)}
@@ -72,7 +71,7 @@ def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> NDArray[
 
 
 def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
-    """Time that each cause had in every tick, ns; a missed one lasts to the next deadline."""
+    """Time of each cause in every tick, ns; a missed tick lasts until the next deadline."""
     due, woke = timing["plant_scheduled"], timing["plant_woke"]
     sent, received = timing["plant_sent"], timing["plant_received"]
     heard, answered = timing["controller_received"], timing["controller_sent"]
@@ -87,10 +86,10 @@ def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
 
 
 def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How long the controller may not have looked between two times of each tick, ns.
+    """How long the controller may not have polled between two times of each tick, ns.
 
-    Its longest gap since the frame before is recorded with the frame that it took next, whichever
-    that was. Where between the two it lay is not known: it counts as far as it fits.
+    The controller records its longest gap since the last frame with the next frame that it takes.
+    The position of the gap between the two frames is unknown: it counts as far as it fits.
     """
     heard = timing["controller_received"]
     gap = timing.get("controller_stall", np.zeros(len(heard), np.int64))
@@ -101,7 +100,7 @@ def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> N
     back = heard[taken]  # ascending: frames arrive in order
     since = np.concatenate([[0], back[:-1]])
     first = np.searchsorted(back, begin, side="right")
-    for wait in (first, first + 1):  # the one that the tick meets, and the one after its y
+    for wait in (first, first + 1):  # the wait during which y came, and the next one
         k = np.minimum(wait, len(back) - 1)
         fits = np.minimum(back[k], end) - np.maximum(since[k], begin)
         away += np.where(wait < len(back), np.minimum(gap[taken][k], fits).clip(min=0), 0)
@@ -114,7 +113,7 @@ def counts(causes: NDArray[np.int64]) -> dict[str, int]:
 
 
 def bursts(missed: NDArray[Any]) -> dict[int, int]:
-    """How many bursts of each length, from the ticks that were missed, ascending."""
+    """Number of bursts of each length, from the missed ticks in ascending order."""
     if not len(missed):
         return {}
     ends = np.flatnonzero(np.diff(missed) != 1)

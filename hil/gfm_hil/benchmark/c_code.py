@@ -1,4 +1,4 @@
-"""C sources of the benchmark, compiled on the spot where there is a compiler."""
+"""C sources of the benchmark, compiled at run time if there is a compiler."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 SOURCES = Path(__file__).parent
 FLAGS = "-O3"
-# A fused multiply-add rounds once, the kernel twice. Compilers for x86-64 do not fuse at -O3
-# alone; others do.
+# A fused multiply-add rounds once, the kernel twice. Compilers for x86-64 do not fuse with -O3
+# alone; compilers for other processors do.
 _ALWAYS = ("-std=c11", "-ffp-contract=off", "-fPIC", "-shared", "-Wall", "-Werror")
 
 
 class NoCompiler(Exception):
-    """There is no C compiler, or it refuses; the message is one line for the report."""
+    """There is no C compiler, or it fails; the message is one line for the report."""
 
 
 def compiler() -> str:
@@ -33,10 +33,10 @@ def compiler() -> str:
 
 
 def compile_c(source: str, folder: Path, name: str, flags: str = FLAGS) -> Path:
-    """Compile a source of this package into ``folder``/``name``.so; headers may lie there too.
+    """Compile a source of this package into ``folder``/``name``.so; headers may be there too.
 
     Raises:
-        NoCompiler: there is none, or it refuses.
+        NoCompiler: there is none, or it fails.
     """
     library = folder / f"{name}.so"
     command = [compiler(), *shlex.split(flags), *_ALWAYS, f"-I{folder}", str(SOURCES / source)]
@@ -50,12 +50,12 @@ def compile_c(source: str, folder: Path, name: str, flags: str = FLAGS) -> Path:
 
 
 def load_c(library: Path) -> ctypes.CDLL:
-    """The compiled functions; a call of one holds no interpreter's lock."""
+    """The compiled functions; calls release the interpreter's lock."""
     return ctypes.CDLL(str(library))
 
 
 def version_line() -> str:
-    """First line of what the compiler says about itself.
+    """First line of the compiler's version output.
 
     Raises:
         NoCompiler: there is none.

@@ -1,4 +1,4 @@
-"""The ends of the C ping-pongs: what is set up from Python, before and after the C loops run."""
+"""The ends of the C ping-pongs: Python opens and closes what the C loops use."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class CEnd:
     Args:
         library: pingpong.c, compiled.
         kind: ``shm``, ``udp`` or ``zmq``.
-        arguments: what the kind's functions begin with, as ctypes values.
+        arguments: first arguments of the kind's functions, as ctypes values.
         size: bytes that this side sends.
-        keep: what has to be let go of in the end.
+        keep: resources to free at the end.
     """
 
     compiled = True
@@ -44,7 +44,7 @@ class CEnd:
     def ping(
         self, stop: NDArray[np.int64], period_ns: int, duration_ns: int, took: NDArray[np.int64]
     ) -> int:
-        """Ask; see ``gfm_hil.benchmark.pingpong``."""
+        """Send requests; see ``gfm_hil.benchmark.pingpong``."""
         return int(
             self._ping(
                 *self._arguments, self._size, _WORD(period_ns), _WORD(duration_ns),
@@ -53,21 +53,21 @@ class CEnd:
         )  # fmt: skip
 
     def pong(self, stop: NDArray[np.int64]) -> None:
-        """Answer until told to stop."""
+        """Answer until stopped."""
         self._pong(*self._arguments, self._size, ctypes.c_void_p(stop.ctypes.data))
 
     def close(self) -> None:
-        """Let go of sockets and memory."""
+        """Free sockets and memory."""
         self._keep.close()
 
 
 def open_shm(library: Path, side: Side, path: str, size: int) -> CEnd:
-    """Shared memory: a file that both map."""
+    """Shared memory: a file that both sides map."""
     if side == "controller":
         Path(path).write_bytes(bytes(_SLOTS))
     slots = np.memmap(path, np.uint8, "r+")
     keep = ExitStack()
-    keep.callback(slots.flush)  # holds the mapping as long as the end
+    keep.callback(slots.flush)  # keeps the mapping alive with the end
     first = _WORD(side == "controller")
     return CEnd(library, "shm", [ctypes.c_void_p(slots.ctypes.data), first], size, keep)
 
@@ -83,7 +83,7 @@ def open_udp(library: Path, side: Side, ports: str, size: int) -> CEnd:
 
 
 def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
-    """libzmq, the very one that the link uses, on a socket with the options of the link's.
+    """libzmq, the same library as the link's, on a socket with the link's options.
 
     Raises:
         UserError: its functions cannot be found.
@@ -101,7 +101,7 @@ def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
         end.bind(endpoint)
     else:
         end.connect(endpoint)
-    libzmq = ctypes.CDLL(_zmq.__file__)  # finds what it was linked to
+    libzmq = ctypes.CDLL(_zmq.__file__)  # resolves the library that it is linked to
     try:
         call = [ctypes.cast(libzmq[name], ctypes.c_void_p) for name in ("zmq_send", "zmq_recv")]
     except AttributeError:

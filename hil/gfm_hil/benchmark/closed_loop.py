@@ -1,8 +1,8 @@
-"""The closed loop over every link, by the product itself: two processes, all that a run does.
+"""The closed loop over every link, with the product itself: two processes, a complete run.
 
-Lockstep: ticks a second, beside what the plant's arithmetic alone allows. Real time: ticks without
-a fresh u, why, and how many a loop that only paces would have lost on the same machine right
-before and after.
+Lockstep: ticks per second, compared with the limit of the plant's arithmetic alone. Real time:
+ticks without a fresh u, their causes, and how many ticks a loop that only paces lost on the same
+machine right before and after.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
 
 LAW = "mimo-gfm"
 T_S = 1e-4  # s
-_SETTLE = 1_000  # ticks after the CPU load begins that are left out
-_PATIENCE_S = 5.0  # a machine that is busy with other things shall not end a run
+_SETTLE = 1_000  # ticks left out after the start of the CPU load
+_PATIENCE_S = 5.0  # peer timeout: a busy machine must not end a run
 _SHORT = 2_000  # ticks of one of the short runs in process
 
 COMPLETED = "completed"
@@ -52,8 +52,8 @@ Timing = dict[str, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for: links, loads of real time, its policy, s and rounds of both modes (fewer
-    if they would not end by ``until``)."""
+    """What to measure: links, loads and policy of real time, s and rounds of both modes (fewer
+    rounds if they would not end by ``until``)."""
 
     links: Sequence[str]
     loads: Sequence[Load]
@@ -66,10 +66,10 @@ class Plan:
 
 @dataclass
 class _Run:
-    """What one run in real time showed, and the bare loop before and after it."""
+    """Results of one run in real time, and of the bare loop before and after it."""
 
     timing: Timing
-    begin: int  # tick from which on it counts
+    begin: int  # first tick that counts
     scheduling: list[str]
     ended: str
     late: NDArray[np.int64]
@@ -85,7 +85,7 @@ class _Cell:
 
 
 def usable(links: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The links that are to be had here at ``T_S``, and a remark on each other one."""
+    """The links that work here at ``T_S``, and a remark on each of the others."""
     found, remarks = [], []
     for link in links:
         try:
@@ -101,12 +101,12 @@ def usable(links: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def measure_lockstep(plan: Plan, tell: Tell) -> Found:
-    """Ticks a second over every link and in process; simulated, so as fast as it goes.
+    """Ticks per second over every link and in process; simulated, so as fast as possible.
 
-    Over a link with and without a sample of loop delay: with one, as a real loop has it, the plant
-    goes on while u[k] comes. The share of what the plant's half of the loop alone allows is that
-    of the quickest stretch, as the half itself is timed, right before and after and in at least as
-    many stretches: a stop of the machine is neither's, nor a change of its speed.
+    Over a link it measures with and without one sample of loop delay: with it, as in a real loop,
+    the plant continues while u[k] is on its way. The share of the limit of the plant's half alone
+    compares the fastest stretches of both. The half is timed right before and after, in at least
+    as many stretches, so that neither a stop of the machine nor a change of its speed counts.
     """
     remarks: list[str] = []
     names = [(INPROC, 0), *((link, delay) for link in plan.links for delay in (0, 1))]
@@ -151,14 +151,14 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
 
 
 def _pace(sent: NDArray[np.int64]) -> tuple[float, list[float]]:
-    """ns a tick, of the whole run and of each ``_SHORT`` ticks in a row."""
+    """ns per tick, of the whole run and of each stretch of ``_SHORT`` ticks."""
     marks = sent[:: min(_SHORT, len(sent) - 1)]
     whole = float(sent[-1] - sent[0]) / (len(sent) - 1)
     return whole, (np.diff(marks) / min(_SHORT, len(sent) - 1)).tolist()
 
 
 def measure_realtime(plan: Plan, tell: Tell) -> Found:
-    """Misses of 10 kHz in real time over every link under every load."""
+    """Misses at 10 kHz in real time over every link under every load."""
     cells = [_Cell(link, load) for link in plan.links for load in plan.loads]
     with ExitStack() as stack:
         place = memory_folder(stack)
@@ -194,8 +194,8 @@ def _observe(
     pace: Callable[[], NDArray[np.int64]],
     beside: Callable[[], AbstractContextManager[None]] | None,
 ) -> _Run:
-    """One run in real time between two halves of a bare loop, so that a host that slowly takes
-    more or less is in both; ``beside`` begins with the run's first ticks, not while it starts."""
+    """One run in real time between two halves of a bare loop, so that a slow change of the host's
+    load affects both; ``beside`` begins with the run's first ticks, not during its start."""
     begin, before = 0, pace()
     with ExitStack() as during:
 
@@ -242,7 +242,7 @@ def _row(cell: _Cell) -> dict[str, Any]:
         "missed": missed,
         "missed_pct": round(100 * missed / ticks, 4) if ticks else None,
         "host_pct": round(100 * host / host_ticks, 4),
-        # one long stop of the machine in a run, or in the pacing before it, is no round's usual
+        # the median: one long stop of the machine in a run, or in the pacing, is an outlier
         "beyond_host_pct": round(median(beyond), 4) if beyond else None,
         "rounds_beyond_host_pct": [round(value, 4) for value in beyond],
         "by_work_or_link_pct": round(100 * ours / ticks, 4) if ticks else None,
@@ -261,7 +261,7 @@ def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario
         "law": LAW,
         "plant": {"delay": {"samples": delay}},
         "link": {"type": link, "peer_timeout_s": _PATIENCE_S},
-        "late_policy": {"hold": 10**9},  # misses are counted, none ends the run
+        "late_policy": {"hold": 10**9},  # count misses, never end the run
     }
     return check_scenario(content, "bench")
 
@@ -269,10 +269,10 @@ def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario
 def _run(
     scenario: Scenario, place: Path, progress: Progress = lambda ticks, misses: None
 ) -> tuple[Timing, list[str], str]:
-    """Run a scenario; its timing, how its sides were scheduled, and how it ended."""
+    """Run a scenario; returns its timing, the scheduling of its sides, and how it ended."""
     folder = place / f"run-{time.monotonic_ns()}"
     summary = run_scenario(scenario, folder, progress, figures=False).summary
-    if summary["status"] == "interrupted":  # Ctrl-C, which the run has caught
+    if summary["status"] == "interrupted":  # the run has caught Ctrl-C
         raise KeyboardInterrupt
     with np.load(folder / "timing.npz") as file:
         timing = dict(file)
@@ -285,5 +285,5 @@ def _run(
 
 
 def _last_line(log: Path) -> str:
-    """What a side that failed said last."""
+    """The last line of a failed side's log."""
     return log.read_text("utf-8").strip().splitlines()[-1] if log.exists() else ""

@@ -1,8 +1,8 @@
 """Two results side by side: which differences are real, which are noise.
 
-The rounds of a row in A and in B are put in one order and judged by the Mann-Whitney test, which
-asks nothing of how times are distributed. There are many rows, of which some differ by chance; so
-the p values are corrected for their number by Holm's method before they are believed.
+The Mann-Whitney test compares the rounds of a row in A and in B by rank; it assumes nothing about
+the distribution of times. Of many rows some differ by chance, so Holm's method corrects the p
+values for their number.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ import numpy as np
 from gfm_hil.benchmark.tables import Table, lockstep_name, times
 from gfm_hil.core.errors import UserError
 
-BELIEVED = 0.05  # of a corrected p value
-_EXACT = 200_000  # orders that are counted one by one; beyond, the normal approximation
+BELIEVED = 0.05  # limit of a corrected p value
+_EXACT = 200_000  # most orders counted one by one; beyond, use the normal approximation
 
 
 def rank_test(a: Sequence[float], b: Sequence[float]) -> float:
     """p value of the two-sided Mann-Whitney test, ties at their mean rank.
 
-    Every way of dealing the ranks is counted where there are few, so that it is exact with ties
-    too; else by the normal approximation with the corrections for ties and continuity.
+    If there are few, it counts all assignments of the ranks, and so is exact with ties too; else it
+    uses the normal approximation with the corrections for ties and continuity.
     """
     n, m = len(a), len(b)
     both = np.asarray([*a, *b], float)
@@ -45,7 +45,7 @@ def rank_test(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """The p values corrected for how many there are."""
+    """The p values corrected for their number."""
     corrected, greatest = [0.0] * len(p_values), 0.0
     for k, at in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
         greatest = max(greatest, min(1.0, (len(p_values) - k) * p_values[at]))
@@ -54,11 +54,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[str, Any]]:
-    """One row a quantity that both results have, B over A.
+    """One row per quantity that both results have, B over A.
 
     Args:
         a, b: results.
-        by_limit: compare ratios to the limit in C where both have them, not times.
+        by_limit: if both have ratios to the limit in C, compare these instead of times.
 
     Raises:
         UserError: they have nothing in common.
@@ -71,7 +71,7 @@ def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[s
     corrected = holm([rank_test(*pair) for pair in pairs])
     rows = []
     for name, (x, y), p in zip(names, pairs, corrected, strict=True):
-        # the least p that these many rounds could have given, corrected as if it were alone
+        # the smallest p possible with this number of rounds, corrected as the smallest of all rows
         reach = 2 / math.comb(len(x) + len(y), len(x)) * len(names)
         real = p < BELIEVED
         rows.append(
@@ -92,9 +92,9 @@ def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[s
 
 
 def comparison_table(rows: list[dict[str, Any]]) -> Table:
-    """For people."""
+    """The rows as a table for display."""
     return Table(
-        "B beside A: medians of rounds, p of the rank test corrected for the number of rows",
+        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
         ("", "A", "B", "unit", "B : A", "p", "verdict"),
         [
             (
@@ -109,7 +109,7 @@ def comparison_table(rows: list[dict[str, Any]]) -> Table:
 def _samples(
     content: dict[str, Any], by_limit: bool
 ) -> Iterator[tuple[str, tuple[str, list[float]]]]:
-    """(row, (unit, what each round gave))."""
+    """(row, (unit, value of each round))."""
     for r in content["results"]:
         name = f"{r['name']}, {r['mode']}, {r['load']}, {r['policy']}, {r['payload']} B"
         if by_limit and r["peer"] != "C" and r["rounds_ratio"]:

@@ -1,6 +1,6 @@
-"""What can be measured: the bench's links, and beside each the limit in C.
+"""The contenders of the benchmark: the bench's links, and for each the limit in C.
 
-A contender is data, so that it can be sent to the two processes, which open their ends of it.
+A contender is plain data that is sent to the two processes; each opens its end.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.signals import NY
 
-FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is then a u
+FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
 
 
 class End(Protocol):
@@ -32,32 +32,32 @@ class End(Protocol):
 
     @property
     def compiled(self) -> bool:
-        """Its loop holds no Python."""
+        """Whether its loop runs without Python."""
 
     def ping(
         self, stop: NDArray[np.int64], period_ns: int, duration_ns: int, took: NDArray[np.int64]
     ) -> int:
-        """Ask."""
+        """Send requests."""
 
     def pong(self, stop: NDArray[np.int64]) -> None:
-        """Answer."""
+        """Answer requests."""
 
     def close(self) -> None:
-        """Let go."""
+        """Free its resources."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """One way of getting a message there and back.
+    """One way to send a message there and back.
 
     Attributes:
         name: in tables, unique.
-        link: name of the link, or of what the C peer uses (``shm``, ``udp``, ``zmq``).
+        link: name of the link, or of the C peer's transport (``shm``, ``udp``, ``zmq``).
         peer: ``ours``, ``C`` or the name of a foreign package.
-        endpoint: where both sides meet.
+        endpoint: of both sides.
         options: of the link.
-        baseline: name of the contender that it is measured against; its own for a limit.
-        library: of a C peer, compiled.
+        baseline: name of the contender that it is compared with; its own name for a limit.
+        library: compiled library of a C peer.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Contender:
 
     @staticmethod
     def messages(side: Side, payload: int) -> Messages:
-        """What a side sends: the bench's own frames if the payload is theirs."""
+        """The messages of a side: the bench's frames if the payload has their size."""
         if payload == FRAME:
             return frames("y" if side == "plant" else "u")
         return plain(payload)
@@ -108,11 +108,11 @@ def check_links(names: list[str]) -> list[str]:
 
 
 def of_links(links: list[str], place: Path, library: Path | None) -> list[Contender]:
-    """The contenders of some links and the limits they are measured against.
+    """The contenders of some links and the limits that they are compared with.
 
     Args:
         links: names, checked.
-        place: an empty folder in memory, of a short path.
+        place: an empty folder in memory with a short path.
         library: pingpong.c, or None if there is no compiler.
     """
     found: dict[str, Contender] = {}
@@ -150,14 +150,14 @@ def of_links(links: list[str], place: Path, library: Path | None) -> list[Conten
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody uses now, for TCP and most likely for UDP."""
+    """A port of the loopback interface that is free for TCP, and most likely for UDP."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def memory_folder(stack: ExitStack) -> Path:
-    """A folder that is removed in the end, in memory where there is /dev/shm."""
+    """A folder that is removed at the end; in memory if /dev/shm exists."""
     memory = Path("/dev/shm")
     place = str(memory) if memory.is_dir() else None
     return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-", dir=place)))

@@ -1,7 +1,7 @@
 """Log-linear histogram of times: constant relative resolution from 1 ns to 2.3 hours.
 
-As in HdrHistogram: below 2^``BITS`` ns every value has a bucket of its own; above, each octave is
-cut into 2^(``BITS`` - 1) buckets, so that a bucket is at most 1/64 of its value wide.
+As in HdrHistogram: below 2^``BITS`` ns every value has its own bucket; above, each octave is
+divided into 2^(``BITS`` - 1) buckets, so that a bucket is at most 1/64 of its value wide.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ BITS = 7
 _HALF = 1 << (BITS - 1)
 _OCTAVES = 36  # above the linear part
 BUCKETS = (_OCTAVES + 2) * _HALF
-RESOLUTION = 1 / _HALF  # width of a bucket over its least value, at most
+RESOLUTION = 1 / _HALF  # largest width of a bucket relative to its lower end
 
 Counts = NDArray[np.int64]
 
 
 @njit(cache=True)
 def record(counts, times_ns):
-    """Count every time of ``times_ns`` (n,) in ``counts`` (BUCKETS,); later ones in the last."""
+    """Count every time of ``times_ns`` (n,) in ``counts`` (BUCKETS,); longer ones in the last."""
     for t in times_ns:
         v, octave = max(t, 0), 0
         while v >= 2 * _HALF:
@@ -40,16 +40,16 @@ def histogram(times_ns: NDArray[np.int64]) -> Counts:
 
 
 def lower_ends() -> NDArray[np.float64]:
-    """Least time of every bucket, and the end of the last, ns; shape (BUCKETS + 1,)."""
+    """Lower end of every bucket, and upper end of the last, ns; shape (BUCKETS + 1,)."""
     k = np.arange(BUCKETS + 1)
     octave = np.maximum(k // _HALF - 1, 0)
     return np.ldexp((k - octave * _HALF).astype(float), octave)
 
 
 def quantiles(counts: Counts, shares: Sequence[float]) -> list[float]:
-    """Times in ns that these shares of all (0 to 1) do not exceed, to the middle of a bucket.
+    """Quantiles in ns for these shares (0 to 1), each the middle of a bucket.
 
-    The least time of rank ceil(share n), as ``numpy.quantile`` with ``inverted_cdf``.
+    The smallest time of rank ceil(share n), as ``numpy.quantile`` with ``inverted_cdf``.
     """
     total = np.cumsum(counts)
     ranks = np.maximum(np.ceil(np.round(np.asarray(shares) * total[-1], 6)), 1)
@@ -60,13 +60,13 @@ def quantiles(counts: Counts, shares: Sequence[float]) -> list[float]:
 
 
 def sparse(counts: Counts) -> list[list[int]]:
-    """[bucket, count] of all that are not empty, for JSON."""
+    """[bucket, count] of all non-empty buckets, for JSON."""
     at = np.flatnonzero(counts)
     return [[int(k), int(counts[k])] for k in at]
 
 
 def dense(pairs: Sequence[Sequence[int]]) -> Counts:
-    """The histogram that ``sparse`` made ``pairs`` of."""
+    """The histogram from the output of ``sparse``."""
     counts = np.zeros(BUCKETS, np.int64)
     for k, n in pairs:
         counts[k] = n

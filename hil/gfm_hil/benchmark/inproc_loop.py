@@ -1,9 +1,9 @@
-"""Time of the whole closed loop in one process, and where it goes.
+"""Time of the whole closed loop in one process, and of its parts.
 
-The loop is the one that ``gfmhil run --link inproc`` calls, on a scenario's own records, from a
-step of P_ref at tick 0. Its parts are timed by themselves on what the whole run recorded: the plant
-is given the u of every tick, the controller the y. A part alone can overlap its ticks on the
-processor, which the closed loop cannot, so the parts need not add up to the whole.
+The loop is that of ``gfmhil run --link inproc``, on a scenario's own records, from a step of P_ref
+at tick 0. The parts are timed separately with the data of the whole run: the plant gets the
+recorded u of every tick, the controller the y. The processor can overlap the ticks of a part alone,
+but not of the closed loop, so the parts need not add up to the whole.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, seconds, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.recording.recorder import Part, record_command, record_controller, record_sample
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import control
 from gfm_runtime.signals import NU, NY
 
-# Laws whose defaults are stable on the paper's stiff grid; the last row is the rig with its noise,
+# Laws whose defaults are stable on the paper's stiff grid; the last row adds the rig's noise,
 # sensor filters, quantisation and delay.
 LAWS = (
     "mimo-gfm", "mimo-gfm-scheduled", "vsg-2", "vsg-11", "droop-2", "droop-5", "psc-2",
@@ -49,7 +50,7 @@ def plant_alone(par, st, y, u, us):
 
 @compiled
 def plants_half(par, st, y, u, us, rows):
-    """What the plant's process does in a tick but for the link: the same with its recording."""
+    """The tick of the plant's process without the link: the plant and its recording."""
     for k in range(len(us)):
         for i in range(NU):
             u[i] = us[k, i]
@@ -70,7 +71,7 @@ def controller_alone(ctl, laws, states, est, y, u, ys):
 
 @compiled
 def recording_alone(par, st, ctl, est, y, u, plant_rows, controller_rows):
-    """The recording of one and the same tick into every row."""
+    """Record the same tick into every row."""
     for k in range(len(plant_rows)):
         record_controller(controller_rows[k], ctl, est)
         record_sample(plant_rows[k], y, par, st)
@@ -78,7 +79,7 @@ def recording_alone(par, st, ctl, est, y, u, plant_rows, controller_rows):
 
 
 class Loop:
-    """A bench that can be put back to its start, and files to record into."""
+    """A bench that can be reset to its start, and files for its recording."""
 
     def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
         bench = make_bench(load_scenario(scenario, law=law, link__type="inproc", mode="lockstep"))
@@ -126,7 +127,7 @@ class Loop:
         return self._per_tick(lambda: plant_alone(b.par, b.st, b.y, b.u, self._u))
 
     def plants_half(self) -> float:
-        """ns per tick of the plant with its recording, as in a run into rows not written lately."""
+        """ns per tick of the plant and its recording, into rows not written lately, as in a run."""
         b, rows = self.reset(), next(self._rows)
         return self._per_tick(lambda: plants_half(b.par, b.st, b.y, b.u, self._u, rows))
 
@@ -144,7 +145,7 @@ class Loop:
         return self._per_tick(lambda: recording_alone(b.par, b.st, c.ctl, c.est, b.y, b.u, *rows))
 
     def allocations_per_tick(self) -> float:
-        """Of numba's runtime; a call's own, whatever its length, cancel."""
+        """Allocations of numba's runtime per tick; those per call cancel."""
         _nrt_python.memsys_enable_stats()
         short, long = self._allocations(self.ticks // 2), self._allocations(self.ticks)
         _nrt_python.memsys_disable_stats()
@@ -162,14 +163,14 @@ class Loop:
 def measure(
     laws: Sequence[str], ticks: int, turns: int, folder: Path, tell: Callable[[str, float], None]
 ) -> list[dict[str, Any]]:
-    """ns per tick of laws and of the rig, a row each.
+    """ns per tick of laws and of the rig, one row each.
 
     Args:
         laws: names.
-        ticks: of a short run, of which a turn has ``RUNS``.
+        ticks: of a short run; a turn has ``RUNS`` of them.
         turns: of each.
-        folder: to record into.
-        tell: told what is being done, and the share that is done.
+        folder: for the recordings.
+        tell: called with the present work and the share done.
 
     Raises:
         UserError: a run ended early, so that there is nothing to time.

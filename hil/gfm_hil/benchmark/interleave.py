@@ -1,4 +1,4 @@
-"""Two installations of gfmhil, measured in turn on the same machine."""
+"""Two installations of gfmhil, measured alternately on the same machine."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from gfm_hil.benchmark.result import check_result, write_result
 from gfm_hil.core.errors import UserError
 
 KINDS = ("latency", "jitter", "kernel", "loop")
-_LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # what grows with every round
+_LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # lists that every round extends
 
 
 def interleave(
     a: str, b: str, turns: int, what: str, folder: Path, tell: Callable[[str, float], None]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Run both so often, one round each; returns their results, which are left in ``folder``.
+    """Run both ``turns`` times, one round each; returns the results and writes them to ``folder``.
 
     Args:
-        a, b: commands that are gfmhil, such as the path of one in another environment.
+        a, b: gfmhil commands, for example the path of one in another environment.
         turns: of each; every second one begins with B.
         what: kind and options of ``gfmhil bench``.
-        folder: for A.json and B.json: the first turn, with the rounds of all.
-        tell: told what is being done, and the share that is done.
+        folder: for A.json and B.json: the first turn's result with the rounds of all turns.
+        tell: called with the present work and the share done.
 
     Raises:
-        UserError: no such command, or what it says when it refuses.
+        UserError: there is no such command, or it fails (with its message).
     """
     if turns < 2:
         raise UserError(f"--interleave {turns}: must be at least 2")
@@ -69,7 +69,7 @@ def _once(name: str, command: list[str], chosen: list[str]) -> dict[str, Any]:
 
 
 def _merged(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """The first result, its lists of rounds continued by those of the others."""
+    """The first result, its lists of rounds extended by those of the others."""
     first: dict[str, Any] = runs[0]
     for other in runs[1:]:
         _continue(first, other)

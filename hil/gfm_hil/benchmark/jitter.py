@@ -1,7 +1,7 @@
-"""How late a loop begins its ticks: the clock and the scheduler alone, with nothing else to do.
+"""How late a loop begins its ticks: the clock and the scheduler alone, without other work.
 
-Both processors pace at a time, as the two sides of a run do. What is lost here no link and no law
-can win back: it is the host's own share of the misses.
+Both processors pace at the same time, as the two sides of a run do. No link and no law can recover
+the ticks lost here: they are the host's share of the misses.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LEAD_NS = 2_000_000  # between the call and the first deadline
 
 @njit(cache=True, nogil=True)
 def pace(first_ns, period_ns, how, late):
-    """Fill ``late`` (ticks,) with ns from each deadline to the moment that the loop was there."""
+    """Fill ``late`` (ticks,) with the ns from each deadline to the loop's wake-up."""
     for k in range(len(late)):
         due = first_ns + k * period_ns
         if how == HYBRID:
@@ -46,27 +46,27 @@ def pace(first_ns, period_ns, how, late):
 
 
 def pace_here(first_ns: int, period_ns: int, how: int, ticks: int) -> NDArray[np.int64]:
-    """The same in a process of the pair."""
+    """``pace`` in a process of the pair."""
     late = np.full(ticks, -1, np.int64)
     pace(first_ns, period_ns, how, late)
     return late
 
 
 def pace_both(two: Pair, period_ns: int, how: int, seconds: float) -> NDArray[np.int64]:
-    """Lateness on both processors at a time, ns, shape (2, ticks)."""
+    """Lateness on both processors at the same time, ns, shape (2, ticks)."""
     ticks = max(1, round(seconds * 1e9 / period_ns))
     first = time.monotonic_ns() + _LEAD_NS
     return np.stack(list(two.both(pace_here, first, period_ns, how, ticks).values()))
 
 
 def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
-    """Ticks for which either of the two, (2, ticks), was later than allowed."""
+    """Ticks at which either of the two, (2, ticks), was later than allowed."""
     return np.flatnonzero((late > allowed_ns).any(axis=0))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for: ways to wait, loads, policies, period in ns, s of a round, rounds of each
+    """What to measure: ways to wait, loads, policies, period in ns, s of a round, rounds of each
     (fewer if they would not end by ``until``)."""
 
     waits: Sequence[str]
@@ -79,7 +79,7 @@ class Plan:
 
 
 def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, Any]]:
-    """Measure; one row a way to wait, load and policy."""
+    """Measure; returns one row per way to wait, load and policy."""
     cells: dict[tuple[Policy, Load, str], list[NDArray[np.int64]]] = {
         (policy, load, wait): []
         for policy in plan.policies for load in plan.loads for wait in plan.waits
@@ -91,7 +91,7 @@ def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, An
             for policy in plan.policies
         }
         for each in two.values():
-            each.both(pace_here, 0, 1, HYBRID, 1)  # compiled before anything is timed
+            each.both(pace_here, 0, 1, HYBRID, 1)  # compile before timing
         for number in rounds(plan.rounds, plan.until):
             for n, (policy, load, wait) in enumerate(list(cells)[:: -1 if number % 2 else 1]):
                 tell(f"{policy}, {load}, {wait}", (number + n / len(cells)) / plan.rounds)

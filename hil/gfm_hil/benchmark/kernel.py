@@ -1,8 +1,8 @@
-"""Time of one kernel step, beside the same recursion in C on the same bytes.
+"""Time of one kernel step, compared with the same recursion in C on the same bytes.
 
-Both run a closed chain of steps: each tick's measurements are moved a little by the u before it,
-so that nothing can be computed ahead or left out. Before anything is timed, inputs that drive
-every output into its limits are put through both, and outputs and states are compared bit by bit.
+Both run a closed chain of steps: the previous u slightly changes each tick's measurements, so that
+no step can be computed ahead or skipped. Before the timing, both process inputs that drive every
+output into its limits, and their outputs and states are compared bit by bit.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from gfm_runtime.kernel import pack_law, state_dtype, step
 from gfm_runtime.signals import NU, NY, group
 
 T_S = 1e-4  # s
-ROWS = 256  # different measurements in turn
-FEEDBACK = 1e-6  # p.u. of y for one p.u. of u
+ROWS = 256  # different measurements, used in turn
+FEEDBACK = 1e-6  # p.u. of y per p.u. of u
 REALS = ("float64", "float32")
 
 
 def io_dtype(real: DTypeLike) -> np.dtype[Any]:
-    """Record of what a step takes and gives."""
+    """Record of a step's inputs and outputs."""
     f = np.dtype(real)
     return np.dtype([("ref", f, (NY,)), ("y", f, (NY,)), ("u", f, (NU,))], align=True)
 
@@ -41,8 +41,8 @@ def drive(law, state, io, inputs, outputs, steps, feedback):
     """``steps`` steps on the rows of ``inputs`` in turn; the last u of each row in ``outputs``.
 
     ``law``, ``state`` and ``io`` are one-element arrays; inputs (rows, 5), outputs (rows, 3) and
-    feedback are of the law's own real type. What a record holds travels without a reference
-    count: as plain arrays, ref, y and u would cost more atomic operations than some laws cost.
+    feedback have the law's real type. The fields of a record need no reference count: as plain
+    arrays, ref, y and u would cost more time in atomic operations than some laws take.
     """
     law0, state0, now = law[0], state[0], io[0]
     m = 0
@@ -57,7 +57,7 @@ def drive(law, state, io, inputs, outputs, steps, feedback):
 
 @dataclass
 class Chain:
-    """One law at its reference, with measurements that scatter around it, and what comes out."""
+    """One law at its reference, with measurements that scatter around it, and its outputs."""
 
     law: NDArray[Any]
     state: NDArray[Any]
@@ -67,7 +67,7 @@ class Chain:
 
     @staticmethod
     def make(name: str, real: DTypeLike, scatter: float) -> Chain:
-        """A fresh chain; ``scatter`` is the standard deviation of the measurements, p.u."""
+        """A new chain; ``scatter`` is the standard deviation of the measurements, p.u."""
         ref = np.array([s.default for s in group("ref")])
         y = ref + scatter * np.random.default_rng(1).standard_normal((ROWS, NY))
         law = pack_law(discretise(get_law(name), T_S), real)
@@ -77,7 +77,7 @@ class Chain:
         return Chain(law, state, io, y.astype(real), np.zeros((ROWS, NU), real))
 
     def run(self, drive: Drive, steps: int) -> None:
-        """So many steps on, by numba's or C's ``drive``."""
+        """Advance by ``steps`` steps with numba's or C's ``drive``."""
         feedback = self.inputs.dtype.type(FEEDBACK)
         drive(self.law, self.state, self.io, self.inputs, self.outputs, steps, feedback)
 
@@ -89,7 +89,7 @@ class Chain:
 
 
 def ulps(a: NDArray[Any], b: NDArray[Any]) -> int:
-    """Greatest distance of two arrays in units of the last place; 0 is bit for bit the same."""
+    """Largest distance of two arrays in units of the last place; 0: equal bit by bit."""
     whole = np.dtype(f"i{a.dtype.itemsize}")
 
     def ordered(x: NDArray[Any]) -> NDArray[Any]:
@@ -101,14 +101,14 @@ def ulps(a: NDArray[Any], b: NDArray[Any]) -> int:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two chains came apart, and how often the outputs i_u, omega_u, E_u were limited."""
+    """Distance of two chains, and how often the outputs i_u, omega_u, E_u were limited."""
 
     ulps: int
     limited: tuple[int, ...]
 
 
 def compare(name: str, real: DTypeLike, rival: Drive, rounds: int) -> Agreement:
-    """Put the same wild inputs through numba and a rival; ``rounds`` times all rows."""
+    """Run numba and a rival on the same extreme inputs; ``rounds`` times all rows."""
     ours, theirs = (Chain.make(name, real, scatter=0.5) for _ in range(2))
     worst, limited = 0, np.zeros(NU, int)
     for _ in range(rounds):
@@ -128,7 +128,7 @@ def time_laws(
 
     def job(name: str, how: Drive) -> float:
         chain = Chain.make(name, real, scatter=1e-3)
-        chain.run(how, ROWS)  # warm
+        chain.run(how, ROWS)  # warm up
         return quickest(lambda: seconds(lambda: chain.run(how, steps))) / steps * 1e9
 
     ways: dict[str, Drive] = {"numba": drive} | ({"c": twin} if twin else {})
@@ -153,13 +153,13 @@ def measure(
     tell: Callable[[str, float], None],
     flags: str = FLAGS,
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Measure laws; returns (rows, remarks), a row a law and real type.
+    """Measure laws; returns (rows, remarks), one row per law and real type.
 
     Args:
         names: of laws.
         steps: in one of the ``RUNS`` short runs of a turn.
         turns: of each.
-        tell: told what is being done, and the share that is done.
+        tell: called with the present work and the share done.
         flags: for the C compiler.
     """
     rows: list[dict[str, Any]] = []

@@ -114,7 +114,7 @@ typedef struct {
     real ref[NY], y[NY], u[NU];
 } io_t;
 
-/* As `drive` of gfm_hil/benchmark/kernel.py: `rows` inputs in turn, each moved by the u before it. */
+/* As `drive` of gfm_hil/benchmark/kernel.py: `rows` inputs in turn, each changed by the last u. */
 void drive(const law_t *law, state_t *state, io_t *io, const real *inputs, real *outputs,
            int64_t rows, int64_t steps, real feedback)
 {

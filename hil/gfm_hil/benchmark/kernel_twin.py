@@ -1,4 +1,4 @@
-"""The kernel's step in C, compiled on the spot and called on the records that numba uses."""
+"""The kernel's step in C, compiled at run time and called on the records that numba uses."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ Drive = Callable[..., None]
 def compile_twin(folder: Path, real: DTypeLike, flags: str = FLAGS) -> Drive:
     """Compile ``drive`` of kernel_step.c for float64 or float32 into ``folder``.
 
-    It takes what ``gfm_hil.benchmark.kernel.drive`` takes; arrays are passed by address, uncopied.
+    It has the arguments of ``gfm_hil.benchmark.kernel.drive``; arrays are passed by address,
+    without a copy.
 
     Raises:
-        NoCompiler: there is none, or it refuses.
+        NoCompiler: there is none, or it fails.
     """
     dtype = np.dtype(real)
     (folder / "law.h").write_text(c_header(dtype), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Round trips of every link beside the limit in C, in interleaved rounds of one run."""
+"""Round trips of every link and of the limit in C, in interleaved rounds of one run."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ Mode = Literal["lockstep", "realtime"]
 MODES: tuple[Mode, ...] = ("lockstep", "realtime")
 PERIOD_NS = 100_000
 
-_FIRST_S = 0.02  # the round that is not kept
+_FIRST_S = 0.02  # length of the warm-up round
 
-Tell = Callable[[str, float], None]  # what is being done, and the share that is done
+Tell = Callable[[str, float], None]  # present work and share done
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked for.
+    """What to measure.
 
     Attributes:
         links: names.
         modes: lockstep: one round trip after the other; realtime: one every 100 µs.
         loads: idle, or busy: with a CPU load on each processor.
-        policy: how the two processes are scheduled.
-        payload: bytes there; ``FRAME`` stands for the bench's frames, 64 there and 48 back.
+        policy: scheduling of the two processes.
+        payload: bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back.
         seconds: of one round.
         rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
     """
@@ -55,7 +55,7 @@ class Plan:
 
 @dataclass
 class _Cell:
-    """One contender under one mode and load."""
+    """One contender in one mode under one load."""
 
     contender: Contender
     mode: Mode
@@ -66,9 +66,9 @@ class _Cell:
 
 
 def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
-    """Measure; returns (results, remarks), one result a contender, mode and load.
+    """Measure; returns (results, remarks), one result per contender, mode and load.
 
-    A link that is not to be had here is left out, with a remark.
+    A link that is not available here is left out, with a remark.
     """
     remarks: list[str] = []
     with ExitStack() as stack:
@@ -103,7 +103,7 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
                     cell.rounds[number] = times
                 cell.silent += not len(times)
 
-        one_round(-1, _FIRST_S)  # to compile and to warm up
+        one_round(-1, _FIRST_S)  # compile and warm up
         for number in rounds(plan.rounds, plan.until):
             one_round(number, plan.seconds)
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}

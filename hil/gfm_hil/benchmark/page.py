@@ -1,4 +1,4 @@
-"""bench.html: a result in one file that needs nothing else."""
+"""bench.html: a result as one self-contained file."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _BADGE = (
 _SECTIONS = {
     "latency": (
         "Round trips",
-        "A message there and its answer back, between two processes on two processors. Solid: the "
+        "A message and its answer, between two processes on two processors. Solid: the "
         "links of the bench; dashed: the limit, the same exchange in C, in the same rounds. "
         "lockstep: one after the other. realtime: one every 100 µs, counted from its deadline, so "
         "that a late start is part of it. busy: another process computes on each processor.",
@@ -52,30 +52,31 @@ _SECTIONS = {
     "misses": (
         "Real time",
         "The product at 10 kHz: ticks whose answer had not come by the next deadline, and why. The "
-        "mark is what a loop that does nothing but pace lost on the same processors right before "
-        "and after: what no link can win back.",
+        "mark is what a loop that only waits for its ticks lost on the same processors right "
+        "before and after the run: no link can avoid these misses.",
     ),
     "jitter": (
         "Pacing",
         "A loop that waits for the next deadline and does nothing else, on both processors at a "
-        "time. The line is the period: beyond it a whole tick is gone. The kernel stops SCHED_FIFO "
-        "that only spins for 5 % of each second; so the bench sleeps first, then spins.",
+        "time. The line is the period: beyond it a whole tick is lost. The kernel stops a "
+        "SCHED_FIFO thread that only spins for 5 % of each second, so the bench sleeps first and "
+        "then spins.",
     ),
     "lockstep": (
         "Lockstep",
-        "The closed loop in simulated time, as fast as it goes, beside what the plant's arithmetic "
-        "alone allows. inproc: both sides in one compiled loop, no link at all.",
+        "The closed loop in simulated time, as fast as possible, and the rate that the plant's "
+        "arithmetic alone allows. inproc: both sides in one compiled loop, without a link.",
     ),
     "kernel": (
         "Kernel",
-        "One step of the controller for every law, each waiting for the one before, beside the "
+        "One step of the controller for every law, each waiting for the previous one, and the "
         "same algorithm in C on the same bytes, with the same bits as result.",
     ),
 }
 
 
 def write_page(content: dict[str, Any], path: Path) -> None:
-    """Write the page of a result, and its figures beside it as files."""
+    """Write the page of a result, and its figures as files in the same folder."""
     made = figures(content)
     for name, svg in made.items():
         path.with_name(f"{name}.svg").write_bytes(svg)
@@ -133,10 +134,10 @@ def _badge(environment: dict[str, Any]) -> str:
 
 
 def _cards(content: dict[str, Any]) -> str:
-    """The figures that most people look for, a line a kind."""
+    """The most important figures, one line per kind."""
     loop = content.get("loop", {})
     trips = [
-        (f"{tables.micro(r['p50_us'])} µs", _beside(r))
+        (f"{tables.micro(r['p50_us'])} µs", _compared(r))
         for r in content["results"]
         if (r["peer"], r["code"], r["mode"], r["load"]) == ("ours", "compiled", "lockstep", "idle")
     ]
@@ -165,7 +166,7 @@ def _cards(content: dict[str, Any]) -> str:
     return "".join(lines)
 
 
-def _beside(row: dict[str, Any]) -> str:
+def _compared(row: dict[str, Any]) -> str:
     ratio = row["ratio_to_baseline_p50"]
     return f"{row['name']}: round trip" + (f", {tables.times(ratio)} the limit" if ratio else "")
 

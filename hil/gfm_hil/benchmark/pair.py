@@ -1,7 +1,7 @@
-"""Two processes that stay for a whole benchmark: one asks, one answers, each on its processor.
+"""Two processes for a whole benchmark: one sends, one answers, each on its processor.
 
-Every contender is open in both from the start, so that rounds of one can follow rounds of another
-at once. They are pinned and ranked as the two sides of a run in real time are.
+Both open every contender at the start, so that a round of one can follow a round of another at
+once. They are pinned and get the priority of the two sides of a run in real time.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ow
 
 Policy = Literal["fifo", "other"]
 
-CAPACITY = 1 << 20  # round trips in a round
+CAPACITY = 1 << 20  # most round trips in a round
 _START_S = 120.0
 WARM_NS = 20_000_000
 
-# of one of the two processes
+# state in each of the two processes
 _side: Side = "plant"
 _ends: dict[str, End] = {}
 _took = np.zeros(0, np.int64)
@@ -37,17 +37,17 @@ _stop = np.zeros(1, np.int64)
 
 
 class Pair:
-    """The two processes as the benchmark sees them."""
+    """Handle of the two processes."""
 
     def __init__(self, pools: dict[Side, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
         self._pools, self._stop = pools, stop
 
     def call(self, side: Side, work: Any, *arguments: Any, timeout: float = 120.0) -> Any:
-        """Call a function in one of them and wait for what it returns."""
+        """Call a function in one of them and return its result."""
         return self._wait(self._pools[side].submit(work, *arguments), timeout)
 
     def both(self, work: Any, *arguments: Any, timeout: float = 120.0) -> dict[Side, Any]:
-        """Call a function in both at a time."""
+        """Call a function in both at the same time."""
         futures = {s: pool.submit(work, *arguments) for s, pool in self._pools.items()}
         return {s: self._wait(future, timeout) for s, future in futures.items()}
 
@@ -55,14 +55,14 @@ class Pair:
         """Open a contender's ends; returns whether its loops are compiled.
 
         Raises:
-            UserError: it is not to be had.
+            UserError: it cannot be opened.
         """
         for side in SIDES:
             compiled = self.call(side, _open, contender, payload)
         return bool(compiled)
 
     def round(self, contender: Contender, period_ns: int, seconds: float) -> NDArray[np.int64]:
-        """Times of the round trips of one round in ns; none if the other side fell silent."""
+        """Times of the round trips of one round in ns; none if the peer stopped answering."""
         self._stop[0] = 0
         answers = self._pools["controller"].submit(_pong, contender.name)
         try:
@@ -94,7 +94,7 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     stop = np.memmap(path, np.int64, "r+")
     two = Pair(pools, stop)
     heard = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:  # both start now and inherit this: Ctrl-C is the parent's to handle
+    try:  # both start now and inherit this: only the parent handles Ctrl-C
         started = [pool.submit(_started) for pool in pools.values()]
     finally:
         signal.signal(signal.SIGINT, heard)
@@ -119,13 +119,13 @@ def _set_up(side: Side, policy: Policy, stop: str) -> None:
     else:
         own_processor(side)
     _side, _took = side, np.zeros(CAPACITY, np.int64)
-    _took += 1  # no page is first touched in a round
+    _took += 1  # touch all pages before a round
     _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
     no_collector_pauses()
 
 
 def _started() -> None:
-    """The first task: it is done once ``_set_up`` is."""
+    """The first task: it is done once ``_set_up`` is done."""
 
 
 def _open(contender: Contender, payload: int) -> bool:

@@ -1,4 +1,4 @@
-"""What others offer for the same purpose, from PyPI; measured where it is installed."""
+"""Other packages for the same purpose, from PyPI; measured if installed."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Iceoryx2Link:
         return ctypes.string_at(payload.as_ptr(), payload.len())
 
     def close(self) -> None:
-        """Let go of the shared memory."""
+        """Free the shared memory."""
         self._publisher.delete()
         self._subscriber.delete()
         self._keep.clear()

@@ -1,8 +1,8 @@
-/* The limits that the links are measured against: ping-pong between two processes in plain C.
+/* The limits that the links are compared with: ping-pong between two processes in plain C.
  *
- * Each `ping_*` fills took[] with the ns of its round trips and returns how many there were, or -1
- * if the other side fell silent. period = 0: one after the other. Else one every `period` ns at
- * absolute deadlines, and a time counts from the deadline, so that a late start is not left out.
+ * Each `ping_*` fills took[] with the ns of its round trips and returns their number, or -1 if the
+ * peer stopped answering. period = 0: one after the other. Else one every `period` ns at absolute
+ * deadlines, and a time counts from the deadline, so that a late start is included.
  * Each `pong_*` answers until *stop is set. Waiting is as in the compiled loops of the links.
  */
 #define _GNU_SOURCE
@@ -31,7 +31,7 @@ static void relax(void)
 #endif
 }
 
-/* Sleep until shortly before a deadline, then spin, with a yield or a pause after each look. */
+/* Sleep until shortly before a deadline, then spin, with a yield or a pause after each poll. */
 static void wait_until(int64_t deadline, int yields)
 {
     if (deadline - now_ns() > AHEAD_NS) {
@@ -43,7 +43,7 @@ static void wait_until(int64_t deadline, int yields)
         yields ? (void)sched_yield() : relax();
 }
 
-/* What a link is here: send a whole message; take one if it is there (0: none). */
+/* A link: send a whole message; receive one if it has arrived (0: none). */
 typedef struct link {
     void (*send)(struct link *, const void *, int64_t);
     int64_t (*receive)(struct link *, void *);
@@ -55,7 +55,7 @@ ping(link_t *l, void (*send)(link_t *, const void *, int64_t), int64_t (*receive
      int64_t size, int64_t period, int64_t duration, int64_t *took, int64_t capacity)
 {
     char out[LONGEST] = {1}, in[LONGEST];
-    while (receive(l, in)) /* the late answer of a round that was given up */
+    while (receive(l, in)) /* late answers of an aborted round */
         ;
     int64_t begin = now_ns(), end = begin + duration, n = 0;
     for (int64_t due = begin + period; n < capacity && begin < end; n++) {
@@ -102,8 +102,8 @@ pong(link_t *l, void (*send)(link_t *, const void *, int64_t), int64_t (*receive
         pong(&l.base, kind##_send, kind##_receive, size, stop);                                    \
     }
 
-/* Shared memory: one slot a direction, a counter that is released when its bytes are there. What
- * the receiver has seen outlives a round, so that nothing depends on which side begins first. */
+/* Shared memory: one slot per direction; the writer releases the counter after the bytes. `seen`
+ * outlives a round, so that either side may begin first. */
 typedef struct {
     _Alignas(64) number count;
     int64_t size;
@@ -163,7 +163,7 @@ static int64_t udp_receive(link_t *base, void *message)
 #define UDP_END {{udp_send, udp_receive, 0}, (int)socket}
 ENDS(udp, UDP_END, int64_t socket)
 
-/* ZeroMQ: libzmq's own functions, by address, on a socket that is open. */
+/* ZeroMQ: libzmq's functions, by address, on an open socket. */
 typedef int (*zmq_send_t)(void *, const void *, size_t, int);
 typedef int (*zmq_recv_t)(void *, void *, size_t, int);
 

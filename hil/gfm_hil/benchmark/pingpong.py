@@ -1,12 +1,12 @@
-"""Round trips over one link between two processes: ``ping`` asks, ``pong`` answers at once.
+"""Round trips over one link between two processes: ``ping`` sends, ``pong`` answers at once.
 
-The compiled loops call a link through its port, as the compiled loops of a run do; a link without
-one is driven through its Python methods. ``pingpong.c`` is the same in C.
+The compiled loops call a link through its port, as the loops of a run do; a link without a port is
+called through its Python methods. ``pingpong.c`` is the same in C.
 
-A loop fills ``took`` (capacity,) with the ns of its round trips and returns how many there were,
-or -1 if the other side fell silent. With ``period_ns`` 0 they follow each other. Else one begins
-every period, at absolute deadlines, and its time counts from the deadline: a late start is not left
-out. ``stop`` is one number in memory that both processes share.
+A loop fills ``took`` (capacity,) with the ns of its round trips and returns their number, or -1 if
+the peer stopped answering. With ``period_ns`` 0 they follow each other. Else one begins every
+period, at absolute deadlines, and its time counts from the deadline, so that a late start is
+included. ``stop`` is one number in memory that both processes share.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from gfm_runtime.signals import Group, names
 
 SILENCE_NS = 1_000_000_000
 LONGEST = 512  # bytes
-_DIFFERENT = 256  # messages in turn, so that a link that counts sees every frame follow the last
-_LOOKS = 1024  # between two looks at the clock
+_DIFFERENT = 256  # messages in turn, so that a link that checks the sequence accepts all
+_LOOKS = 1024  # polls between two reads of the clock
 
 Messages = NDArray[np.uint8]
 
 
 def frames(group: Group) -> Messages:
-    """The bench's own frames, one after the other in sequence; shape (256, bytes)."""
+    """The bench's frames with consecutive sequences; shape (256, bytes)."""
     writer, values = FrameWriter(group), np.ones(len(names(group)))
     packed = b"".join(writer.pack(k, 0, 0, values) for k in range(_DIFFERENT))
     return np.frombuffer(packed, np.uint8).reshape(_DIFFERENT, -1)
@@ -49,7 +49,7 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
     """``ping`` through a port's functions."""
     answer = np.empty(LONGEST, np.uint8)
     message = np.empty(messages.shape[1], np.uint8)
-    while receive(handle, answer) > 0:  # the late answer of a round that was given up
+    while receive(handle, answer) > 0:  # late answers of an aborted round
         pass
     begin = now_ns()
     end, due, n = begin + duration_ns, begin + period_ns, 0
@@ -94,24 +94,24 @@ def pong_port(handle, send, receive, spins, messages, stop):
 
 
 class Carrier(Protocol):
-    """What a ping-pong needs of ``gfm_hil.links.Link``."""
+    """The part of ``gfm_hil.links.Link`` that a ping-pong uses."""
 
     @property
     def port(self) -> Port | None:
-        """For compiled loops, or None."""
+        """The port for compiled loops, or None."""
 
     def send(self, message: bytes) -> bool:
-        """Hand a message over."""
+        """Send a message."""
 
     def receive(self) -> bytes | None:
         """The next message, or None."""
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Free all resources."""
 
 
 class LinkEnd:
-    """One end of an open link, by its port where it has one."""
+    """One end of an open link; uses its port if it has one."""
 
     def __init__(self, link: Carrier, messages: Messages) -> None:
         self._link, self._messages = link, messages
@@ -119,7 +119,7 @@ class LinkEnd:
 
     @property
     def compiled(self) -> bool:
-        """It has a port."""
+        """Whether it has a port."""
         return self._link.port is not None
 
     def ping(
@@ -129,7 +129,7 @@ class LinkEnd:
         duration_ns: int,
         took: NDArray[np.int64],
     ) -> int:
-        """Ask; see the module."""
+        """Send requests; see the module."""
         if (p := self._link.port) is not None:
             return int(ping_port(*_call(p), self._messages, stop, period_ns, duration_ns, took))
         while self._link.receive() is not None:
@@ -152,7 +152,7 @@ class LinkEnd:
         return n
 
     def pong(self, stop: NDArray[np.int64]) -> None:
-        """Answer until told to stop."""
+        """Answer until stopped."""
         if (p := self._link.port) is not None:
             pong_port(*_call(p), self._messages, stop)
             return

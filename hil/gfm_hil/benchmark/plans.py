@@ -1,4 +1,4 @@
-"""From the options of ``gfmhil bench`` to what is measured; every option is checked first."""
+"""From the options of ``gfmhil bench`` to its measurements; checks every option first."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STEPS = 10_000  # of the kernel in a short run
 _TICKS = 2_000  # of the loop in process in a short run
 _FEW_LAWS = ("mimo-gfm", "vsg-2", "droop-2")  # of the loop in `all`
 
-#: what `all` measures less of, so that it takes three minutes
+#: `all` measures less of these, so that it takes three minutes
 _ALL = {
     "mode": "lockstep,realtime", "load": "idle,busy", "policy": "auto", "payload": FRAME,
     "laws": None, "cflags": "-O3",
@@ -35,10 +35,10 @@ _ALL = {
 
 
 def steps_of(options: Namespace) -> list[Step]:
-    """What is to be measured, in order.
+    """The measurements, in order.
 
     Raises:
-        UserError: an option that cannot be.
+        UserError: an option is invalid.
     """
     if options.kind == "all":
         return _everything(options)
@@ -47,7 +47,7 @@ def steps_of(options: Namespace) -> list[Step]:
 
 
 def _everything(options: Namespace) -> list[Step]:
-    """Three minutes: each part ends by its time, with fewer rounds if need be."""
+    """Three minutes: each part ends in time, with fewer rounds if necessary."""
     begin = time.monotonic()
 
     def with_(**numbers: Any) -> Namespace:
@@ -150,7 +150,7 @@ def split(option: str, text: str, allowed: Sequence[Any] | None = None) -> list[
     """Names from a comma-separated list, each once.
 
     Raises:
-        UserError: an empty one, or one that is not allowed.
+        UserError: a name is empty or not allowed.
     """
     names = list(dict.fromkeys(name.strip() for name in text.split(",")))
     for name in names:
@@ -184,10 +184,10 @@ def within(option: str, value: Any, low: Any, high: Any) -> Any:
 
 
 def policies(wanted: str) -> list[Policy]:
-    """The policies that are meant, the first one the best that may be had.
+    """The selected policies; the best one that is permitted comes first.
 
     Raises:
-        UserError: fifo is asked for without the rights.
+        UserError: fifo is requested without the rights.
     """
     allowed = may_sched_fifo()
     if wanted == "fifo" and not allowed:

@@ -1,4 +1,4 @@
-"""Figures of a result, as SVG: percentiles as HdrHistogram draws them, misses, lockstep, kernel."""
+"""Figures of a result as SVG: percentiles in HdrHistogram's style, misses, lockstep, kernel."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def figures(content: dict[str, Any]) -> dict[str, bytes]:
 def _svg(figure: Figure) -> bytes:
     FigureCanvasAgg(figure)
     out = io.BytesIO()
-    with mpl.rc_context({"svg.hashsalt": "gfmhil"}):  # the same result, the same bytes
+    with mpl.rc_context({"svg.hashsalt": "gfmhil"}):  # equal results give equal bytes
         figure.savefig(out, format="svg", metadata={"Date": None})
     return out.getvalue()
 
@@ -58,13 +58,13 @@ def _plain(axes: Axes, heading: str) -> None:
 
 
 def _curve(row: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """1/(1 - q) and the µs that a share q does not exceed, a point a bucket."""
+    """1/(1 - q) and the µs that a share q does not exceed, one point per bucket."""
     counts = dense(row["histogram"])
     at = np.flatnonzero(counts)
     share = np.cumsum(counts)[at] / counts.sum()
     ends = lower_ends()
     us = (ends[at] + ends[at + 1]) / 2e3
-    beyond = np.maximum(1 - share, 0.5 / counts.sum())  # the last point: half a time beyond it
+    beyond = np.maximum(1 - share, 0.5 / counts.sum())  # last point: as if half a time exceeds it
     return 1 / beyond, us
 
 
@@ -86,7 +86,7 @@ def _panels(
     draw: Callable[[Axes, dict[str, Any], int], None],
     heading: Callable[[str, str], str],
 ) -> Figure:
-    """A panel for each value of the first key (down) and of the second (across)."""
+    """One panel for each value of the first key (rows) and of the second (columns)."""
     down, across = ([*dict.fromkeys(r[key] for r in rows)] for key in keys)
     size = (4.9 * max(len(across), 1) + 2.0, 3.1 * len(down) + 0.4)
     figure = Figure(figsize=size, layout="constrained")

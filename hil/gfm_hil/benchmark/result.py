@@ -14,10 +14,10 @@ FORMAT = 1
 
 
 class Recorder:
-    """Collects what one run of the benchmark found.
+    """Collects the results of one benchmark run.
 
     ``content`` has ``results`` (rows of `latency`), ``jitter``, ``kernel`` and ``loop`` (those that
-    were asked for), ``remarks``, ``environment``, ``caveats`` and ``seconds``.
+    were requested), ``remarks``, ``environment``, ``caveats`` and ``seconds``.
     """
 
     def __init__(self, what: str) -> None:
@@ -31,7 +31,7 @@ class Recorder:
         }
 
     def close(self) -> dict[str, Any]:
-        """The whole, with the time it took."""
+        """The whole content, with the duration."""
         badge = self.content["environment"]
         badge["steal_pct"] = self._steal.percent()
         self.content["caveats"] = caveats(badge)
@@ -40,16 +40,16 @@ class Recorder:
 
 
 def write_result(content: dict[str, Any], path: Path) -> None:
-    """Write it as JSON."""
+    """Write a result as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """Read a result, or the one in a folder.
+    """Read a result from a file or a folder.
 
     Raises:
-        UserError: it is none.
+        UserError: it is not a result.
     """
     file = path / "bench.json" if path.is_dir() else path
     try:
@@ -63,7 +63,7 @@ def check_result(content: Any, source: str) -> dict[str, Any]:
     """The content, if it is a result.
 
     Raises:
-        UserError: it is none, or one of another version.
+        UserError: it is not a result, or one of another version.
     """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise UserError(f"{source}: not a result of `gfmhil bench` of format {FORMAT}")

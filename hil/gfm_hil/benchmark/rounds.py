@@ -1,7 +1,7 @@
-"""Timing that a noisy machine cannot fool easily: rivals take turns, and the median counts.
+"""Timing that is robust on a noisy machine: rivals take turns, and the median counts.
 
-A turn is the quickest of a few short runs, since what else the machine does only adds time. A
-ratio is taken turn by turn, between runs that follow each other at once, before its median is.
+A turn is the fastest of a few short runs, since other work on the machine only adds time. A ratio
+is computed per turn, between runs that follow each other at once; then the median is taken.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ RUNS = 20  # in a turn
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, least and greatest of one measured quantity over all turns, and what each gave."""
+    """Median, minimum and maximum of one quantity over all turns, and the value of each turn."""
 
     median: float
     min: float
@@ -31,7 +31,7 @@ class Spread:
         return Spread(statistics.median(values), min(values), max(values), tuple(values))
 
     def text(self, digits: int) -> str:
-        """``median (min–max)`` with so many digits after the point."""
+        """``median (min–max)`` with ``digits`` digits after the point."""
         return f"{self.median:.{digits}f} ({self.min:.{digits}f}–{self.max:.{digits}f})"
 
     def plain(self) -> dict[str, Any]:
@@ -41,21 +41,21 @@ class Spread:
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """How long one call takes, in s."""
+    """Duration of one call, s."""
     begin = perf_counter_ns()
     work()
     return (perf_counter_ns() - begin) * 1e-9
 
 
 def quickest(run: Callable[[], float], runs: int = RUNS) -> float:
-    """The least of what so many calls of ``run`` return."""
+    """The minimum of the results of ``runs`` calls of ``run``."""
     return min(run() for _ in range(runs))
 
 
 def take_turns(jobs: Mapping[str, Callable[[], float]], turns: int) -> dict[str, list[float]]:
-    """Run every job once unrecorded, then all of them in turn; what each returned, per turn.
+    """Run every job once to warm up, then all of them in turn; returns each job's results.
 
-    Every second turn runs backwards, so that none always follows the same rival.
+    Every second turn has the reverse order, so that no job always follows the same rival.
     """
     for job in jobs.values():
         job()
@@ -67,12 +67,12 @@ def take_turns(jobs: Mapping[str, Callable[[], float]], turns: int) -> dict[str,
 
 
 def rounds(count: int, until: float) -> Iterator[int]:
-    """Numbers of rounds: ``count`` of them, or as many as by their length so far end in time.
+    """Numbers of rounds: ``count``, or as many as will end in time, judged by the rounds so far.
 
-    At least one. On a machine that is busy with other things rounds take several times longer.
+    At least one. On a busy machine rounds take several times longer.
 
     Args:
-        count: wanted.
+        count: requested rounds.
         until: time of ``time.monotonic``, s.
     """
     begin = time.monotonic()

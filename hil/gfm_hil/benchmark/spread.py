@@ -1,7 +1,7 @@
 """Percentiles of several interleaved rounds of one measurement.
 
-p50, p90 and p99 are medians over the rounds; from p99.9 on a round has too few times, so these are
-of all rounds together, as is the histogram.
+p50, p90 and p99 are medians over the rounds; from p99.9 on a round has too few times, so these
+percentiles and the histogram are of all rounds together.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ REST = 0.15  # of a round: the kernel takes 5 % of each second from SCHED_FIFO t
 def summary(rounds: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
     """``n``, ``<percentile>_us``, ``rounds_p50_us`` and ``histogram`` of rounds of times in ns.
 
-    Rounds without times count for nothing; None stands for what cannot be said.
+    Rounds without times are ignored; None stands for an unknown value.
     """
     counts = [histogram(times) for times in rounds if len(times)]
     found: dict[str, Any] = {f"{name}_us": None for name in SHARES}

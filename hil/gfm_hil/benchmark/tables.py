@@ -19,7 +19,7 @@ class Table:
 
 
 def title(percentile: str) -> str:
-    """As people write it: p99.9."""
+    """The usual notation of a percentile: p99.9."""
     return percentile.replace("_", ".")
 
 
@@ -43,7 +43,7 @@ def percent(value: float | None) -> str:
 
 
 def tables(content: dict[str, Any]) -> Iterator[Table]:
-    """Everything that a result holds."""
+    """All tables of a result."""
     yield from latency_tables(content["results"])
     if "jitter" in content:
         yield jitter_table(content["jitter"])
@@ -59,7 +59,7 @@ def tables(content: dict[str, Any]) -> Iterator[Table]:
 
 
 def latency_tables(rows: list[dict[str, Any]]) -> Iterator[Table]:
-    """Round trips, one table a mode and load."""
+    """Round trips, one table per mode and load."""
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
         some = [r for r in rows if (r["mode"], r["load"]) == (mode, load)]
         yield Table(
@@ -127,12 +127,12 @@ def causes_table(rows: list[dict[str, Any]]) -> Table:
 
 
 def lockstep_name(row: dict[str, Any]) -> str:
-    """What ran in lockstep: the link, and with how much loop delay."""
+    """Name of a run in lockstep: its link and its loop delay."""
     return f"{row['link']}, a sample late" if row["delay_samples"] else str(row["link"])
 
 
 def lockstep_table(rows: list[dict[str, Any]]) -> Table:
-    """The closed loop as fast as it goes."""
+    """The closed loop as fast as possible."""
     return Table(
         "The product in lockstep",
         ("", "ticks a second", "× real time", "of what the plant alone allows"),
@@ -164,7 +164,7 @@ def laws_table(rows: list[dict[str, Any]]) -> Table:
 
 
 def kernel_table(rows: list[dict[str, Any]]) -> Table:
-    """ns a step of every law."""
+    """ns per step of every law."""
     reals = list(dict.fromkeys(r["real"] for r in rows))
     by = {(r["law"], r["real"]): r for r in rows}
 

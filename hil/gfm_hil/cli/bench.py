@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
         sub.set_defaults(call=call)
 
     kind(
-        "latency", "round trip of every link beside the limit in C",
+        "latency", "round trip of every link, and the limit in C",
         _add_links, _add_modes, _add_load, _add_policy, _add_payload, _add_seconds(0.2),
         _add_rounds,
     )  # fmt: skip
@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     kind(
         "kernel",
-        "ns a step of every law, beside the same in C",
+        "time of one step of every law, and of the same in C",
         _add_laws,
         _add_cflags,
         _add_rounds,

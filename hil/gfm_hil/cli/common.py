@@ -16,10 +16,10 @@ from rich.table import Table
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.report import as_expected, cell, event_rows
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
-from gfm_hil.results.summary import controlled_by
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130

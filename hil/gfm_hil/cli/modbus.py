@@ -1,4 +1,4 @@
-"""gfmhil modbus: a SunSpec device on Modbus/TCP beside a run that is going on."""
+"""gfmhil modbus: serve a run that is going on as a SunSpec device on Modbus/TCP."""
 
 from __future__ import annotations
 

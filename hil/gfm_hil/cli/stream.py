@@ -51,7 +51,8 @@ def add(commands: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Carry it out; returns the exit code."""
     _check(options)
-    from gfm_hil.telemetry.follow import Follower, begun
+    from gfm_hil.recording.live import begun
+    from gfm_hil.telemetry.follow import Follower
     from gfm_hil.telemetry.publish import Ports, Publisher
 
     if options.part is not None:

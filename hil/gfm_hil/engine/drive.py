@@ -31,7 +31,7 @@ from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import CONTROLLER_LEFT, PLANT_LEFT
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.expectation import CONTROLLER_GONE
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED

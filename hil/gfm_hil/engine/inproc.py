@@ -15,15 +15,14 @@ from gfm_hil.engine.loop_records import ControllerRecords, PlantRecords, Why
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.tick import advance, answer, obey, sample
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.recorder import (
+from gfm_hil.recording.columns import (
     CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
     PLANT_COLUMNS,
     PLANT_TIMES,
-    Part,
-    record_command,
-    record_controller,
 )
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import plant_is_delayed, plant_step
 from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY

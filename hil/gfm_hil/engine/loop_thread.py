@@ -18,7 +18,7 @@ from gfm_hil.links import Link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.links.pump import ported
 from gfm_hil.realtime.priority import stand_back
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 
 _LOOK_S = 0.05
 

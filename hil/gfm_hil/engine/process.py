@@ -30,13 +30,8 @@ from gfm_hil.links.impaired import ImpairedLink
 from gfm_hil.realtime.prevent_idle import kept_awake
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording.log import Outcome
-from gfm_hil.recording.recorder import (
-    Part,
-    keep_in_memory,
-    record_command,
-    record_controller,
-    record_sample,
-)
+from gfm_hil.recording.parts import Part, keep_in_memory
+from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_plant import plant_command, plant_sample, plant_step

@@ -18,7 +18,7 @@ from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
 from gfm_hil.recording.log import Outcome
-from gfm_hil.recording.recorder import Part, keep_in_memory
+from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.scenario.model import Scenario
 
 #: told (ticks done, misses so far); may be called a few times a second

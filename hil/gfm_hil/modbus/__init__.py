@@ -1,1 +1,1 @@
-"""A SunSpec device on Modbus/TCP beside a run: measurements and an operator's commands."""
+"""A run as a SunSpec device on Modbus/TCP: measurements, and commands of an operator."""

@@ -28,11 +28,11 @@ _SPAN = 100.0  # %: the two points that show the droop in force have Var = ± th
 _RESOLUTION = 0.015  # %: largest deviation of the line from the reference
 _MINE = 2  # the curve that a client may write
 
-#: what a client may write of a curve of model 705, and of a control of model 711
+#: points that a client may write in a curve of model 705, and in a control of model 711
 VOLT_VAR = ("ActPt", "VRef", "Pt1.V", "Pt1.Var", "Pt2.V", "Pt2.Var")
 DROOP = ("DbOf", "DbUf", "KOf", "KUf", "RspTms")
 
-#: what a curve stands for: "V_ref" [p.u.], "D_p", "D_q"
+#: meaning of a curve: "V_ref" [p.u.], "D_p", "D_q"
 Meaning = dict[str, float]
 
 

@@ -9,17 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gfm_hil.core.errors import UserError
 from gfm_hil.operator import Operator
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, PLANT_TIMES, Part
+from gfm_hil.recording.live import LiveRun
+from gfm_hil.recording.timing import SLACK
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.states import SAFE
 
 _NAMES_S = 0.1  # how old names and gains may be
 _WINDOW_S = 1.0  # window of the slack
-_SCHEDULED, _RECEIVED = PLANT_TIMES.index("scheduled"), PLANT_TIMES.index("received")
 
 
 @dataclass(frozen=True)
@@ -74,23 +72,19 @@ class Watcher:
     """
 
     def __init__(self, operator: Operator, folder: Path, scenario: Scenario) -> None:
-        self._operator, self._folder = operator, folder
-        self._T_ns = round(scenario.T_s * 1e9)
+        self._operator, self._run = operator, LiveRun(folder)
+        self._T_s = scenario.T_s
         self._window = max(round(_WINDOW_S / scenario.T_s), 1)
-        self._parts: dict[str, Part] = {}
         self._said: dict[str, Any] = {}
         self._code: tuple[float, ...] = ()
         self._asked = -math.inf
 
     def look(self) -> View | None:
         """The newest tick of both sides, or None before there is one."""
-        row: dict[str, float] = {}
-        for side, columns in (("plant", PLANT_COLUMNS), ("controller", CONTROLLER_COLUMNS)):
-            part = self._part(side)
-            done = 0 if part is None else int(part.progress[0])
-            if part is None or not done:
-                return None
-            row.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
+        plant, controller = self._run.done("plant"), self._run.done("controller")
+        if not (plant and controller):
+            return None
+        row = self._run.row("plant", plant - 1) | self._run.row("controller", controller - 1)
         code = (row["law"], row["state"], row["true_trip"])
         now = time.monotonic()
         if code != self._code or now >= self._asked + _NAMES_S:  # reading files takes time
@@ -99,11 +93,10 @@ class Watcher:
             self._code, self._asked = code, now
         if "active" not in self._said:  # the controller's desk is not open yet
             return None
-        progress = self._parts["plant"].progress
         return View(
             row=row,
-            tick=int(progress[0]) - 1,
-            misses=int(progress[1]),
+            tick=plant - 1,
+            misses=self._run.misses,
             state=int(row["state"]),
             law=self._said["active"],
             gains=self._said["gains"],
@@ -116,24 +109,12 @@ class Watcher:
 
     def slack(self) -> Slack:
         """The slack over the last second of ticks; u[k] is due when tick k + 1 begins."""
-        part = self._parts.get("plant")
-        done = 0 if part is None else int(part.progress[0])
-        if part is None or not done:
+        done = self._run.done("plant")
+        if not done:
             return Slack()
-        times = part.times[max(done - self._window, 0) : done]
-        times = times[(times[:, _RECEIVED] >= 0) & (times[:, _SCHEDULED] >= 0)]
-        if not len(times):
-            return Slack()
-        left = (times[:, _SCHEDULED] + self._T_ns - times[:, _RECEIVED]) * 1e-3
-        return Slack(*(float(v) for v in np.percentile(left, (50, 1, 0.1, 0))))
+        left = SLACK.spread(self._run.columns, self._T_s, max(done - self._window, 0), done)
+        return Slack(*(left.percentile(q) * 1e-3 for q in (50, 1, 0.1, 0))) if left else Slack()
 
     def laws(self) -> list[str]:
         """Names of the laws that the run can switch to, in order."""
         return [str(name) for name in self._operator.snapshot()["laws"]]
-
-    def _part(self, side: str) -> Part | None:
-        if side not in self._parts:
-            part = Part.open(self._folder, side)
-            if part is not None:
-                self._parts[side] = part
-        return self._parts.get(side)

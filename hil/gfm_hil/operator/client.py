@@ -12,7 +12,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity, local
 from gfm_hil.core.roles import Side
 from gfm_hil.engine.announcement import LARGEST, announced, present
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part
+from gfm_hil.recording.live import LiveRun
 from gfm_hil.scenario.events import CONTROLLER_EVENTS
 from gfm_plant import TRIP_REASONS
 from gfm_runtime.states import REASONS, STATES
@@ -95,29 +95,18 @@ class Operator:
             UserError: the recording is damaged.
         """
         found: dict[str, Any] = {}
-        sides: tuple[tuple[Side, tuple[str, ...]], ...]
-        sides = ("plant", PLANT_COLUMNS), ("controller", CONTROLLER_COLUMNS)
-        for side, columns in sides:
-            part = Part.open(self._folder, side)
-            done = 0 if part is None else int(part.progress[0])
-            if part is None or not done:
-                continue
-            found.update(zip(columns, part.signals[done - 1].tolist(), strict=True))
-            if side == "plant":
-                found["tick"], found["misses"] = done - 1, int(part.progress[1])
-                found["trip"] = _word(
-                    self._folder, "trip", {**TRIP_REASONS, 0: ""}, found["true_trip"]
-                )
-            else:
-                found["state"] = _word(
-                    self._folder, "state", dict(enumerate(STATES)), found["state"]
-                )
-                reasons = dict(enumerate(REASONS))
-                found["reason"] = _word(self._folder, "reason", reasons, int(part.progress[1]))
-                if (desk := announced(self._folder, side)) is not None:
-                    law = _word(self._folder, "law", dict(enumerate(desk["laws"])), found["law"])
-                    found["active"], found["gains"] = law["name"], law["gains"]
-                    found["laws"], found["T_s"] = desk["names"], desk["T_s"]
+        run, folder = LiveRun(self._folder), self._folder
+        if done := run.done("plant"):
+            found |= {**run.row("plant", done - 1), "tick": done - 1, "misses": run.misses}
+            found["trip"] = _word(folder, "trip", {**TRIP_REASONS, 0: ""}, found["true_trip"])
+        if done := run.done("controller"):
+            found |= run.row("controller", done - 1)
+            found["state"] = _word(folder, "state", dict(enumerate(STATES)), found["state"])
+            found["reason"] = _word(folder, "reason", dict(enumerate(REASONS)), run.safe_reason)
+            if (desk := announced(folder, "controller")) is not None:
+                law = _word(folder, "law", dict(enumerate(desk["laws"])), found["law"])
+                found["active"], found["gains"] = law["name"], law["gains"]
+                found["laws"], found["T_s"] = desk["names"], desk["T_s"]
         return found
 
     def _ask(self, side: Side, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:

@@ -62,12 +62,12 @@ def caveats(badge: dict[str, Any]) -> list[str]:
             f"Frequency governor {badge['governor']}: a processor that slept starts slowly."
         )
     if badge["cpus"] < 2:
-        said.append("One processor: the two sides take turns on it, and nothing is as in a bench.")
+        said.append("One processor: the two sides share it, and no time is that of a bench.")
     busy = badge["load_average"][0] / badge["cpus"]
     if busy > 0.5:
         said.append(
             f"Load average {badge['load_average'][0]:g} on {badge['cpus']} processors at the start:"
-            " other work ran beside."
+            " other work ran at the same time."
         )
     return said
 

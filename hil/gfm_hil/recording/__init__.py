@@ -1,1 +1,4 @@
-"""The record of a run: its columns, the recorder that fills them, and the log of events."""
+"""The record of a run: the table of its columns, and what writes them.
+
+``RecordedRun`` reads a run that is over, ``LiveRun`` one that is going on; nothing else does.
+"""

@@ -48,6 +48,20 @@ def read_log(*paths: Path) -> list[dict[str, Any]]:
     return sorted(lines, key=lambda line: line["tick"])
 
 
+def read_events(folder: Path) -> list[dict[str, Any]]:
+    """The log of a run folder; while the run goes on, what its sides have written so far."""
+    whole = folder / "events.jsonl"
+    return read_log(whole) if whole.is_file() else read_log(*folder.glob("events_*.jsonl"))
+
+
+def event_text(event: dict[str, Any]) -> str:
+    """What a line of the log says beyond its kind, in a few words."""
+    if "label" in event:
+        return str(event["label"])
+    rest = {k: v for k, v in event.items() if k not in ("tick", "t", "event")}
+    return ", ".join(f"{key} {value}" for key, value in rest.items())
+
+
 def read_summary(folder: Path) -> dict[str, Any]:
     """The content of a run's summary.json.
 

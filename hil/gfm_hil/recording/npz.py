@@ -14,7 +14,7 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -235,22 +235,3 @@ def _field(extra: bytes) -> bytes:
             return extra[4 : 4 + size]
         extra = extra[4 + size :]
     return b""
-
-
-class Arrays(Mapping[str, NDArray[Any]]):
-    """Columns as arrays, each read as a whole whenever it is asked for."""
-
-    def __init__(self, columns: Mapping[str, Column]) -> None:
-        self._columns = columns
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._columns[name][:]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._columns

@@ -1,7 +1,7 @@
-"""Whether this machine is fit for real time: one finding a line, with what to do about it.
+"""Is this machine fit for real time? Judges the badge line by line and gives advice.
 
-Green: there is nothing to do. Yellow: the longest times are longer than they need be. Red: ticks
-will be late, or the machine refuses something that a run needs.
+Green: nothing to do. Yellow: the longest times are longer than necessary. Red: ticks will be late,
+or the machine refuses something that a run needs.
 """
 
 from __future__ import annotations
@@ -18,12 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
-from gfm_hil.recording.recorder import (
-    CONTROLLER_COLUMNS,
-    CONTROLLER_TIMES,
-    PLANT_COLUMNS,
-    PLANT_TIMES,
-)
+from gfm_hil.recording.columns import BYTES_PER_TICK
 
 Level = Literal["green", "yellow", "red"]
 Facts = dict[str, Any]
@@ -35,9 +30,7 @@ _CAP_SYS_NICE = 23
 _FAST_CLOCKS = {"tsc", "arch_sys_counter", "riscv_clocksource", "kvm-clock"}
 _FAST_CLOCKS |= {"hyperv_clocksource_tsc_page"}
 _WAKE_US = 20  # of a tick of 100 µs
-_MINUTE_BYTES = 60 * 10_000 * 8 * sum(
-    map(len, (PLANT_COLUMNS, CONTROLLER_COLUMNS, PLANT_TIMES, CONTROLLER_TIMES))
-)  # fmt: skip
+_MINUTE_BYTES = 60 * 10_000 * BYTES_PER_TICK
 _NEEDED = ("numpy", "numba", "pyzmq", "python-can")
 
 
@@ -51,7 +44,7 @@ class Finding(NamedTuple):
 
 
 def examine() -> tuple[Facts, list[Finding]]:
-    """The machine's badge and more, and what there is to say about it; changes nothing."""
+    """The machine's badge and further facts, and the findings; changes nothing."""
     steal = StealTime()
     time.sleep(_STEAL_OVER_S)
     facts = {**environment(), **look(Path("/")), "steal_pct": steal.percent()}
@@ -69,7 +62,7 @@ def verdict() -> dict[str, Any]:
 
 
 def look(root: Path) -> Facts:
-    """What the badge does not say, from files below ``root`` and the limits of this process."""
+    """Facts beyond the badge, from files below ``root`` and the limits of this process."""
     cpu = root / "sys/devices/system/cpu"
     governors = {_text(f) for f in cpu.glob("cpu[0-9]*/cpufreq/scaling_governor")}
     deepest = [
@@ -99,7 +92,7 @@ def look(root: Path) -> Facts:
 
 
 def _allowed_priority(root: Path) -> int:
-    """The highest real-time priority that this process may ask for."""
+    """The highest real-time priority that this process may use."""
     held = re.search(r"^CapEff:\s*(\w+)", _text(root / "proc/self/status"), re.M)
     if held and int(held.group(1), 16) >> _CAP_SYS_NICE & 1:
         return 99
@@ -107,7 +100,7 @@ def _allowed_priority(root: Path) -> int:
 
 
 def _can_modules(root: Path) -> list[str]:
-    """Which of the kernel's CAN drivers are loaded, built in, or there to be loaded."""
+    """Which of the kernel's CAN drivers are loaded, built in, or loadable."""
     drivers = root / "lib/modules" / os.uname().release
     listed = _text(drivers / "modules.dep") + "\n" + _text(drivers / "modules.builtin")
     found = set(re.findall(r"/(can|vcan|can-raw|can-dev)\.ko", listed))
@@ -118,7 +111,7 @@ def _can_modules(root: Path) -> list[str]:
 
 
 def judge(facts: Facts) -> list[Finding]:
-    """A finding for each rule, in the order of the table."""
+    """One finding per rule, in the order of the table."""
     return [rule(facts) for rule in _RULES]
 
 

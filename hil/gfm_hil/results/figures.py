@@ -14,19 +14,17 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.core.files import replacing
-from gfm_hil.results.metrics import Rows
-from gfm_hil.results.summary import Spread, controlled_by, nominal_frequency
+from gfm_hil.recording.columns import PIECE, TABLE, Columns, Rows
+from gfm_hil.recording.run import controlled_by, nominal_frequency
+from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.scenario.model import Scenario
-
-Signals = Mapping[str, Rows]
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart, and which print well
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 # gaps wide enough to see an identical curve below
 _STYLES = ("-", (0, (5, 4)), (0, (6, 4, 1.5, 4)), (0, (1.5, 4)))
 _POINTS = 4000  # drawn a curve; each pixel column keeps its least and its largest value
-_PIECE = 1 << 18  # ticks read at a time
 _LABELS = 40  # events with a label
 _BINS = 60  # of the histogram of misses
 _GREY = "#888888"
@@ -42,7 +40,7 @@ def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
     if stretch < 3:
         return t[:], x[:] * factor
     whole = ticks // stretch * stretch
-    step = max(1, _PIECE // stretch) * stretch
+    step = max(1, PIECE // stretch) * stretch
     moments, pairs = [], []
     for first in range(0, whole, step):
         last = min(first + step, whole)
@@ -84,6 +82,21 @@ def draw_panel(
     least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise
     if high - low < least:
         axes.set_ylim((low + high - least) / 2, (low + high + least) / 2)
+
+
+def _draw_columns(
+    axes: Axes,
+    title: str,
+    name: str,
+    scenario: Scenario,
+    curves: Sequence[tuple[Columns, str, str, str]],
+) -> float:
+    """One quantity in the unit in which people read the column ``name``: curves of columns, the
+    name of one of them, colour and label. Returns the factor from what is recorded."""
+    shown = TABLE[name].shown(nominal_frequency(scenario))
+    drawn = [(columns["t"], columns[n], colour, label) for columns, n, colour, label in curves]
+    draw_panel(axes, f"{title} [{shown.unit}]", drawn, shown.factor)
+    return shown.factor
 
 
 def _mark(
@@ -142,8 +155,8 @@ def _save(figure: Figure, path: Path) -> None:
 def draw_run(
     folder: Path,
     scenario: Scenario,
-    signals: Signals,
-    timing: Signals,
+    signals: Columns,
+    timing: Columns,
     summary: dict[str, Any],
 ) -> list[Path]:
     """Draw one run into its folder: signals.png and, in real time, timing.png."""
@@ -163,32 +176,26 @@ SIZE_LAWS = (8.6, 8.2)
 
 
 def draw_signals(
-    figure: Figure, scenario: Scenario, signals: Signals, summary: dict[str, Any]
+    figure: Figure, scenario: Scenario, signals: Columns, summary: dict[str, Any]
 ) -> list[Axes]:
     """Fill a figure with the six panels of a run: p, q, frequency, V, v_dc and currents."""
     axes = _panels(figure, 3, 2)
-    t, f_n = signals["t"], nominal_frequency(scenario)
     blue, red, green, *_ = COLOURS
-
-    def panel(axes: Axes, title: str, *names: tuple[str, str, str], factor: float = 1.0) -> None:
-        drawn = [(t, signals[n], c, label) for n, c, label in names if n in signals]
-        draw_panel(axes, title, drawn, factor)
-        if len(drawn) > 1:
-            _legend(axes, len(drawn))
-
-    panel(axes[0], "active power p [p.u.]", ("true_p", blue, "p"), ("ref_P_ref", _GREY, "P_ref"))
-    panel(axes[1], "reactive power q [p.u.]", ("true_q", blue, "q"), ("ref_Q_ref", _GREY, "Q_ref"))
-    panel(
-        axes[2], "frequency [Hz]", ("true_omega_u", blue, "converter"),
-        ("true_omega_g", _GREY, "grid"), factor=f_n,
-    )  # fmt: skip
-    panel(axes[3], "voltage V [p.u.]", ("true_V", blue, "V"), ("u_E_u", red, "E_u"))
-    panel(axes[4], "DC voltage v_dc [p.u.]", ("true_v_dc", blue, "v_dc"))
     # a regulated source ignores i_u
     i_u = [("u_i_u", green, "i_u")] if scenario.plant.dc_source.mode == "controlled" else []
-    panel(
-        axes[5], "currents [p.u.]", ("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *i_u
-    )  # fmt: skip
+    panels: list[tuple[str, list[tuple[str, str, str]]]] = [
+        ("active power p", [("true_p", blue, "p"), ("ref_P_ref", _GREY, "P_ref")]),
+        ("reactive power q", [("true_q", blue, "q"), ("ref_Q_ref", _GREY, "Q_ref")]),
+        ("frequency", [("true_omega_u", blue, "converter"), ("true_omega_g", _GREY, "grid")]),
+        ("voltage V", [("true_V", blue, "V"), ("u_E_u", red, "E_u")]),
+        ("DC voltage v_dc", [("true_v_dc", blue, "v_dc")]),
+        ("currents", [("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *i_u]),
+    ]
+    for a, (title, names) in zip(axes, panels, strict=True):
+        curves = [(signals, n, colour, label) for n, colour, label in names if n in signals]
+        _draw_columns(a, title, names[0][0], scenario, curves)
+        if len(curves) > 1:
+            _legend(a, len(curves))
     _mark(axes, summary["events"])
     trips = [{"t": x["t"], "label": reason_name(x["reason"])} for x in summary.get("trips", [])]
     _mark(axes, trips, red, above=20 + 10 * min(3, len(summary["events"])))
@@ -197,19 +204,17 @@ def draw_signals(
     return axes
 
 
-def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict[str, Any]) -> Path:
+def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict[str, Any]) -> Path:
     """Draw into timing.png how long the round trips took, and when the plant had no fresh u."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    for begin, end, colour, label in (
-        ("plant_sent", "plant_received", COLOURS[0], "y[k] sent → u[k] received"),
-        ("plant_scheduled", "plant_woke", COLOURS[1], "tick begun after its deadline"),
-    ):
-        spread = Spread.between(timing, begin, end)
+    for duration, colour in ((ROUND_TRIP, COLOURS[0]), (LATE, COLOURS[1])):
+        spread = duration.spread(timing, scenario.T_s)
         before = np.cumsum(spread.count) - spread.count
-        beyond = 1 - before / max(1, int(spread.count.sum()))
-        left.loglog(np.maximum(spread.ns / 1e3, 0.1), beyond, color=colour, lw=1.2, label=label)
+        beyond = 1 - before / max(1, len(spread))
+        us = np.maximum(spread.ns / 1e3, 0.1)
+        left.loglog(us, beyond, color=colour, lw=1.2, label=duration.meaning)
     left.axvline(scenario.T_s * 1e6, color=_GREY, lw=0.8, ls=(0, (4, 3)))
     left.text(
         scenario.T_s * 1e6, 0.98, f" T_s = {scenario.T_s * 1e6:g} µs", fontsize=8, va="top",
@@ -219,8 +224,8 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict
     left.legend(fontsize=8, frameon=False, loc="lower left")
     edges, counts = np.linspace(0, summary["duration_s"], _BINS + 1), np.zeros(_BINS)
     ticks = len(timing["plant_received"])
-    for first in range(0, ticks, _PIECE):
-        missing = np.flatnonzero(timing["plant_received"][first : first + _PIECE] < 0)
+    for first in range(0, ticks, PIECE):
+        missing = np.flatnonzero(missed(timing, first, first + PIECE))
         counts += np.histogram((first + missing) * scenario.T_s, edges)[0]
     right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
     right.set_title(
@@ -240,31 +245,31 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Signals, summary: dict
 def draw_laws(
     figure: Figure,
     scenario: Scenario,
-    runs: Mapping[str, Signals],
+    runs: Mapping[str, Columns],
     events: Sequence[dict[str, Any]],
 ) -> list[Axes]:
     """Fill a figure with p, frequency, q and v_dc of several laws, like the paper's."""
     axes = _panels(figure, 4, 1)
-    f_n = nominal_frequency(scenario)
     whole = max(len(s["t"]) for s in runs.values())
     if all(s["t"][0:1] == 0 for s in runs.values()):  # not only a window of each run
         whole = scenario.ticks
-    for a, (title, name, factor) in zip(
+    for a, (title, name) in zip(
         axes,
         (
-            ("active power p [p.u.]", "true_p", 1.0),
-            ("frequency [Hz]", "true_omega_u", f_n),
-            ("reactive power q [p.u.]", "true_q", 1.0),
-            ("DC voltage v_dc [p.u.]", "true_v_dc", 1.0),
+            ("active power p", "true_p"),
+            ("frequency", "true_omega_u"),
+            ("reactive power q", "true_q"),
+            ("DC voltage v_dc", "true_v_dc"),
         ),
         strict=True,
     ):
         curves = [
-            (s["t"], s[name], COLOURS[k % len(COLOURS)], law)
-            for k, (law, s) in enumerate(runs.items())
+            (columns, name, COLOURS[k % len(COLOURS)], law)
+            for k, (law, columns) in enumerate(runs.items())
         ]
-        draw_panel(a, title, curves, factor)
-        for t, x, colour, _ in curves:
+        factor = _draw_columns(a, title, name, scenario, curves)
+        for columns, _, colour, _ in curves:
+            t, x = columns["t"], columns[name]
             if len(t) < whole:  # this run ended early
                 a.plot(t[len(t) - 1 :], x[len(t) - 1 :] * factor, "x", color=colour)
     _legend(axes[0], min(4, len(runs)))
@@ -274,7 +279,7 @@ def draw_laws(
 
 
 def draw_comparison(
-    path: Path, scenario: Scenario, runs: Mapping[str, Signals], events: Sequence[dict[str, Any]]
+    path: Path, scenario: Scenario, runs: Mapping[str, Columns], events: Sequence[dict[str, Any]]
 ) -> None:
     """Draw several laws into a file, see ``draw_laws``."""
     figure = _figure(SIZE_LAWS)

@@ -8,18 +8,14 @@ received says how near the misses are.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-
-_PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
-_FILES = ("scenario.toml", "timing.npz", "summary.json")
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.timing import ROUND_TRIP, Spread, missed
 
 
 @dataclass(frozen=True)
@@ -78,51 +74,35 @@ class LoopDelay:
         )
 
 
-def check_run(folder: Path) -> None:
-    """See that a folder holds a run.
+def loop_delay(run: RecordedRun, set_s: float, margin_s: float) -> LoopDelay:
+    """What a run showed, beside a margin.
+
+    Args:
+        run: with its times, if it was in real time.
+        set_s: the delay that the scenario sets between y[k] and u[k] acting, s.
+        margin_s: how much more the law stands, s.
 
     Raises:
-        UserError: it does not, or lacks a file.
+        UserError: the run lacks the plant's times.
     """
-    if not folder.is_dir():
-        raise UserError(f"--run {folder}: no such folder")
-    missing = [name for name in _FILES if not (folder / name).is_file()]
-    if missing:
-        raise UserError(f"--run {folder}: not a finished run, lacks {', '.join(missing)}")
-
-
-def read_loop_delay(folder: Path, set_s: float, T_s: float, margin_s: float) -> LoopDelay:
-    """What a run folder says, beside a margin; all arguments in s.
-
-    Raises:
-        UserError: a file cannot be read or lacks the plant's times.
-    """
-    check_run(folder)
-    try:
-        mode = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["mode"]
-        with np.load(folder / "timing.npz") as file:
-            timing = {n: file[n] for n in ("plant_sent", "plant_received") if n in file}
-    except (OSError, ValueError, KeyError, TypeError) as problem:
-        raise UserError(f"--run {folder}: cannot be read: {problem}") from None
+    T_s = run.scenario.T_s
     set_us, T_s_us = 1e6 * set_s, 1e6 * T_s
-    if mode != "realtime":
+    if run.summary["mode"] != "realtime":
         return LoopDelay(set_us, T_s_us, 0, 0, 0, None, None, 0)
-    if not {"plant_sent", "plant_received"} <= timing.keys() or not len(timing["plant_sent"]):
-        raise UserError(f"--run {folder}: timing.npz lacks the plant's times")
-    sent, received = timing["plant_sent"], timing["plant_received"]
-    there = received >= 0
-    ages = _ages(there)
-    acting = set_us + T_s_us * ages
-    trip = _percentiles((received - sent)[there] / 1e3) if there.any() else None
+    if not run.timing.keys() >= {*ROUND_TRIP.needs} or not run.ticks:
+        raise UserError(f"{run.folder}: timing.npz lacks the plant's times")
+    late = missed(run.timing)
+    ages = _ages(~late)
+    held = Spread.of([ages * round(1e9 * T_s)])
     return LoopDelay(
         set_us,
         T_s_us,
-        len(there),
-        int(np.sum(~there)),
+        run.ticks,
+        int(late.sum()),
         int(ages.max()),
-        trip,
-        _percentiles(acting),
-        int(np.sum(acting - set_us >= 1e6 * margin_s)),
+        ROUND_TRIP.spread(run.timing, T_s).percentiles_us() or None,
+        {name: round(set_us + us, 2) for name, us in held.percentiles_us().items()},
+        int(np.sum(T_s_us * ages >= 1e6 * margin_s)),
     )
 
 
@@ -131,7 +111,3 @@ def _ages(there: NDArray[np.bool_]) -> NDArray[np.int64]:
     k = np.arange(len(there))
     last = np.maximum.accumulate(np.where(there, k, -1))
     return k - last
-
-
-def _percentiles(us: NDArray[Any]) -> dict[str, float]:
-    return {name: round(float(np.percentile(us, q)), 2) for name, q in _PERCENTILES.items()}

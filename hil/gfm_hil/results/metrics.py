@@ -6,20 +6,13 @@ All from the plant's true signals. For each event the window runs to the next ev
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.recording.columns import PIECE, Columns, Rows, pieces
+
 Vector = NDArray[np.float64]
-
-
-class Rows(Protocol):
-    """A column, shape (ticks,): an array, or one of a file of which only slices are read."""
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, rows: slice, /) -> Any: ...
 
 
 ROCOF_WINDOW = 0.1  # s; df/dt is the slope over this window
@@ -30,17 +23,11 @@ METRICS = (
 _BAND = 0.02  # settling: within 2 % of the step (or 0.02 p.u. where there is no step)
 _GONE = 1e-6
 _NO_STEP = 0.02  # p.u.; a smaller change of p is no step
-_PIECE = 1 << 18  # ticks read at a time
 _FEW = 20  # samples; a shorter window has no metrics
 
 
-def blocks(column: Rows, first: int, last: int) -> Iterator[Any]:
-    """Rows [first, last) of a column in pieces of at most ``_PIECE``, so that memory is bounded."""
-    return (column[a : min(a + _PIECE, last)] for a in range(first, last, _PIECE))
-
-
 def event_metrics(
-    signals: Mapping[str, Rows], start: int, stop: int, T_s: float, f_n: float
+    signals: Columns, start: int, stop: int, T_s: float, f_n: float
 ) -> dict[str, float | None]:
     """Metrics of the ticks [start, stop) after an event at ``start``.
 
@@ -65,10 +52,10 @@ def event_metrics(
     rest = max(start - 1, 0)
     before = float(p[rest : rest + 1][0])
     tail = max(1, length // 20)
-    final = sum(float(np.sum(x)) for x in blocks(p, stop - tail, stop)) / tail
+    final = sum(float(np.sum(x)) for x in pieces(p, stop - tail, stop)) / tail
     step = final - before
     peak, least, most = before, math.inf, -math.inf
-    for x in blocks(p, start, stop):
+    for x in pieces(p, start, stop):
         furthest = float(x[np.argmax(np.abs(x - before))])
         peak = furthest if abs(furthest - before) > abs(peak - before) else peak
         least, most = min(least, float(x.min())), max(most, float(x.max()))
@@ -76,7 +63,7 @@ def event_metrics(
     settled = _settled(p, start, stop, final, _BAND * abs(step) if stepped else _BAND)
     beyond = (most - final if step > 0 else final - least) if stepped else 0.0
     nadir, top, slope = _frequency(f, start, stop, max(1, round(ROCOF_WINDOW / T_s)))
-    voltages = [(float(x.min()), float(x.max())) for x in blocks(V, start, stop)]
+    voltages = [(float(x.min()), float(x.max())) for x in pieces(V, start, stop)]
     damping, frequency = dominant_oscillation(p[start : min(stop, start + _longest(T_s))], T_s)
     return {
         "p_before": before,
@@ -99,7 +86,7 @@ def _settled(p: Rows, start: int, stop: int, final: float, band: float) -> int:
     """Ticks after ``start`` from which on p stays within ``band`` of ``final``, to ``stop``."""
     last = stop
     while last > start:  # from the end, where it is found soon
-        first = max(start, last - _PIECE)
+        first = max(start, last - PIECE)
         outside = np.flatnonzero(np.abs(p[first:last] - final) > band)
         if len(outside):
             return first + int(outside[-1]) + 1 - start
@@ -110,8 +97,8 @@ def _settled(p: Rows, start: int, stop: int, final: float, band: float) -> int:
 def _frequency(f: Rows, start: int, stop: int, width: int) -> tuple[float, float, float | None]:
     """Extremes of f, p.u., and its largest slope over ``width`` ticks, p.u. a tick."""
     least, most, slope = math.inf, -math.inf, None
-    for first in range(start, stop, _PIECE):
-        x = f[first : min(first + _PIECE + width, stop)]
+    for first in range(start, stop, PIECE):
+        x = f[first : min(first + PIECE + width, stop)]
         least, most = min(least, float(x.min())), max(most, float(x.max()))
         if len(x) > width:
             slope = max(slope or 0.0, float(np.abs(x[width:] - x[:-width]).max()) / width)

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.files import write_text
-from gfm_hil.results.summary import END_METRICS, controlled_by
+from gfm_hil.recording.run import controlled_by
+from gfm_hil.results.summary import END_METRICS
 from gfm_hil.scenario.model import Scenario
 
 _STYLE = """
@@ -112,6 +113,9 @@ def write_report(
         facts.append(("machine", machine + judged))
     if any(summary["faults"].values()):
         facts.append(("frames refused or lost", str(summary["faults"])))
+    if summary["e2e"]:
+        states = ", ".join(f"{side} {state}" for side, state in summary["e2e"].items())
+        facts.append(("end-to-end protection", states))
     rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
     images = "".join(f'<img alt="{p.stem}" src="{_inline(p)}">' for p in pictures)
     unmet = "".join(

@@ -12,7 +12,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,26 +23,21 @@ from numpy.typing import NDArray
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
-from gfm_hil.core.roles import OUR_CONTROLLER, SIDES, Side
+from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.log import Outcome, read_log, worst
-from gfm_hil.recording.npz import Column, Table, open_npz, write_npz
-from gfm_hil.recording.recorder import (
-    CONTROLLER_COLUMNS,
-    CONTROLLER_TIMES,
-    PLANT_COLUMNS,
-    PLANT_TIMES,
-    merge,
-    read_recording,
-    remove_parts,
-)
-from gfm_hil.results.run import Run, load_run
+from gfm_hil.recording.columns import BYTES_PER_TICK, Columns
+from gfm_hil.recording.log import Outcome, read_events, read_log, worst
+from gfm_hil.recording.merge import merge
+from gfm_hil.recording.npz import Table, write_npz
+from gfm_hil.recording.parts import remove_parts
+from gfm_hil.recording.run import read_recording
+from gfm_hil.results.run import Run
 from gfm_hil.results.summary import origin, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
-_COLUMNS = ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *PLANT_TIMES, *CONTROLLER_TIMES)
+_BYTES_PER_TICK = BYTES_PER_TICK + 16  # in the files, which have tick and t as well
 
 
 def check_free(folder: Path, ticks: int) -> None:
@@ -60,7 +55,7 @@ def check_free(folder: Path, ticks: int) -> None:
     if there == folder and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     # the parts stay until the run's files are there, which compression may not make smaller
-    needed = 2 * 8 * len(_COLUMNS) * ticks
+    needed = 2 * _BYTES_PER_TICK * ticks
     free = shutil.disk_usage(there).free
     if needed > free:
         raise UserError(
@@ -107,7 +102,7 @@ def recover(folder: Path) -> Run:
     with _alone(folder), _kept(folder):
         if (folder / "summary.json").is_file():
             _clear(folder)
-            return load_run(folder)
+            return Run.load(folder)
         parts = folder / "parts"
         if not parts.is_dir() and not (folder / "signals.npz").is_file():
             lay = f" (it lay in {parts.readlink()})" if parts.is_symlink() else ""
@@ -193,27 +188,23 @@ def _complete(
     if (folder / "parts").is_dir() or not (folder / "signals.npz").is_file():
         merge(folder, scenario.T_s, laws)  # of no parts where no side came so far
     signals, timing, labels = read_recording(folder)
-    logs = sorted(folder.glob("events_*.jsonl"))
-    log = read_log(*(logs or [folder / "events.jsonl"]))
+    log = read_events(folder)
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
-    faults, injected, one_clock, controller, run_id = {}, {}, True, OUR_CONTROLLER, None
-    for path in sorted(folder.glob("link_*.json")):
-        content = json.loads(path.read_text())
-        faults[content["side"]] = {k: v for k, v in content["faults"].items() if v}
-        one_clock &= content["one_clock"]
-        controller, run_id = content.get("controller", OUR_CONTROLLER), content.get("run")
-        if "injected" in content:
-            injected[content["side"]] = content["injected"]
-    outcome = worst(log, outside)
-    summary = summarise(
-        scenario, signals, timing, log, outcome, faults, wall_s, one_clock, controller
-    )
-    summary |= origin(scenario, (folder / "scenario.toml").stat().st_mtime) | {"run": run_id}
-    if injected:
-        summary["injected"] = injected
-    run = Run(scenario, summary, signals, labels, log, folder)
-    _conclude(run, timing, figures)
+    links = _link_ends(folder)
+    summary = summarise(scenario, signals, timing, log, worst(log, outside), links, wall_s)
+    summary |= origin(scenario, (folder / "scenario.toml").stat().st_mtime)
+    summary["run"] = next((end["run"] for end in links.values() if "run" in end), None)
+    run = Run(scenario, summary, signals, labels, log, folder, timing)
+    _conclude(run, figures)
     return run
+
+
+def _link_ends(folder: Path) -> dict[Side, dict[str, Any]]:
+    """What each side wrote about its end of the link: the faults that it counted, the state of the
+    end-to-end protection, whether both sides share a clock, the number of the run, what the
+    controller calls itself, and the faults injected on purpose."""
+    ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
+    return {end["side"]: end for end in ends}
 
 
 def merge_sides(first: Path, second: Path, folder: Path) -> Run:
@@ -230,7 +221,7 @@ def merge_sides(first: Path, second: Path, folder: Path) -> Run:
             is in use or cannot be written.
     """
     sides: dict[Side, Run] = {}
-    for run in (load_run(first), load_run(second)):
+    for run in (Run.load(first), Run.load(second)):
         recorded = [s for s, one in zip(SIDES, ("ref_P_ref", "true_p"), strict=True)
                     if one in run.columns]  # fmt: skip
         if len(recorded) != 1:
@@ -246,10 +237,11 @@ def merge_sides(first: Path, second: Path, folder: Path) -> Run:
     done = plant.summary["ticks"]
     check_free(folder, done)
     log = read_log(*(run.file("events.jsonl") for run in sides.values()))
-    faults, injected, machines = (
-        controller.summary.get(key, {}) | plant.summary.get(key, {})
-        for key in ("faults", "injected", "machines")
-    )
+    links = {
+        side: _link_end(side, sides[side].summary)
+        for side in SIDES
+        if side in sides[side].summary["faults"]
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(plant.file("scenario.toml"), folder)
@@ -258,25 +250,30 @@ def merge_sides(first: Path, second: Path, folder: Path) -> Run:
         laws = Table.of(laws=np.array(controller.laws))
         tables = [_padded(plant.columns, done, np.nan), _padded(own, done, np.nan), laws]
         write_npz(folder / "signals.npz", tables)
-        times = [open_npz(run.file("timing.npz")) for run in (plant, controller)]
-        write_npz(folder / "timing.npz", [_padded(x, done, -1) for x in times])
+        times = [_padded(run.timing, done, -1) for run in (plant, controller)]
+        write_npz(folder / "timing.npz", times)
         signals, timing, labels = read_recording(folder)
-        summary = summarise(
-            plant.scenario, signals, timing, log, worst(log, None), faults,
-            plant.summary["wall_s"], "clock_drift_ppm" not in controller.summary,
-            plant.summary["controller"],
-        )  # fmt: skip
+        wall_s = plant.summary["wall_s"]
+        summary = summarise(plant.scenario, signals, timing, log, worst(log, None), links, wall_s)
         summary |= {key: plant.summary[key] for key in ("date", "version", "run")}
-        summary |= {"machines": machines} | ({"injected": injected} if injected else {})
-        whole = Run(plant.scenario, summary, signals, labels, log, folder)
-        _conclude(whole, timing, figures=True)
+        summary["machines"] = controller.summary["machines"] | plant.summary["machines"]
+        whole = Run(plant.scenario, summary, signals, labels, log, folder, timing)
+        _conclude(whole, figures=True)
     except OSError as problem:
         shutil.rmtree(folder, ignore_errors=True)
         raise UserError(f"{folder}: {problem.strerror or problem}") from None
     return whole
 
 
-def _padded(columns: Mapping[str, Any], rows: int, missing: float) -> Table:
+def _link_end(side: Side, summary: dict[str, Any]) -> dict[str, Any]:
+    """What ``_link_ends`` gives of a side, from the summary of that side alone."""
+    keys = ("faults", "e2e", "injected")
+    kept = {key: summary[key][side] for key in keys if side in summary.get(key, {})}
+    one_clock = "clock_drift_ppm" not in summary
+    return {**kept, "one_clock": one_clock, "controller": summary["controller"]}
+
+
+def _padded(columns: Columns, rows: int, missing: float) -> Table:
     """Columns of one side, cut or filled up with ``missing`` to ``rows``."""
 
     def read(first: int, last: int) -> Iterator[NDArray[Any]]:
@@ -288,7 +285,7 @@ def _padded(columns: Mapping[str, Any], rows: int, missing: float) -> Table:
     return Table({name: column.dtype for name, column in columns.items()}, rows, read)
 
 
-def _conclude(run: Run, timing: Mapping[str, Column], figures: bool) -> None:
+def _conclude(run: Run, figures: bool) -> None:
     """Draw a run's figures, write its report and then its summary, and remove what is left over."""
     assert run.folder is not None
     folder, scenario, summary = run.folder, run.scenario, run.summary
@@ -297,7 +294,7 @@ def _conclude(run: Run, timing: Mapping[str, Column], figures: bool) -> None:
         from gfm_hil.results.figures import draw_run
         from gfm_hil.results.report import write_report
 
-        pictures = draw_run(folder, scenario, run.columns, timing, summary)
+        pictures = draw_run(folder, scenario, run.columns, run.timing, summary)
         write_report(folder, scenario, summary, pictures)
     sync_folder(folder)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")

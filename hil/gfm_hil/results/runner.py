@@ -18,15 +18,15 @@ from gfm_hil.engine.inproc import buffers, run_inproc
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
+from gfm_hil.recording.columns import Rows, named
 from gfm_hil.recording.log import Outcome
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS, Part, remove_parts
-from gfm_hil.results.metrics import Rows
+from gfm_hil.recording.merge import known_laws, laws_used
+from gfm_hil.recording.parts import Part, remove_parts
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.results.summary import origin, summarise
 from gfm_hil.scenario.model import INPROC, Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
-from gfm_runtime.assembly import SPARE
 
 __all__ = ["Notice", "Progress", "Run", "run_scenario"]
 
@@ -119,17 +119,10 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
     recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
     done = int(recorded[-1]) + 1 if len(recorded) else 0
     columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
-    for part, names in ((plant, PLANT_COLUMNS), (controller, CONTROLLER_COLUMNS)):
-        columns |= {name: np.array(part.signals[:done, j]) for j, name in enumerate(names)}
+    columns |= named("plant", plant.signals[:done].copy("F"))
+    columns |= named("controller", controller.signals[:done].copy("F"))
     outcome = timeline.outcome or Outcome("safe", "ended without a word", done)
     summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
     summary |= origin(scenario, date)
-    return Run(scenario, summary, columns, _known_laws(columns, bench), timeline.lines)
-
-
-def _known_laws(columns: dict[str, Rows], bench: Bench) -> list[str]:
-    """Labels of the laws that the column ``law`` may refer to: those of the scenario, and those
-    that an event made of them."""
-    labels = bench.controller.labels
-    used = int(np.nanmax(columns["law"][:], initial=-1)) + 1
-    return labels[: max(used, len(labels) - SPARE)]
+    laws = known_laws(bench.controller.labels, laws_used(columns["law"][:]))
+    return Run(scenario, summary, columns, laws, timeline.lines)

@@ -5,33 +5,28 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gfm_hil.core.roles import OUR_CONTROLLER
+from gfm_hil.core.roles import OUR_CONTROLLER, Side
+from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.log import Outcome, cause
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.recording.timing import ROUND_TRIP, count_misses
 from gfm_hil.results.doctor import verdict
-from gfm_hil.results.metrics import Rows, blocks, event_metrics
+from gfm_hil.results.metrics import event_metrics
 from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
-from gfm_plant import load_converter
 
 _BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
 _FAULTS = ("tripped", "safe")
 #: metrics of where a response ends, which a response that a trip cuts short does not have
 END_METRICS = ("p_final", "settling_s", "overshoot_pct")
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
-
-
-def nominal_frequency(scenario: Scenario) -> float:
-    """Nominal frequency of the scenario's converter, Hz."""
-    return load_converter(scenario.plant.converter).bases.omega_b / (2 * np.pi)
 
 
 def origin(scenario: Scenario, began: float) -> dict[str, Any]:
@@ -49,38 +44,29 @@ def origin(scenario: Scenario, began: float) -> dict[str, Any]:
     }
 
 
-def controlled_by(summary: Mapping[str, Any]) -> str:
-    """The laws of a run, or what a controller that is not ours calls itself."""
-    name = summary.get("controller", OUR_CONTROLLER)
-    if name == OUR_CONTROLLER:
-        return " → ".join(summary["laws"])
-    return name or "a controller that gave no name"
-
-
 def summarise(
     scenario: Scenario,
-    signals: Mapping[str, Rows],
-    timing: Mapping[str, Rows],
+    signals: Columns,
+    timing: Columns,
     log: list[dict[str, Any]],
     outcome: Outcome,
-    faults: dict[str, dict[str, int]],
+    links: Mapping[Side, dict[str, Any]],
     wall_s: float,
-    one_clock: bool = True,
-    controller: str | None = OUR_CONTROLLER,
 ) -> dict[str, Any]:
     """The summary of one run as plain data; None where the recording does not say.
 
     Args:
         scenario, outcome, log: of the run.
-        signals, timing: the columns of the files of these names, shape (ticks,): arrays, or
-            columns of a file, which are read piece by piece. A side that recorded nothing has no
-            columns.
-        faults: counts of refused frames, by side.
+        signals, timing: the columns of the files of these names, read piece by piece. A side that
+            recorded nothing has no columns.
+        links: what each side wrote about its end of the link (``link_<side>.json``), by side;
+            empty for a run in one process.
         wall_s: how long the run took, s.
-        one_clock: both sides ran on one machine.
-        controller: what the controller calls itself; None if it gave no name.
     """
     done = len(signals["tick"])
+    controller: str | None = OUR_CONTROLLER
+    for end in links.values():
+        controller = end.get("controller", OUR_CONTROLLER)
     plant, ours = "true_p" in signals, "ref_P_ref" in signals
     trips = _trips(log, outcome, done, scenario.T_s)
     changes = [e for e in log if e["event"] == "law-active"]
@@ -122,16 +108,30 @@ def summarise(
         "ticks": done,
         "duration_s": done * scenario.T_s,
         "wall_s": wall_s,
-        "misses": misses(timing, done) if plant else None,
-        "round_trip_us": round_trip(timing),
-        "faults": faults,
+        "misses": count_misses(timing, done) if plant else None,
+        "round_trip_us": _round_trip(timing, scenario.T_s),
+        "faults": {
+            side: {k: n for k, n in end["faults"].items() if n} for side, end in links.items()
+        },
+        "e2e": {side: end["e2e"] for side, end in links.items()},
         "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
         "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
         "events": events,
     }
+    injected = {side: end["injected"] for side, end in links.items() if "injected" in end}
+    if injected:
+        summary["injected"] = injected
+    one_clock = all(end["one_clock"] for end in links.values())
     if not one_clock and scenario.mode == "realtime":
         summary["clock_drift_ppm"] = clock_drift(timing, scenario.T_s)
     return summary
+
+
+def _round_trip(timing: Columns, T_s: float) -> dict[str, float] | None:
+    """Percentiles, µs; None where no u was received."""
+    if not timing.keys() >= {*ROUND_TRIP.needs}:
+        return None
+    return ROUND_TRIP.spread(timing, T_s).percentiles_us() or None
 
 
 def _trips(
@@ -163,16 +163,7 @@ def _trips(
     return found
 
 
-def misses(timing: Mapping[str, Rows], done: int) -> int:
-    """Ticks whose u had not arrived by the next deadline; 0 in lockstep, which has none."""
-    if "plant_scheduled" not in timing:
-        return 0
-    if not any((x >= 0).any() for x in blocks(timing["plant_scheduled"], 0, done)):
-        return 0
-    return sum(int(np.sum(x < 0)) for x in blocks(timing["plant_received"], 0, done))
-
-
-def clock_drift(timing: Mapping[str, Rows], T_s: float) -> float | None:
+def clock_drift(timing: Columns, T_s: float) -> float | None:
     """How fast the plant's clock runs against the controller's, ppm; None if that is unknown.
 
     The slope of the earliest arrivals: what is late was late on the way, the earliest was not.
@@ -196,45 +187,3 @@ def clock_drift(timing: Mapping[str, Rows], T_s: float) -> float | None:
     times, away_us = np.transpose(first)
     slope = np.polyfit(times, away_us, 1)[0]  # us a second: ppm
     return round(-float(slope), 3)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """How many ticks took how long: ``ns`` are the different durations in order, ``count`` how
-    many ticks took each. It takes little memory, as ticks by far outnumber durations."""
-
-    ns: NDArray[np.int64]
-    count: NDArray[np.int64]
-
-    @staticmethod
-    def between(timing: Mapping[str, Rows], begin: str, end: str) -> Spread:
-        """From one column of ``timing`` to another, over the ticks in which ``end`` happened."""
-        total: dict[str, NDArray[np.int64]] = {"ns": np.empty(0, np.int64)}
-        total["count"] = total["ns"]
-        column = timing[end]
-        whole = len(column)
-        for a, b in zip(blocks(timing[begin], 0, whole), blocks(column, 0, whole), strict=True):
-            new, many = np.unique((b - a)[b >= 0], return_counts=True)
-            ns, at = np.unique(np.concatenate([total["ns"], new]), return_inverse=True)
-            count = np.zeros(len(ns), np.int64)
-            np.add.at(count, at, np.concatenate([total["count"], many]))
-            total = {"ns": ns, "count": count}
-        return Spread(**total)
-
-    def percentile(self, q: float) -> float:
-        """The percentile of all durations as ``np.percentile`` has it, ns."""
-        behind = np.cumsum(self.count)
-        at = q / 100 * (behind[-1] - 1)
-        low, high = self.ns[np.searchsorted(behind, [np.floor(at), np.ceil(at)], side="right")]
-        return float(low + (high - low) * (at - np.floor(at)))
-
-
-def round_trip(timing: Mapping[str, Rows]) -> dict[str, float] | None:
-    """Percentiles of the time from y[k] sent to u[k] received at the plant, µs."""
-    if "plant_received" not in timing:
-        return None
-    spread = Spread.between(timing, "plant_sent", "plant_received")
-    if not len(spread.ns):
-        return None
-    marks = {"p50": 50, "p99": 99, "p99.9": 99.9, "max": 100}
-    return {name: round(spread.percentile(q) / 1e3, 2) for name, q in marks.items()}

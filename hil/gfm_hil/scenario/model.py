@@ -162,9 +162,9 @@ class Scenario(_Model):
     )
     ready_laws: list[str] = Field(
         default_factory=list,
-        description="laws made ready besides those that events name, for an operator to change to",
+        description="further laws to make ready for an operator, besides those of the events",
     )
-    compare: list[str] = Field(default_factory=list, description="laws that `compare` puts beside")
+    compare: list[str] = Field(default_factory=list, description="laws for `gfmhil compare`")
     references: References = Field(References(), description="references Y_ref at the start")
     link: Link = Field(Link(), description="how the two sides exchange frames")
     late_policy: LatePolicy = Field(

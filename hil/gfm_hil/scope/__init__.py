@@ -1,5 +1,5 @@
 """A live scope in the browser: a server that reads a run's recording, and a page that shows it.
 
-The server is a separate process. It reads the recording, to which the loop only appends, and passes
-commands to the desks of both sides; the loop is unaware of it.
+The server is a process of its own. It reads the recording, to which the loops only append, and
+passes commands to the command servers of both sides. No loop waits for it.
 """

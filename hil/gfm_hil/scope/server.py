@@ -29,7 +29,6 @@ from gfm_hil.scope.access import HEADERS, Access
 from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.record import Record
-from gfm_hil.scope.record import ready as ready_laws
 from gfm_hil.scope.session import SEND_S, Session, in_words
 from gfm_runtime.signals import group
 from gfm_runtime.states import STATES
@@ -204,20 +203,20 @@ class Scope:
         """The run's data that a page needs; no file names, only the scenario's title."""
         s = self.record.scenario
         return {
-            "title": s["title"],
+            "title": s.title,
             "live": self.record.live,
-            "commands": self.record.live and s["link"]["type"] != INPROC,
-            "mode": s["mode"],
-            "link": s["link"]["type"],
+            "commands": self.record.live and s.link.type != INPROC,
+            "mode": s.mode,
+            "link": s.link.type,
             "T_s": self.record.T_s,
             "capacity": self.record.capacity,
             "f_b": self.record.f_b,
             "channels": [channel.about() for channel in self._pyramid.channels],
             "states": STATES,
             "labels": self.record.laws,
-            "laws": ready_laws(s),
+            "laws": s.laws(),
             "limits": {r.name: [r.low, r.high] for r in group("ref")},
-            "grid_hz": s["plant"]["grid"].get("omega_g", 1.0) * self.record.f_b,
+            "grid_hz": s.plant.grid.omega_g * self.record.f_b,
         }
 
     async def _tell(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
@@ -228,7 +227,7 @@ class Scope:
         if not self.record.live:
             raise UserError("the run is over")
         if self._operator is None:
-            if self.record.scenario["link"]["type"] == INPROC:
+            if self.record.scenario.link.type == INPROC:
                 raise UserError("a run in one process (link inproc) takes no commands")
             self._operator = Operator(self.record.folder)
         return self._operator.tell(event, by)

@@ -12,7 +12,7 @@ from gfm_design.model.closed_loop import T_S
 from gfm_hil.engine.inproc import run_ticks
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import safe_reason
-from gfm_hil.recording.recorder import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import trip_reason
 from gfm_runtime.states import SAFE

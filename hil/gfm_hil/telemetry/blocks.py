@@ -16,8 +16,9 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import SIDES
-from gfm_hil.telemetry.follow import COLUMNS, TIMES, Rows
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF
+from gfm_hil.telemetry.follow import Rows
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
 _TOPIC = "gfmhil/"
@@ -39,9 +40,9 @@ class Block:
     rows: NDArray[np.void]
 
 
-def block_dtype(side: str) -> np.dtype:
+def block_dtype(side: Side) -> np.dtype:
     """The dtype of one row of a side."""
-    signals, times = COLUMNS[side], TIMES[side]
+    signals, times = SIGNALS_OF[side], TIMES_OF[side]
     return np.dtype(
         [("tick", "<i8"), *((n, "<f8") for n in signals), *((f"{n}_ns", "<i8") for n in times)]
     )
@@ -51,9 +52,9 @@ def messages(rows: Rows) -> list[list[bytes]]:
     """The messages that carry some rows."""
     whole = np.empty(len(rows.signals), block_dtype(rows.side))
     whole["tick"] = np.arange(rows.first, rows.first + len(whole))
-    for j, name in enumerate(COLUMNS[rows.side]):
+    for j, name in enumerate(SIGNALS_OF[rows.side]):
         whole[name] = rows.signals[:, j]
-    for j, name in enumerate(TIMES[rows.side]):
+    for j, name in enumerate(TIMES_OF[rows.side]):
         whole[f"{name}_ns"] = rows.times[:, j]
     out = []
     for first in range(0, len(whole), _MOST):

@@ -6,15 +6,14 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.operator import Operator
-from gfm_hil.telemetry.follow import Follower, Rows, slack_us
+from gfm_hil.recording.timing import ROUND_TRIP, SLACK, Spread
+from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_runtime.states import STATES
 
@@ -48,24 +47,22 @@ class RunCollector(Collector):
 
     def _counts(self, follower: Follower) -> Iterator[Metric]:
         ticks, misses = _metric("gfmhil_ticks_total"), _metric("gfmhil_misses_total")
-        for side, part in follower.parts.items():
-            ticks.add_metric([side], float(part.progress[0]))
+        for side in follower.run.parts:
+            ticks.add_metric([side], float(follower.run.done(side)))
             if side == "plant":
-                misses.add_metric([], float(part.progress[1]))
+                misses.add_metric([], float(follower.run.misses))
         yield ticks
         yield misses
 
     def _times(self, follower: Follower) -> Iterator[Metric]:
         """Quantiles of slack and round trip over the newest ticks; in lockstep no slack."""
-        part = follower.parts.get("plant")
-        if part is None:
+        run, T_s = follower.run, follower.T_s
+        if "plant" not in run.parts:
             return
-        done = int(part.progress[0])
-        first = max(0, done - round(_WINDOW_S / follower.T_s))
-        rows = Rows("plant", first, part.signals[:0], np.array(part.times[first:done]))
-        there = rows.time("received") >= 0
-        trips = (rows.time("received") - rows.time("sent"))[there] * 1e-9
-        slack = slack_us(rows, follower.T_s) * 1e-6
+        done = run.done("plant")
+        window = max(0, done - round(_WINDOW_S / T_s)), done
+        slack = SLACK.spread(run.columns, T_s, *window)
+        trips = ROUND_TRIP.spread(run.columns, T_s, *window)
         yield _quantiles("gfmhil_slack_seconds", slack, _SLACK)
         yield _quantiles("gfmhil_round_trip_seconds", trips, _ROUND_TRIP)
 
@@ -88,10 +85,10 @@ class RunCollector(Collector):
         with contextlib.suppress(UserError):  # no desk: in process, not open yet, or not readable
             self._operator = self._operator or Operator(follower.folder)
             seen = self._operator.snapshot()
-        part = follower.parts.get("controller")
-        if part is not None and not seen and int(part.progress[0]):
-            law, state, _ = part.signals[int(part.progress[0]) - 1, -3:].tolist()
-            seen = {"state": STATES[int(state)], "active": str(int(law))}
+        done = follower.run.done("controller")
+        if done and not seen:
+            row = follower.run.row("controller", done - 1)
+            seen = {"state": STATES[int(row["state"])], "active": str(int(row["law"]))}
         return seen
 
 
@@ -101,14 +98,10 @@ def _metric(name: str) -> CounterMetricFamily | GaugeMetricFamily:
     return kind(name, about.text, labels=[about.label] if about.label else [])
 
 
-def _quantiles(
-    name: str, values: NDArray[np.floating[Any]], quantiles: tuple[float, ...]
-) -> Metric:
+def _quantiles(name: str, found: Spread, quantiles: tuple[float, ...]) -> Metric:
     metric = _metric(name)
-    known = values[~np.isnan(values)]
-    if len(known):
-        for q, value in zip(quantiles, np.quantile(known, quantiles).tolist(), strict=True):
-            metric.add_metric([f"{q:g}"], value)
+    for q in quantiles if found else ():
+        metric.add_metric([f"{q:g}"], found.percentile(100 * q) * 1e-9)
     return metric
 
 

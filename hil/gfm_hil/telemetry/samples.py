@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.telemetry.follow import COLUMNS, Rows, missed, slack_us
+from gfm_hil.recording.columns import SIGNALS_OF
+from gfm_hil.recording.timing import SLACK, missed
+from gfm_hil.telemetry.follow import Rows
 
 _GROUPS = ("y", "u", "true", "ref")  # prefixes that become objects
 
@@ -25,7 +27,7 @@ def _place(column: str) -> tuple[str, str]:
     return (group, rest) if group in _GROUPS else ("", column)
 
 
-_PLACES = {side: [_place(name) for name in names] for side, names in COLUMNS.items()}
+_PLACES = {side: [_place(name) for name in names] for side, names in SIGNALS_OF.items()}
 
 
 class Sampler:
@@ -55,9 +57,9 @@ class Sampler:
         every = self._every * max(1, faster)
         plant, out, begin = rows.side == "plant", [], 0
         if plant:
-            misses = self._misses + np.cumsum(missed(rows))
+            misses = self._misses + np.cumsum(missed(rows.columns))
             self._misses = int(misses[-1])
-            slack = slack_us(rows, self.T_s)
+            slack = SLACK.us(rows.columns, self.T_s)
         for k in range(-rows.first % every, len(rows.signals), every):
             values = rows.signals[k].tolist()
             if math.isnan(values[0]):  # a tick whose frame was lost

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.recording.columns import unit_of
 from gfm_hil.results.metrics import dominant_oscillation
-from gfm_hil.testing.signals import unit
 
 Vector = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class Window:
 
     def show(self, value: float) -> str:
         """A value with its unit."""
-        return f"{value:.4g}{unit(self.name)}"
+        return f"{value:.4g} {unit_of(self.name)}".rstrip()
 
 
 @dataclass(frozen=True)

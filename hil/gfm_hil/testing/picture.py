@@ -13,11 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from gfm_hil.recording.columns import unit_of
 from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
 from gfm_hil.results.run import Run
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.testing.checks import Finding
-from gfm_hil.testing.signals import unit
 
 _BLUE, _RED, _GREEN, *_ = COLOURS
 _CONTEXT = ("p", "f_hz", "V", "i", "v_dc")  # the first four that are not the signal itself
@@ -82,8 +82,7 @@ def draw(
 
 def draw_times(path: Path, run: Run, scenario: Scenario) -> None:
     """Draw when a run in real time was late, as in its report."""
-    with np.load(run.file("timing.npz")) as timing:
-        draw_timing(path.parent, scenario, dict(timing), run.summary).rename(path)
+    draw_timing(path.parent, scenario, run.timing, run.summary).rename(path)
 
 
 def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:
@@ -91,7 +90,7 @@ def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:
     follows = _FOLLOWS.get(name, "")
     if follows in signals:
         curves.append((signals["t"], signals[follows], "#888888", follows.removeprefix("ref_")))
-    draw_panel(axes, f"{name} [{unit(name).strip() or '1'}]", curves)
+    draw_panel(axes, f"{name} [{unit_of(name) or '1'}]", curves)
 
 
 def _band(axes: Axes, finding: Finding, x: NDArray[Any]) -> None:

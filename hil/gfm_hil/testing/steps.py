@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.run import Run, Signals
+from gfm_hil.recording.run import Signals
+from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.testing.plan import Plan
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
-from gfm_hil.testing.signals import same
 from gfm_runtime.signals import REF_NAMES
 
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
@@ -184,7 +187,7 @@ class Steps:
         )
         if run.summary["reason"] == "stopped by the operator":
             raise KeyboardInterrupt
-        if before is not None and not same(before.signals, run.signals):
+        if before is not None and not _same(before.signals, run.signals):
             raise UserError(
                 "the same steps gave another run: a controller that does not repeat itself must be "
                 f"asked for results only at the end ({before.folder}, {run.folder})"
@@ -199,3 +202,13 @@ class Steps:
     def _begun(self) -> Plan:
         self.start()
         return self._plan
+
+
+def _same(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether both hold the same values as far as the shorter one goes."""
+    length = min(len(one["tick"]), len(other["tick"]))
+    return all(
+        np.array_equal(one[name][:length], other[name][:length], equal_nan=True)
+        for name in one
+        if name in other
+    )

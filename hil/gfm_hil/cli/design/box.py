@@ -54,7 +54,7 @@ def call(options: argparse.Namespace) -> int:
             worst = points[k].loop(options.law).modes()[0]
             rows.append(row | {"mode_hz": worst.frequency_hz})
         gamma = _gamma(file, dc)
-        rows.append(_row(dc, "gamma beside this source", 1, gamma["gamma"], Point(dc=dc)))
+        rows.append(_row(dc, "gamma with this source", 1, gamma["gamma"], Point(dc=dc)))
         nominal = Point(dc=dc)
         margin = overall_delay(nominal.loop(options.law)).seconds
         rows.append(_row(dc, "delay margin [s]", 1, margin, nominal))

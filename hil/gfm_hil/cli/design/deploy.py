@@ -73,12 +73,12 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _demands(demands: Wanted) -> dict[str, float]:
-    """Those that count: beside one source alone nothing is relaxed."""
+    """The demands in force: with a single source none is relaxed."""
     both = demands.rig_alpha is not None
     return {k: v for k, v in asdict(demands).items() if both or not k.startswith("rig_")}
 
 
-def _beside(box: Box) -> str:
+def _source(box: Box) -> str:
     return "" if len(set(box.dc)) > 1 else f", DC source {box.dc[0]}"
 
 
@@ -94,7 +94,7 @@ def _write(
     content = file.model_dump(mode="json", exclude_none=True)
     content |= {
         "name": path.stem,
-        "title": f"the paper's MIMO-GFM, gains that hold in the real loop{_beside(box)}",
+        "title": f"the paper's MIMO-GFM, gains that hold in the real loop{_source(box)}",
         "source": "Eq. (36); gains by gfmhil design deploy, see the comments of the file\n",
     }
     for name, value in gains.items():

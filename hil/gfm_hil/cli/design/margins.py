@@ -15,7 +15,8 @@ from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.results.loop_delay import check_run, read_loop_delay
+from gfm_hil.recording.run import RecordedRun
+from gfm_hil.results.loop_delay import loop_delay
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
 from gfm_hil.studies.margin_figures import draw_delay, draw_region
@@ -39,8 +40,9 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Report the margins; exit code 3 for an unstable loop, which has none."""
+    run = None
     if options.run is not None:
-        check_run(options.run)
+        run = RecordedRun.load(options.run)
         scenario = load_scenario(str(options.run / "scenario.toml"), law=options.law)
     else:
         scenario = load_scenario(options.scenario, law=options.law)
@@ -58,11 +60,7 @@ def call(options: argparse.Namespace) -> int:
         return EXIT_OTHERWISE
     margin = found.loop.delay.seconds
     set_s = float(loop.u_delay[0])
-    measured = (
-        read_loop_delay(options.run, set_s, scenario.T_s, margin)
-        if options.run is not None
-        else None
-    )
+    measured = None if run is None else loop_delay(run, set_s, margin)
     region = _draw(options.figures, loop, label, margin) if options.figures else None
     if options.json:
         content = {"law": label, "scenario": scenario.title, "stable": True}

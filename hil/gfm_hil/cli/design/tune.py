@@ -39,7 +39,7 @@ def add(kinds: Any) -> None:
         help="the given start and random ones; 6, and one more a gain, if left out",
     )
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
-    command.add_argument("--full-order", action="store_true", help="a bound from below besides")
+    command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
     command.add_argument("--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.set_defaults(call=call)

@@ -50,7 +50,7 @@ subrate_dtype = np.dtype(
         ("next", "u1", (_ROOM,)),
         # the plant
         ("due", "i8"),  # tick for which it needs a command
-        ("asked", "i8"),  # newest tick for which it sent y
+        ("asked", "i8"),  # newest tick of its measurements
         ("again", "i8"),  # commands received again
         ("given", "i8"),  # sequence of the last frame given to the reader
         ("ticks", "i8", (_KEPT + 1,)),  # tick of each stored command; NOTHING: free

@@ -11,7 +11,6 @@ not the words that end a run. All that is on a bus is for a logger on that bus, 
 from __future__ import annotations
 
 import heapq
-import tomllib
 from bisect import bisect_right
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +26,7 @@ from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.vectors import PARTS, CanFrame, encode, sender_dtype, set_sender
 from gfm_hil.links.can.wire import frame_dtype
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.results.export.table import RunTable
+from gfm_hil.recording.run import RecordedRun
 from gfm_runtime.signals import Group, names
 from gfm_runtime.states import INIT, PLANT_TRIP, REASONS, SAFE
 
@@ -37,11 +36,11 @@ _PIECE = 1 << 16  # ticks
 Timed = tuple[float, CanFrame]
 
 
-def write_blf(table: RunTable, file: Path) -> None:
+def write_blf(run: RecordedRun, file: Path) -> None:
     """Write a run; times are of each sender's clock since tick 0, in lockstep those of the run."""
-    options = can_options(table)
+    options = can_options(run)
     with can.BLFWriter(file) as writer:
-        for t, (number, payload) in can_frames(table, options):
+        for t, (number, payload) in can_frames(run, options):
             writer.on_message_received(
                 can.Message(
                     timestamp=t, arbitration_id=number, data=payload, is_extended_id=False,
@@ -50,33 +49,33 @@ def write_blf(table: RunTable, file: Path) -> None:
             )  # fmt: skip
 
 
-def dbc_text(table: RunTable) -> str:
+def dbc_text(run: RecordedRun) -> str:
     """The DBC by which the frames are to be read."""
-    options = can_options(table)
+    options = can_options(run)
     if options.dbc is None:
         return write_dbc(options.fd)
     return Path(options.dbc).read_text(encoding="utf-8")
 
 
-def can_options(table: RunTable) -> CanOptions:
+def can_options(run: RecordedRun) -> CanOptions:
     """The run's own if it went over CAN, else the link's defaults."""
-    link = tomllib.loads(table.text("scenario.toml")).get("link", {})
-    return CanOptions(**link.get("options", {})) if link.get("type") == "can" else CanOptions()
+    link = run.scenario.link
+    return CanOptions(**link.options) if link.type == "can" else CanOptions()
 
 
-def can_frames(table: RunTable, options: CanOptions) -> Iterator[Timed]:
+def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
     """The frames of both sides in the order of their times.
 
     Raises:
         UserError: a side did not record, or the DBC is not to be had.
     """
-    if not {"y_p", "state"} <= set(table.values):
-        raise UserError(f"{table.folder}: holds the recording of one side; frames need both")
+    if not {"y_p", "state"} <= set(run.recorded):
+        raise UserError(f"{run.folder}: holds the recording of one side; frames need both")
     try:
         plan = load_plan(options)
     except ValueError as problem:
         raise UserError(f"link.options.{problem}") from None
-    sides = _measurements(table, options, plan), _commands(table, options, plan)
+    sides = _measurements(run, options, plan), _commands(run, options, plan)
     return heapq.merge(*sides, key=lambda timed: timed[0])
 
 
@@ -104,12 +103,12 @@ class _Sender:
         return [(int(f["id"]), f["data"][: f["length"]].tobytes()) for f in self._frames[:count]]
 
 
-def _measurements(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
+def _measurements(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
-    sender, clock = _Sender(plan, "y", options.heartbeat), _Clock(table, "plant")
-    for first, last in _pieces(table):
-        rows, times = _vector(table, "y", first, last), clock.times(first, last)
-        tripped = table.values["true_trip"][first:last] != 0
+    sender, clock = _Sender(plan, "y", options.heartbeat), _Clock(run, "plant")
+    for first, last in _pieces(run):
+        rows, times = _vector(run, "y", first, last), clock.times(first, last)
+        tripped = run.recorded["true_trip"][first:last] != 0
         for k, row in enumerate(rows, first):
             state, reason = (SAFE, PLANT_TRIP) if tripped[k - first] else (INIT, 0)
             sender.pack(k, state, reason, row)
@@ -117,17 +116,17 @@ def _measurements(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[
                 yield from ((times[k - first], frame) for frame in sender.frames())
 
 
-def _commands(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Timed]:
+def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The controller's: an answer to every vector that it got.
 
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
     """
     sender, n = _Sender(plan, "u", options.heartbeat), options.every
-    clock, reasons = _Clock(table, "controller"), _SafeReasons(table)
-    for first, last in _pieces(table):
-        times, state = clock.times(first, last), table.values["state"][first:last]
+    clock, reasons = _Clock(run, "controller"), _SafeReasons(run)
+    for first, last in _pieces(run):
+        times, state = clock.times(first, last), run.recorded["state"][first:last]
         beyond = last + n  # u[k] may be taken as late as that
-        rows, taken = _vector(table, "u", first, beyond), _taken(table, first, beyond)
+        rows, taken = _vector(run, "u", first, beyond), _taken(run, first, beyond)
         for j in np.flatnonzero(~np.isnan(state)).tolist():
             k = first + j
             at = j + n if n > 1 and k else j
@@ -141,34 +140,34 @@ def _commands(table: RunTable, options: CanOptions, plan: Plan) -> Iterator[Time
                     yield from ((times[j], frame) for frame in frames)
 
 
-def _pieces(table: RunTable) -> Iterator[tuple[int, int]]:
+def _pieces(run: RecordedRun) -> Iterator[tuple[int, int]]:
     """The ticks of a run, first and last of a piece that is held in memory."""
-    return ((a, min(a + _PIECE, table.ticks)) for a in range(0, table.ticks, _PIECE))
+    return ((a, min(a + _PIECE, run.ticks)) for a in range(0, run.ticks, _PIECE))
 
 
-def _vector(table: RunTable, group: Group, first: int, last: int) -> NDArray[np.float64]:
+def _vector(run: RecordedRun, group: Group, first: int, last: int) -> NDArray[np.float64]:
     """Rows of a vector, shape (ticks, n), p.u."""
-    return np.column_stack([table.values[f"{group}_{n}"][first:last] for n in names(group)])
+    return np.column_stack([run.recorded[f"{group}_{n}"][first:last] for n in names(group)])
 
 
-def _taken(table: RunTable, first: int, last: int) -> NDArray[np.bool_]:
+def _taken(run: RecordedRun, first: int, last: int) -> NDArray[np.bool_]:
     """Ticks at which the plant took a command in time; in process it always does."""
-    received = table.values.get("plant_received", table.values["tick"])
+    received = run.recorded.get("plant_received", run.recorded["tick"])
     return received[first:last] >= 0
 
 
 class _Clock:
     """When a side sent its frame of each tick, s from tick 0."""
 
-    def __init__(self, table: RunTable, side: str) -> None:
-        self._t = table.values["t"] if table.summary["mode"] == "lockstep" else None
+    def __init__(self, run: RecordedRun, side: str) -> None:
+        self._t = run.recorded["t"] if run.summary["mode"] == "lockstep" else None
         if self._t is None:
-            self._sent, due = table.values[f"{side}_sent"], table.values[f"{side}_scheduled"]
-            for first, last in _pieces(table):
+            self._sent, due = run.recorded[f"{side}_sent"], run.recorded[f"{side}_scheduled"]
+            for first, last in _pieces(run):
                 known = np.flatnonzero(due[first:last] >= 0)
                 if len(known):
                     k = first + int(known[0])
-                    self._begin = int(due[k : k + 1][0]) - round(k * table.summary["T_s"] * 1e9)
+                    self._begin = int(due[k : k + 1][0]) - round(k * run.summary["T_s"] * 1e9)
                     break
 
     def times(self, first: int, last: int) -> NDArray[np.float64]:
@@ -181,11 +180,9 @@ class _Clock:
 class _SafeReasons:
     """Codes of the reasons for which the controller was in SAFE; the log has them in words."""
 
-    def __init__(self, table: RunTable) -> None:
+    def __init__(self, run: RecordedRun) -> None:
         said = [
-            line
-            for line in table.events
-            if "controller" in line.get("side", "") and "reason" in line
+            line for line in run.events if "controller" in line.get("side", "") and "reason" in line
         ]
         self._ticks = [line["tick"] for line in said]
         self._codes = [0, *(self._code(line["reason"]) for line in said)]

@@ -11,7 +11,7 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing, write_text
-from gfm_hil.results.export.table import load_run
+from gfm_hil.recording.run import RecordedRun
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Format:
 
     Attributes:
         text: what it is.
-        writer: function that writes a table to a file, as module:name in this package.
+        writer: function that writes a run to a file, as module:name in this package.
         needs: package that this takes.
         beside: ending of a second file that the first is read by, and the function of its text.
     """
@@ -66,16 +66,16 @@ def export_run(folder: Path, name: str, file: Path) -> list[Path]:
         UserError: no run, no such format, or the file cannot be written.
     """
     check_format(name)
-    table, form = load_run(folder), FORMATS[name]
+    run, form = RecordedRun.load(folder), FORMATS[name]
     written = [file]
     try:
         with replacing(file) as part:
             part.touch()  # the packages say it each in its own way
-            _function(form.writer)(table, part)
+            _function(form.writer)(run, part)
             if form.beside is not None:
                 suffix, text = form.beside
                 written.append(file.with_suffix(suffix))
-                write_text(written[-1], _function(text)(table))
+                write_text(written[-1], _function(text)(run))
     except OSError as problem:
         raise UserError(f"{file}: {problem.strerror or problem}") from None
     return written

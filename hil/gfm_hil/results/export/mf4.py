@@ -13,8 +13,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from gfm_hil.results.export.columns import Described
-from gfm_hil.results.export.table import RunTable, event_text
+from gfm_hil.recording.columns import Described
+from gfm_hil.recording.log import event_text
+from gfm_hil.recording.run import RecordedRun
 
 _ROWS = 1 << 17  # handed over at a time
 _ATTACHED = {
@@ -24,7 +25,7 @@ _ATTACHED = {
 }
 
 
-def write_mf4(table: RunTable, file: Path) -> None:
+def write_mf4(run: RecordedRun, file: Path) -> None:
     """Write a run."""
     from asammdf import MDF, Signal
 
@@ -38,20 +39,20 @@ def write_mf4(table: RunTable, file: Path) -> None:
             conversion=_words(c.words),
         )
 
-    channels = [c for c in table.columns if c.name != "t"]  # the group's master
-    began = (table.folder / "scenario.toml").stat().st_mtime  # written as the run is started
+    channels = [c for c in run.described if c.name != "t"]  # the group's master
+    began = run.file("scenario.toml").stat().st_mtime  # written as the run is started
     with MDF(version="4.11") as mdf:
         mdf.start_time = datetime.fromtimestamp(began, UTC)
-        empty = {name: x[:0] for name, x in table.values.items()}
-        for first, rows in table.blocks(_ROWS) if table.ticks else [(0, empty)]:
+        empty = {name: x[:0] for name, x in run.recorded.items()}
+        for first, rows in run.blocks(_ROWS) if run.ticks else [(0, empty)]:
             if first:  # asammdf keeps what was appended in a file of its own
                 mdf.extend(0, [(rows["t"], None), *((rows[c.name], None) for c in channels)])
             else:
                 signals = [signal(c, rows) for c in channels]
-                mdf.append(signals, comment=table.summary["title"], common_timebase=True)
-        mdf.events = [_event(event, table.summary["T_s"]) for event in table.events]
+                mdf.append(signals, comment=run.summary["title"], common_timebase=True)
+        mdf.events = [_event(event, run.summary["T_s"]) for event in run.events]
         for name, mime in _ATTACHED.items():
-            mdf.attach(table.text(name).encode(), name, mime=mime)
+            mdf.attach(run.text(name).encode(), name, mime=mime)
         mdf.save(file, overwrite=True, compression=2)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compiled_bench
 from gfm_hil.engine.inproc import buffers
-from gfm_hil.recording.recorder import Part
+from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import Campaign

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.engine.inproc import buffers
-from gfm_hil.recording.recorder import PLANT_COLUMNS
+from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
 from gfm_hil.studies.campaign.worker import simulate
 

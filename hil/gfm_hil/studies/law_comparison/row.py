@@ -24,7 +24,7 @@ from gfm_runtime import law_file
 #: laws without a row, and why
 LEFT_OUT = {
     "mimo-gfm-scheduled": "on the paper's grid its first stage is in force, which is mimo-gfm",
-    "mimo-gfm-deployable-rig": "beside a source that regulates itself; its row 1 is the paper's",
+    "mimo-gfm-deployable-rig": "for a regulated source; its row 1 is the paper's",
 }
 
 Row = dict[str, Any]

@@ -1,0 +1,205 @@
+"""The one table of what a run records: each column's name, symbol, unit and meaning.
+
+The signal table says what measurements, commands and references are; this table adds what the
+plant itself, the controller and the two clocks record. Export files, figures, the scope, streams,
+data frames and the documentation take names and units from here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Side
+from gfm_plant import TRUTH
+from gfm_plant.names import TRIP_REASONS
+from gfm_runtime.signals import REF_NAMES, SIGNALS, U_NAMES, Y_NAMES
+from gfm_runtime.states import STATES
+
+PLANT_COLUMNS = (
+    *(f"y_{n}" for n in Y_NAMES),
+    *(f"u_{n}" for n in U_NAMES),
+    *(f"true_{n}" for n in TRUTH),
+)
+CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
+# ns of CLOCK_MONOTONIC, -1: never; in lockstep a sample late, an answer is "received" at the look
+# that finds the next frame "sent"; "stall" is the longest gap between two looks at the clock
+PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
+CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
+
+SIGNALS_OF: dict[Side, tuple[str, ...]] = {
+    "plant": PLANT_COLUMNS,
+    "controller": CONTROLLER_COLUMNS,
+}
+TIMES_OF: dict[Side, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
+BYTES_PER_TICK = 8 * sum(map(len, [*SIGNALS_OF.values(), *TIMES_OF.values()]))
+
+PIECE = 1 << 18  # ticks of a column that a reader holds in memory at a time
+
+
+class Rows(Protocol):
+    """A column, shape (ticks,): an array, or a column of a file of which only slices are read."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, rows: slice, /) -> Any: ...
+
+
+Columns = Mapping[str, Rows]  #: columns of a run by name, all of the same length
+
+
+def pieces(column: Rows, first: int, last: int) -> Iterator[Any]:
+    """Rows [first, last) of a column, at most ``PIECE`` at a time, so that memory is bounded."""
+    return (column[a : min(a + PIECE, last)] for a in range(first, last, PIECE))
+
+
+class Shown(NamedTuple):
+    """How people read a column: symbol, unit, and by what to multiply what is recorded."""
+
+    symbol: str
+    unit: str
+    factor: float
+
+
+@dataclass(frozen=True)
+class Described:
+    """One row of the table.
+
+    Attributes:
+        name: of the column in the run folder.
+        symbol: as printed, LaTeX; empty for codes and times.
+        unit: of what is recorded, with the base of a per-unit value; empty for codes.
+        quantity: what it is, in a few words.
+        origin: who recorded it, in a few words; empty if ``quantity`` says it all.
+        words: what the values of a code mean.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    quantity: str
+    origin: str = ""
+    words: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def comment(self) -> str:
+        """``quantity`` and ``origin`` in one line."""
+        return f"{self.quantity}, {self.origin}" if self.origin else self.quantity
+
+    def shown(self, f_n: float) -> Shown:
+        """A frequency in Hz (``f_n`` is nominal), an angle in degrees, the rest as recorded."""
+        signal = self.name.partition("_")[2] or self.name
+        if self.unit == "p.u. (omega_n)":
+            return Shown("f_g" if signal == "omega_g" else "f", "Hz", f_n)
+        if self.unit == "rad":
+            return Shown("δ", "°", math.degrees(1.0))
+        return Shown(signal, self.unit.partition(" (")[0], 1.0)
+
+
+_SENSOR, _COMMAND, _REFERENCE, _TRUE = (
+    "as the A/D reads it", "command in hand at this tick", "reference in force",
+    "of the plant itself",
+)  # fmt: skip
+_TIMES = {
+    "scheduled": "deadline at which the tick begins",
+    "woke": "when the tick began",
+    "sent": "when the frame was handed to the link",
+    "received": "when the frame of this tick was taken from the link",
+    "computed": "when u was computed",
+    "stall": "longest gap between two looks at the clock",
+}
+
+
+def _signals(prefix: str, groups: tuple[str, ...], origin: str) -> list[Described]:
+    """The rows of the signal table's groups, as columns with a prefix."""
+    return [
+        Described(f"{prefix}_{s.name}", s.symbol, f"{s.unit} ({s.base})", s.description, origin)
+        for s in SIGNALS
+        if s.group in groups
+    ]
+
+
+def _time(side: Side, name: str) -> Described:
+    clock = "" if name == "stall" else f"CLOCK_MONOTONIC of the {side}, -1: never; "
+    return Described(f"{side}_{name}", "", "ns", f"{clock}{_TIMES[name]}")
+
+
+def _table() -> dict[str, Described]:
+    rows = [
+        Described("tick", "k", "", "number of the tick"),
+        Described("t", "t", "s", "time of the run, tick × T_s"),
+        *_signals("y", ("y",), _SENSOR),
+        *_signals("u", ("u",), _COMMAND),
+        *_signals("true", ("y", "d"), _TRUE),
+        Described(
+            "true_i", r"\lvert i_{dq} \rvert", "p.u. (S_n/V_n)",
+            "magnitude of the current of L_f", _TRUE,
+        ),
+        Described(
+            "true_delta", r"\delta", "rad",
+            "angle of the converter's frame ahead of the grid's", _TRUE,
+        ),
+        Described("true_i_dc", "i_{dc}", "p.u. (S_n/V_dcref)", "current of the DC source", _TRUE),
+        Described(
+            "true_trip", "", "", "what has tripped", _TRUE, tuple(TRIP_REASONS.items())
+        ),
+        *_signals("ref", ("ref",), _REFERENCE),
+        Described("law", "", "", "law in force"),  # index into `laws` of signals.npz
+        Described("state", "", "", "state of the controller", "", tuple(enumerate(STATES))),
+        Described(
+            "X_est", "X_{est}", "p.u. (Z_b)", "grid reactance as a scheduled law estimates it"
+        ),
+        *(_time(side, name) for side, times in TIMES_OF.items() for name in times),
+    ]  # fmt: skip
+    found = {row.name: row for row in rows}
+    times = [f"{side}_{name}" for side, names in TIMES_OF.items() for name in names]
+    return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *times)}
+
+
+TABLE = _table()
+"""Every column that a recording may have by its name, in the order of the files."""
+
+HERTZ = "f_hz"
+"""The converter's frequency in Hz, which is derived: true_omega_u times the nominal frequency."""
+
+
+def describe(name: str, laws: list[str]) -> Described:
+    """A column of signals.npz or timing.npz, by its name there.
+
+    Args:
+        name: of the column.
+        laws: labels of the run's laws, in the order of the recording's indices.
+
+    Raises:
+        UserError: there is no such column.
+    """
+    if name not in TABLE:
+        raise UserError(f"column {name!r}: is none of a recording; there are {[*TABLE]}")
+    row = TABLE[name]
+    return replace(row, words=tuple(enumerate(laws))) if name == "law" else row
+
+
+def unit_of(name: str) -> str:
+    """The unit of a signal by a column's name, by the bare name of one of the plant's own, or
+    ``f_hz``; per unit without its base, and empty for codes."""
+    if name == HERTZ:
+        return "Hz"
+    row = TABLE.get(name) or TABLE[f"true_{name}"]
+    return row.unit.partition(" (")[0]
+
+
+def named(
+    side: Side, signals: NDArray[Any], times: NDArray[Any] | None = None
+) -> dict[str, NDArray[Any]]:
+    """A side's arrays, shape (ticks, columns) each, as views of shape (ticks,) by column name."""
+    found = {name: signals[:, j] for j, name in enumerate(SIGNALS_OF[side])}
+    if times is not None:
+        found |= {f"{side}_{name}": times[:, j] for j, name in enumerate(TIMES_OF[side])}
+    return found

@@ -1,0 +1,88 @@
+"""A run that is going on: what both sides have recorded so far, read as they append to it.
+
+Reading takes nothing from the loops, which only ever append rows to files that are mapped.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.recording.columns import SIGNALS_OF, Columns, named
+from gfm_hil.recording.parts import Part
+from gfm_runtime.toml_file import read_toml
+
+
+class LiveRun:
+    """The recording of a run as it grows. A side that has not begun to record has no ticks; it is
+    found when it has.
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._parts: dict[Side, Part] = {}
+        self._columns: dict[str, NDArray[Any]] = {}
+
+    @cached_property
+    def T_s(self) -> float:
+        """The sampling time, s.
+
+        Raises:
+            UserError: scenario.toml does not say it.
+        """
+        try:
+            T_s = read_toml(self.folder / "scenario.toml")["T_s"]
+            if not isinstance(T_s, float) or not 0 < T_s < math.inf:
+                raise ValueError(f"T_s = {T_s!r}: must be a number of seconds")
+        except (ValueError, KeyError) as problem:
+            raise UserError(f"{self.folder}: scenario.toml: {problem}") from None
+        return T_s
+
+    @property
+    def parts(self) -> dict[Side, Part]:
+        """The arrays of the sides that have begun to record."""
+        for side in SIDES:
+            if side not in self._parts and (part := Part.open(self.folder, side)) is not None:
+                self._parts[side] = part
+                self._columns = {**self._columns, **named(side, part.signals, part.times)}
+        return self._parts
+
+    @property
+    def columns(self) -> Columns:
+        """Every column of the sides that have begun to record, under the names of signals.npz and
+        timing.npz; only rows of ticks that are done have a meaning."""
+        return self._columns if self.parts else {}
+
+    def done(self, side: Side) -> int:
+        """How many ticks a side has recorded."""
+        part = self.parts.get(side)
+        return 0 if part is None else int(part.progress[0])
+
+    def row(self, side: Side, tick: int) -> dict[str, float]:
+        """What a side recorded in a tick that is done, by column, without its times."""
+        return dict(zip(SIGNALS_OF[side], self.parts[side].signals[tick].tolist(), strict=True))
+
+    @property
+    def misses(self) -> int:
+        """Ticks so far without a fresh u at the plant, as the plant counts them."""
+        return int(self.parts["plant"].progress[1]) if self.done("plant") else 0
+
+    @property
+    def safe_reason(self) -> int:
+        """Why the controller is in SAFE, index into ``gfm_runtime.states.REASONS``."""
+        return int(self.parts["controller"].progress[1]) if self.done("controller") else 0
+
+
+def begun(folder: Path) -> bool:
+    """Whether a side of a run has begun to record there, and it is known what."""
+    recorded = any((folder / f"parts/{side}_progress.npy").is_file() for side in SIDES)
+    return recorded and (folder / "scenario.toml").is_file()

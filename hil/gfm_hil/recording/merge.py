@@ -1,0 +1,102 @@
+"""Making signals.npz and timing.npz of the parts that the sides left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, SIGNALS_OF, TIMES_OF
+from gfm_hil.recording.npz import BLOCK, Table, write_npz
+from gfm_hil.recording.parts import Part
+from gfm_runtime.assembly import SPARE
+from gfm_runtime.signals import NY
+
+
+def _rows(file: Path, first: int, last: int) -> NDArray[Any]:
+    """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
+    return np.ascontiguousarray(np.load(file, mmap_mode="r")[first:last].T)
+
+
+def _blocks(rows: int) -> Iterator[tuple[int, int]]:
+    return ((first, min(first + BLOCK, rows)) for first in range(0, rows, BLOCK))
+
+
+def _recorded(file: Path, ticks: int) -> int:
+    """Ticks up to the last one that was recorded."""
+    for first, last in reversed([*_blocks(ticks)]):
+        rows = np.flatnonzero(~np.isnan(_rows(file, first, last)[NY]))  # written last by a plant
+        if len(rows):
+            return first + int(rows[-1]) + 1
+    return 0
+
+
+def merge(folder: Path, T_s: float, laws: list[str]) -> None:
+    """Write signals.npz and timing.npz from the parts, which stay.
+
+    Rows end where the plant's recording does (where it is missing, the controller's). Each part
+    is read once; memory is that of a few blocks of rows.
+
+    Raises:
+        OSError: a file cannot be written; it is then not there.
+    """
+    parts = {side: part for side in SIDES if (part := Part.open(folder, side)) is not None}
+    files = {side: folder / "parts" / f"{side}_signals.npy" for side in parts}
+    counts = {side: _recorded(files[side], len(part.signals)) for side, part in parts.items()}
+    done = counts.get("plant") or counts.get("controller", 0)
+    write_npz(folder / "signals.npz", _signals(files, done, T_s, laws))
+    write_npz(folder / "timing.npz", _timing(folder / "parts", [*parts], done))
+
+
+def _signals(files: dict[Side, Path], done: int, T_s: float, laws: list[str]) -> Iterator[Table]:
+    kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
+
+    def clock(first: int, last: int) -> list[NDArray[Any]]:
+        ticks = np.arange(first, last)
+        return [ticks, ticks * T_s]
+
+    yield Table(kinds, done, clock)
+    used = 0
+
+    def rows(file: Path, law: int | None) -> Callable[[int, int], NDArray[Any]]:
+        def read(first: int, last: int) -> NDArray[Any]:
+            nonlocal used
+            found = _rows(file, first, last)
+            if law is not None:
+                used = max(used, laws_used(found[law]))
+            return found
+
+        return read
+
+    if "plant" in files:
+        kinds = dict.fromkeys(SIGNALS_OF["plant"], np.dtype(float))
+        yield Table(kinds, done, rows(files["plant"], None))
+    if "controller" in files:
+        kinds = dict.fromkeys(CONTROLLER_COLUMNS, np.dtype(float))
+        yield Table(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
+    yield Table.of(laws=np.array(known_laws(laws, used)))
+
+
+def _timing(parts: Path, sides: list[Side], done: int) -> Iterator[Table]:
+    """The times of each side that recorded some."""
+    for side, names in TIMES_OF.items():
+        file = parts / f"{side}_times.npy"
+        if side in sides and any((_rows(file, a, b) >= 0).any() for a, b in _blocks(done)):
+            kinds = {f"{side}_{name}": np.dtype(np.int64) for name in names}
+            yield Table(kinds, done, partial(_rows, file))
+
+
+def laws_used(indices: NDArray[Any]) -> int:
+    """The highest index in a column ``law``, plus one; the column is NaN where nothing ran."""
+    return int(np.nanmax(indices, initial=-1)) + 1
+
+
+def known_laws(labels: list[str], used: int) -> list[str]:
+    """The labels of the scenario's laws and of those that events have made of them: a controller
+    has room for more, which nothing refers to."""
+    return labels[: max(used, len(labels) - SPARE)]

@@ -1,0 +1,199 @@
+"""The parts of a run: what each side records, on disk or in memory, from the first tick on.
+
+A side's rows are arrays that are memory-mapped files in the run folder: what it has written
+survives the process, however that ends. In real time the files lie in memory until they are merged.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.recording.columns import BYTES_PER_TICK, SIGNALS_OF, TIMES_OF
+
+_MEMORY = Path("/dev/shm")
+_PREFIX = "gfmhil-parts-"
+_FILES = frozenset(f"{s}_{what}.npy" for s in SIDES for what in ("signals", "times", "progress"))
+_HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
+_holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
+
+
+@dataclass
+class Part:
+    """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
+    ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress``
+    (ticks done; plant: misses, controller: why it is in SAFE) for those who watch."""
+
+    signals: NDArray[np.float64]
+    times: NDArray[np.int64]
+    progress: NDArray[np.int64]
+
+    @staticmethod
+    def create(folder: Path, side: Side, ticks: int) -> Part:
+        """New files in ``folder``/parts, filled so that no page is first touched in the loop."""
+        columns, times = SIGNALS_OF[side], TIMES_OF[side]
+        parts = folder / "parts"
+        parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
+
+        def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
+            path = parts / f"{side}_{what}.npy"
+            try:
+                array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+                with path.open("r+b") as file:  # a page that is not to be had would end the process
+                    os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+            except OSError as problem:
+                raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
+            array[:] = fill
+            return np.asarray(array)  # a memmap's own indexing costs microseconds
+
+        return Part(
+            mapped("signals", "f8", (ticks, len(columns)), np.nan),
+            mapped("times", "i8", (ticks, len(times)), -1),
+            mapped("progress", "i8", (2,), 0),
+        )
+
+    @staticmethod
+    def open(folder: Path, side: Side) -> Part | None:
+        """The files of a side as they are, or None if that side never came so far, or one of them
+        is damaged."""
+        try:
+            arrays: list[NDArray[Any]] = [
+                np.asarray(np.load(folder / "parts" / f"{side}_{what}.npy", mmap_mode="r"))
+                for what in ("signals", "times", "progress")
+            ]
+        except Exception:  # not there, or just being made; numpy has no common base for its errors
+            return None
+        signals, times, progress = arrays
+        columns, names = SIGNALS_OF[side], TIMES_OF[side]
+        kinds = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
+        widths = (signals.shape[1:], times.shape[1:]) == ((len(columns),), (len(names),))
+        whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)
+        return Part(*arrays) if whole and 0 <= progress[0] <= len(signals) else None
+
+
+def keep_in_memory(
+    folder: Path, ticks: int, notice: Callable[[str], None] = lambda text: None
+) -> None:
+    """Have the parts of a run lie in memory until they are merged, if there is room.
+
+    A page of a file on a disk is write-protected while it is written back: a loop that touches it
+    waits for the disk. ``folder``/parts becomes a link. Every process of the run calls this, and
+    then holds the place until it removes the parts or ends. What a run whose processes were
+    all killed has left is first moved to its own folder, or stays, and ``notice`` is told where:
+    nothing recorded is lost.
+
+    Raises:
+        UserError: ``folder``/parts is a link, but not one of our user to a place in memory.
+    """
+    if not _MEMORY.is_dir():
+        return
+    _rescue(notice)
+    needed = BYTES_PER_TICK * ticks
+    parts = folder / "parts"
+    if not parts.is_symlink():
+        if shutil.disk_usage(_MEMORY).free < 2 * needed:
+            return
+        place, _holds[parts] = scratch.make(_PREFIX, _MEMORY)
+        (place / _HOME).symlink_to(parts.absolute())
+        try:
+            parts.symlink_to(place)
+            return
+        except FileExistsError:  # another process of this run was first
+            shutil.rmtree(place)
+            scratch.let_go(_holds.pop(parts))
+    place = parts.readlink()
+    ours = parts.lstat().st_uid == os.geteuid()
+    if not ours or place.parent != _MEMORY or not place.name.startswith(_PREFIX):
+        raise UserError(f"{parts}: is a link to {place}, not to a recording in memory of our user")
+    try:
+        _holds[parts] = scratch.hold(place)
+    except OSError as problem:
+        raise UserError(f"{parts}: {place}: {problem.strerror or problem}") from None
+
+
+def _rescue(notice: Callable[[str], None]) -> None:
+    """Move parts that no process uses any more to where their run is, if that can be found."""
+    for place, hold in scratch.left_behind(_PREFIX, _MEMORY):
+        with contextlib.suppress(OSError):  # no room, no rights: they stay
+            recorded = sorted(_FILES.intersection(path.name for path in place.iterdir()))
+            home = _home_of(place)
+            if home is not None:
+                run, link = home
+                try:
+                    _move(recorded, hold, run, link)
+                finally:
+                    os.close(run)
+            elif recorded:
+                gone = (place / _HOME).readlink().parent
+                notice(
+                    f"{place}: kept, the recording of a killed run whose folder {gone} is gone or "
+                    "belongs to another user; move it where it belongs, or remove it"
+                )
+            if home is not None or not recorded:
+                shutil.rmtree(place)
+        scratch.let_go(hold)
+
+
+def _home_of(place: Path) -> tuple[int, str] | None:
+    """The folder of a run, opened, and the name of the link in it to a folder in memory: where it
+    was made, or, if the run's folder has been renamed, beside there. None if there is no such
+    folder of our user."""
+    with contextlib.suppress(OSError):
+        made = (place / _HOME).readlink()
+        for link in (made, *sorted(made.parent.parent.glob(f"*/{made.name}"))):
+            with contextlib.suppress(OSError):
+                run = os.open(link.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+                ours = os.fstat(run).st_uid == os.geteuid()
+                with contextlib.suppress(OSError):  # it is no link
+                    if ours and os.readlink(link.name, dir_fd=run) == str(place):
+                        return run, link.name
+                os.close(run)
+    return None
+
+
+def _move(names: list[str], source: int, run: int, link: str) -> None:
+    """Replace the link in a run's folder by a folder with copies of some files; every folder is
+    given by its descriptor, so that no other user can put another one in its place."""
+    copy = f"parts-{secrets.token_hex(4)}"
+    os.mkdir(copy, 0o700, dir_fd=run)
+    try:
+        target = os.open(copy, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=run)
+        try:
+            if not scratch.is_private(os.fstat(target)):
+                raise PermissionError
+            scratch.copy_files(names, source, target)
+        finally:
+            os.close(target)
+        os.unlink(link, dir_fd=run)
+        os.rename(copy, link, src_dir_fd=run, dst_dir_fd=run)
+    except OSError:
+        shutil.rmtree(copy, dir_fd=run)
+        raise
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what the sides recorded, wherever it lies.
+
+    A process that is killed meanwhile leaves a rest that the next call finds.
+    """
+    parts = folder / "parts"
+    if parts.is_dir():
+        for file in parts.glob("*.npy"):
+            file.unlink()
+        shutil.rmtree(parts.resolve())
+    if parts.is_symlink():
+        parts.unlink()
+    if parts in _holds:
+        scratch.let_go(_holds.pop(parts))

@@ -1,0 +1,259 @@
+"""A finished run: what happened and every signal, read from its folder or kept in memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.roles import OUR_CONTROLLER
+from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
+from gfm_hil.recording.log import read_events, read_summary
+from gfm_hil.recording.npz import Column, open_npz
+from gfm_hil.scenario.model import Scenario
+from gfm_plant import load_converter
+from gfm_runtime.toml_file import read_toml
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+
+class Signals(Mapping[str, NDArray[Any]]):
+    """The recorded signals by name, each of shape (ticks,), read when it is asked for.
+
+    ``p``, ``q``, ``V``, ``v_dc``, ``omega_u``, ``i``, ``delta``, ``omega_g`` and ``V_g`` are the
+    plant's own, without sensors; ``f_hz`` is omega_u in Hz; ``t`` is in s. All columns of the
+    recording are there under their own names too: ``y_p`` as measured, ``u_E_u``, ``ref_P_ref``;
+    iterating gives those.
+
+    Args:
+        columns: of signals.npz.
+        f_n: nominal frequency, Hz.
+    """
+
+    def __init__(self, columns: Columns, f_n: float) -> None:
+        self._columns, self._f_n = columns, f_n
+        self._names = [name.removeprefix("true_") for name in columns if name.startswith("true_")]
+        if "true_omega_u" in columns:
+            self._names.append(HERTZ)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name == HERTZ and name in self._names:
+            return np.asarray(self._columns["true_omega_u"][:] * self._f_n)
+        for known in (name, f"true_{name}"):
+            if known in self._columns:
+                return np.asarray(self._columns[known][:])
+        there = sorted([*self._columns, *self._names])
+        raise UserError(f"signal = {name!r}: was not recorded; there are {there}")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._columns or name in self._names
+
+
+@dataclass(frozen=True, repr=False)
+class RecordedRun:
+    """A finished run.
+
+    Attributes:
+        scenario: what was run.
+        summary: content of summary.json.
+        columns: of signals.npz, each shape (ticks,): an array, or a column of the file, of which
+            a slice is read and nothing more.
+        laws: labels of the laws, which the column ``law`` refers to.
+        events: lines of events.jsonl.
+        folder: where it is; None for a run in memory.
+        timing: columns of timing.npz, likewise; empty for a run in one process.
+    """
+
+    scenario: Scenario
+    summary: dict[str, Any]
+    columns: Columns
+    laws: list[str] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    folder: Path | None = None
+    timing: Columns = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """A run from its folder; no column is read yet.
+
+        Raises:
+            UserError: it is no run folder, the run is not over, or a file is damaged.
+        """
+        folder = Path(folder)
+        try:
+            columns, timing, laws = read_recording(folder)
+            summary = read_summary(folder)
+        except FileNotFoundError as problem:
+            going = (folder / "scenario.toml").is_file()
+            what = "the run is not over, see gfmhil stream, or was cut off, see gfmhil recover"
+            what = what if going else "is not a run folder"
+            missing = Path(problem.filename).name
+            raise UserError(f"{folder}: {what} ({missing} is missing)") from None
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem}") from None
+        events = read_events(folder)
+        return cls(read_scenario(folder), summary, columns, laws, events, folder, timing)
+
+    def file(self, name: str) -> Path:
+        """The path of a file of the run folder.
+
+        Raises:
+            UserError: the run is in memory only.
+        """
+        if self.folder is None:
+            raise UserError(f"{name}: the run is in memory; save it first")
+        return self.folder / name
+
+    def text(self, name: str) -> str:
+        """The content of a text file of the run folder."""
+        return self.file(name).read_text(encoding="utf-8")
+
+    @property
+    def signals(self) -> Signals:
+        """The signals by name, see ``Signals``; p.u. unless ``units`` says otherwise."""
+        return Signals(self.columns, nominal_frequency(self.scenario))
+
+    @cached_property
+    def recorded(self) -> Columns:
+        """All columns, ``columns`` and then ``timing``."""
+        return {**self.columns, **self.timing}
+
+    @property
+    def described(self) -> list[Described]:
+        """What each column of ``recorded`` is, in its order.
+
+        Raises:
+            UserError: one is none of a recording.
+        """
+        return [describe(name, self.laws) for name in self.recorded]
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each column of ``columns``; empty for codes."""
+        return {name: describe(name, self.laws).unit for name in self.columns}
+
+    @property
+    def ticks(self) -> int:
+        """How many ticks were recorded."""
+        return len(self.columns["tick"])
+
+    def blocks(self, ticks: int) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
+        """Rows in blocks of at most ``ticks``: the first tick, and all columns from there on."""
+        recorded = self.recorded
+        for first in range(0, self.ticks, ticks):
+            yield first, {name: x[first : first + ticks] for name, x in recorded.items()}
+
+    @property
+    def status(self) -> str:
+        """``completed``, ``tripped``, ``safe`` or ``interrupted``."""
+        return str(self.summary["status"])
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """All signals as a DataFrame whose index is t in s.
+
+        Raises:
+            UserError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise UserError("to_pandas: needs pandas: pip install 'gfmhil[notebook]'") from None
+        content = {name: column[:] for name, column in self.columns.items()}
+        return pandas.DataFrame(content).set_index("t")
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All signals as a Dataset over t, with units.
+
+        Raises:
+            UserError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise UserError("to_xarray: needs xarray: pip install 'gfmhil[notebook]'") from None
+        units = self.units
+        content = {
+            name: ("t", column[:], {"units": units[name]})
+            for name, column in self.columns.items()
+            if name != "t"
+        }
+        about = {"title": self.scenario.title, "status": self.status}
+        return xarray.Dataset(content, {"t": self.columns["t"][:]}, about)
+
+    def __repr__(self) -> str:
+        reason = f" ({self.summary['reason']})" if self.summary["reason"] else ""
+        where = f", {self.folder}" if self.folder is not None else ""
+        return (
+            f"<Run {self.scenario.title!r}: {controlled_by(self.summary)}, {self.status}{reason}, "
+            f"{self.summary['duration_s']:g} s in {self.summary['ticks']} ticks{where}>"
+        )
+
+
+def controlled_by(summary: Mapping[str, Any]) -> str:
+    """The laws of a run, or what a controller that is not ours calls itself."""
+    name = summary.get("controller", OUR_CONTROLLER)
+    if name == OUR_CONTROLLER:
+        return " → ".join(summary["laws"])
+    return name or "a controller that gave no name"
+
+
+def nominal_frequency(scenario: Scenario) -> float:
+    """Nominal frequency of the scenario's converter, Hz.
+
+    Raises:
+        UserError: the converter's file cannot be read.
+    """
+    name = scenario.plant.converter
+    try:
+        return load_converter(name).bases.omega_b / (2 * math.pi)
+    except (OSError, ValueError) as problem:
+        raise UserError(f"plant.converter = {name!r}: {problem}") from None
+
+
+def read_scenario(folder: Path) -> Scenario:
+    """The scenario of a run as it was resolved; its law files may be gone.
+
+    Raises:
+        UserError: there is none in the folder, or it is damaged.
+    """
+    try:
+        return Scenario.model_validate(read_toml(folder / "scenario.toml"))
+    except ValidationError as problem:
+        reason = "; ".join(lines(problem))
+    except ValueError as problem:
+        reason = str(problem)
+    raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}")
+
+
+def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
+    """The columns of signals.npz and of timing.npz, and the labels of the laws.
+
+    Raises:
+        OSError: a file is not there.
+        UserError: a file is damaged.
+    """
+    signals, timing = open_npz(folder / "signals.npz"), open_npz(folder / "timing.npz")
+    for name in ("tick", "t", "laws"):
+        if name not in signals:
+            raise UserError(f"{folder / 'signals.npz'}: has no column {name}")
+    laws = [str(label) for label in signals.pop("laws")[:]]
+    lengths = {name: len(column) for name, column in [*signals.items(), *timing.items()]}
+    if len(set(lengths.values())) > 1:
+        raise UserError(f"{folder}: the columns of the recording differ in length: {lengths}")
+    return signals, timing, laws
