@@ -31,7 +31,9 @@ nb_execution_timeout = 120  # s a cell
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"  # of the kernels
 
 autodoc_typehints = "description"
-autodoc_typehints_description_target = "documented"
+autodoc_typehints_description_target = "documented_params"
+autodoc_type_aliases = {"ArrayLike": "ArrayLike"}
+autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
 

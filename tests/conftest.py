@@ -18,7 +18,7 @@ from collections.abc import Iterable
 import pytest
 from hypothesis import settings
 
-pytest_plugins = ["tests.attacks"]
+pytest_plugins = ["tests.support.attacks"]
 
 # One thread in BLAS: small matrices, and both processors are busy (see gfm_hil.core.blas).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -52,8 +52,9 @@ class Mistakes:
 
 def meant(name: object, known: Iterable[str]) -> str:
     """The end of a message about an unknown name: the known name that is most like it, if any."""
-    close = difflib.get_close_matches(str(name), list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    names = {other.lower(): other for other in known}
+    close = difflib.get_close_matches(str(name).lower(), names, n=1)
+    return f"; did you mean {names[close[0]]!r}?" if close else ""
 
 
 def printable(text: str) -> str:

@@ -25,7 +25,7 @@ from gfm_plant import Plant
 from gfm_plant.model import f, g
 from gfm_runtime import discretise, get_law, law_file
 
-from .support import reference_loop
+from ..support.loops import reference_loop
 
 RIG: dict[str, Any] = {
     "delay": {"samples": 1, "fraction": 0.25},

@@ -11,7 +11,7 @@ from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import LawError, law_file
 from gfm_runtime.lawfile import parse_law
 
-from ..runtime.support import every_law
+from ..support.laws import every_law
 
 
 def test_ties_follow() -> None:

@@ -14,7 +14,7 @@ from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
 
-from .support import reference_loop
+from ..support.loops import reference_loop
 
 SHORT = {"seed": 0, "evaluations": 64, "starts": 1}
 

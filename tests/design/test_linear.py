@@ -21,7 +21,7 @@ from gfm_plant import Plant, make_plant
 from gfm_plant.model import DELTA, N_X, f, g
 from gfm_runtime import discretise, get_law
 
-from ..runtime.support import every_law
+from ..support.laws import every_law
 
 REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
 RIG = {

@@ -37,7 +37,7 @@ from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
 from gfm_plant import load_converter
 from gfm_plant.model import DELTA
 
-from .support import reference_loop
+from ..support.loops import reference_loop
 
 T = 0.01
 

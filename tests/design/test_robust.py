@@ -21,7 +21,7 @@ from gfm_hil.studies.box import step_run
 from gfm_plant import make_plant
 from gfm_runtime import discretise, get_law, law_file
 
-from .support import reference_loop
+from ..support.loops import reference_loop
 
 LAW = "mimo-gfm-deployable"
 CONTROLLED, RIG = Box(dc=("controlled",)), Box(dc=("regulated",))

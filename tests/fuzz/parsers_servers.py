@@ -33,7 +33,7 @@ from gfm_hil.scope import server as scope_server
 from gfm_hil.scope.access import Access
 from gfm_hil.scope.record import open_record
 
-from ..hil.test_modbus_device import Bench as MadeUp
+from ..support.modbus_device import Bench as MadeUp
 from .conftest import Parser, Take
 from .mutations import blobs, lines, texts
 from .parsers_peers import SCENARIO

@@ -25,7 +25,7 @@ from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.scenario.toml_out import toml_text
 
-from .can_reference import quantised_run
+from ..support.can_reference import quantised_run
 
 PATIENCE_S = 600  # a run may have to compile everything, on one processor
 ENDPOINT = os.environ.get("GFMHIL_TEST_BUS", "can://vcan0")

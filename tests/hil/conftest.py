@@ -15,19 +15,12 @@ import pytest
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import Scenario, check_scenario
-from gfm_runtime import get_law
 
-from .uml import Kernel
+from ..support.uml import Kernel
 
 Make = Callable[..., Scenario]
 RunIt = Callable[..., Run]
 Start = Callable[..., "subprocess.Popen[str]"]
-
-
-def home_plant(law: str) -> dict[str, Any]:
-    """``plant`` with the grid for which a law's defaults are tuned."""
-    grid = get_law(law).home_grid
-    return {"factors": {"L_g": grid.L_g, "R_g": grid.R_g}}
 
 
 @pytest.fixture

@@ -18,10 +18,6 @@ from numba import njit
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.engine.loop_thread import run_loop
-from gfm_hil.engine.process import compile_side
-from gfm_hil.engine.setup import make_bench
-from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.layout import load_plan
@@ -29,14 +25,11 @@ from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.recording.merge import merge
-from gfm_hil.recording.parts import Part
-from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
 
-from .can_reference import quantised_run
-from .test_links import in_threads
+from ..support.can_reference import quantised_run
+from ..support.links import in_threads, run_pair
 
 pytestmark = pytest.mark.processes
 
@@ -75,29 +68,8 @@ def both_sides(
     **options: Any,
 ) -> tuple[dict[str, np.ndarray], dict[Side, tuple[dict, dict]]]:
     """Run a scenario over CAN: the signals, and each side's faults and counters."""
-    benches = {side: make_bench(scenario) for side in SIDES}
-    parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
-    for side in SIDES:
-        compile_side(side, benches[side], parts[side])
-
-    def call(side: Side) -> tuple[dict, dict]:
-        link = open_link("can", side, endpoint, options)
-        timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
-        try:
-            t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None).t0_ns
-            end = touch(side, link)
-            reader = run_loop(side, benches[side], end, parts[side], timeline, t0, lambda: False)
-            return reader.faults, link.counters
-        finally:
-            link.close()
-            timeline.close()
-
-    found = in_threads(call)
-    for outcome in found.values():
-        if isinstance(outcome, Exception):
-            raise outcome
-    merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    return {name: x[:] for name, x in read_recording(folder)[0].items()}, found
+    pair = run_pair(scenario, folder, "can", options, touch, endpoint=endpoint)
+    return pair.signals, {side: (pair.faults[side], pair.counters[side]) for side in SIDES}
 
 
 BOTH_WAYS = pytest.mark.parametrize("portable", [True, False])

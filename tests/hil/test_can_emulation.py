@@ -21,7 +21,7 @@ from gfm_hil.links.can.emulation import (
 from gfm_hil.links.can.frame_time import classic_time, fd_time
 from gfm_hil.links.can.wire import ERROR, frame_dtype
 
-from .can_parts import frame_of
+from ..support.can import frame_of
 
 BITRATE = 1_000_000
 FRAME = classic_time(8, BITRATE)

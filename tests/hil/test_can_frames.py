@@ -16,7 +16,7 @@ from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_runtime.signals import Group, group, names
 from gfm_runtime.states import RUNNING, SAFE
 
-from .can_parts import Joiner, VectorReceiver
+from ..support.can import Joiner, VectorReceiver
 
 DBC = {fd: read_dbc(write_dbc(fd)) for fd in (True, False)}
 PLAN = {fd: plan_of(dbc) for fd, dbc in DBC.items()}

@@ -9,7 +9,7 @@ from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_runtime.signals import Group, names
 from gfm_runtime.states import RUNNING, SAFE, STOPPED
 
-from .can_parts import Subrate
+from ..support.can import Subrate
 
 EVERY = 4
 

@@ -17,7 +17,7 @@ from gfm_hil.scenario.model import shipped_scenarios
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime import law_names
 
-from ..runtime.support import every_law
+from ..support.laws import every_law
 
 SUMMARY = {
     "title", "status", "reason", "expected", "laws", "link", "mode", "T_s", "ticks", "duration_s",

@@ -58,6 +58,15 @@ def test_the_help_loads_no_library(option):
     assert "gfmhil" in done.stdout and done.stderr.strip() == ""
 
 
+def test_an_operator_s_command_loads_no_compiler(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", _LIGHT, "tell", str(tmp_path)], capture_output=True, text=True
+    )
+    refusal, modules = done.stderr.splitlines()
+    assert "no run is going on there" in refusal
+    assert not {"numba", "scipy", "rich"} & set(modules.split())
+
+
 def test_only_what_is_compiled_is_said_and_which_of_how_many():
     new = njit(lambda x: x + 1)
     said: list[str] = []

@@ -23,8 +23,8 @@ from websockets.sync.client import ClientConnection, connect
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
-from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, at, wait_for
-from .scope_pages import addresses, mute
+from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, at, wait_for
+from ..support.scope import addresses, mute
 
 pytestmark = pytest.mark.processes
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 import time
-import zlib
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,36 +10,14 @@ import pytest
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
+from gfm_hil.links.frame import FrameError, FrameReader
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import names
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 
-ONES = {"y": np.array([1.0, 0.5, 1.0, 0.0, 1.0]), "u": np.array([0.3, 1.0, 1.0])}
-HOLD = 500
-FAR = 39_995  # in a run of 40,000 ticks
-REALTIME = {
-    "mode": "realtime",
-    "duration": 4.0,
-    "link": {"type": "shm"},
-    "late_policy": {"hold": HOLD},
-}
-T_NS = 100_000
+from ..support.frames import FAR, REALTIME, T_NS, Forger
 
 by_side = pytest.mark.parametrize("side", SIDES)
-
-
-class Forger(FrameWriter):
-    """Packs frames with a good CRC and any tick below 2**64."""
-
-    def __init__(self, group: Group, sequence: int = 0) -> None:
-        super().__init__(group)
-        self.usual, self.sequence[0] = (ONES[group], sequence % 2**32)
-
-    def forge(self, tick: int, state: int, reason: int = 0, values: Any = None) -> bytes:
-        good = self.pack(0, state, reason, self.usual if values is None else values)
-        body = good[:12] + struct.pack("<Q", tick % 2**64) + good[20:-4]
-        return body + struct.pack("<I", zlib.crc32(body))
 
 
 def limited(side: Side, scenario: Scenario) -> FrameReader:

@@ -32,8 +32,8 @@ from gfm_plant import NO_FRESH_U
 from gfm_runtime.signals import NU, Group, names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
-from .test_e2e import FAR, HOLD, REALTIME, T_NS, Forger
-from .test_faults import LINKS
+from ..support.frames import FAR, HOLD, REALTIME, T_NS, Forger
+from ..support.links import LINKS
 
 pytestmark = pytest.mark.processes
 

@@ -14,17 +14,11 @@ import pytest
 from gfm_hil.core.roles import SIDES
 from gfm_hil.scenario.model import check_scenario
 
-from .pairs import PATIENT, Pair, run_pair
+from ..support.links import LINKS, PATIENT, Pair, run_pair
 
 pytestmark = pytest.mark.processes
 
 TICKS, MANY = 2_000, 100_000
-LINKS: dict[str, tuple[str, dict[str, Any]]] = {
-    "shm": ("shm", {}),
-    "zmq": ("zmq", {}),
-    "zmq-portable": ("zmq", {"portable": True}),
-    "can": ("can", {}),
-}
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "loss": {"loss": 0.01},
     "burst": {"loss": 0.01, "burst": 4.0},

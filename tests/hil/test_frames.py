@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import zlib
 
 import numpy as np
@@ -13,6 +12,8 @@ from hypothesis import strategies as st
 from gfm_hil.links.frame import FAULTS, FrameError, FrameReader, FrameWriter, frame_dtype
 from gfm_runtime.signals import TABLE_VERSION, names
 from gfm_runtime.states import REASONS, STOPPED
+
+from ..support.frames import resealed
 
 GROUPS = ("y", "u")
 WIDTH = {group: len(names(group)) for group in GROUPS}
@@ -25,13 +26,6 @@ def frame(group: str = "y", sequence: int = 0, tick: int = 0) -> bytes:
     writer = FrameWriter(group)
     writer.sequence[0] = sequence
     return writer.pack(tick, 2, 0, np.arange(1.0, WIDTH[group] + 1))
-
-
-def resealed(good: bytes, at: int, value: int) -> bytes:
-    """A frame with one header byte changed and a CRC that fits it."""
-    body = bytearray(good[:-4])
-    body[at] = value
-    return bytes(body) + struct.pack("<I", zlib.crc32(body))
 
 
 def refused(reader: FrameReader, message: bytes) -> str:

@@ -21,8 +21,8 @@ from gfm_hil.links.frame import FrameWriter
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import NY
 
-from .test_links import PATIENT
-from .test_shm import endpoint as shm_endpoint
+from ..support.links import PATIENT
+from ..support.shm import endpoint as shm_endpoint
 
 pytestmark = pytest.mark.processes
 

@@ -21,8 +21,7 @@ from gfm_hil.results.summary import clock_drift
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import NU, NY
 
-from .pairs import run_pair
-from .test_links import PATIENT, in_threads
+from ..support.links import PATIENT, in_threads, run_pair
 
 pytestmark = pytest.mark.processes
 

@@ -14,8 +14,7 @@ from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
 
-from ..runtime.support import every_law
-from .conftest import home_plant
+from ..support.laws import every_law, home_plant
 
 LOAD = {"load_R": 36.1, "load_L": 1e-3}  # about 1 p.u.
 WEAK = {"factors": {"L_g": 10.0, "R_g": 10.0}}

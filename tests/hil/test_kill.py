@@ -22,7 +22,7 @@ import pytest
 
 from gfm_hil.core.roles import SIDES
 
-from .test_processes import end, has_run, sides_of, signals, summary, wait_for, write
+from ..support.processes import end, has_run, places, sides_of, signals, summary, wait_for, write
 
 pytestmark = pytest.mark.systems
 
@@ -31,16 +31,6 @@ SEED = int(os.environ.get("GFMHIL_KILLS_SEED", "4"))
 REPORT = os.environ.get("GFMHIL_KILLS_REPORT")
 PEER_TIMEOUT_S, HOLD = 0.5, 2000
 GENEROUS_S = 10.0  # margin: a crowded machine may not run a process for seconds
-
-
-def places(folder: Path) -> set[Path]:
-    """What a run in progress has outside its folder: memory, the folder of a socket."""
-    words = Path(f"/proc/{sides_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
-    kind, _, name = words[words.index("--endpoint") + 1].partition("://")
-    found = {Path("/dev/shm") / f"gfmhil-link-{name}" if kind == "shm" else Path(name).parent}
-    if (folder / "parts").is_symlink():
-        found.add((folder / "parts").resolve())
-    return found
 
 
 def log_of(folder: Path) -> list[dict[str, Any]]:

@@ -13,86 +13,14 @@ import pytest
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import SIDES, Side
-from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.engine.loop_thread import run_loop
-from gfm_hil.engine.process import compile_side
-from gfm_hil.engine.setup import make_bench
-from gfm_hil.engine.timeline import Timeline
 from gfm_hil.engine.waiting import send_last
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.frame import FrameReader, FrameWriter, frame_dtype
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.recording.log import read_log, worst
-from gfm_hil.recording.merge import merge
-from gfm_hil.recording.parts import Part
-from gfm_hil.recording.run import read_recording
-from gfm_hil.scenario.model import Scenario
 from gfm_runtime.states import RUNNING, SAFE
 
-PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
-RIG = {
-    "delay": {"samples": 1, "fraction": 0.3},
-    "adc": "DS2004",
-    "dac": "DS2101",
-    "sensors": {"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-4, "V": 1e-4}},
-}
-
-
-def in_threads(call: Callable[[Side], Any]) -> dict[Side, Any]:
-    """The same call for both sides at once; returns each side's result or exception."""
-    found: dict[Side, Any] = {}
-
-    def one(side: Side) -> None:
-        try:
-            found[side] = call(side)
-        except Exception as problem:
-            found[side] = problem
-
-    threads = [threading.Thread(target=one, args=(side,), daemon=True) for side in SIDES]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return found
-
-
-def both_sides(
-    scenario: Scenario,
-    folder: Path,
-    endpoint: str,
-    touch: Callable[[Side, Link], Link] = lambda side, link: link,
-    name: str = "zmq",
-    options: dict[str, Any] | None = None,
-) -> dict[str, np.ndarray]:
-    """Run a scenario over a link; returns the signals and writes the logs to ``folder``."""
-    benches = {side: make_bench(scenario) for side in SIDES}
-    parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
-    for side in SIDES:
-        compile_side(side, benches[side], parts[side])
-
-    def call(side: Side) -> None:
-        link = open_link(name, side, endpoint, options)
-        timeline = Timeline(benches[side], folder / f"events_{side}.jsonl", (side,))
-        try:
-            t0 = shake_hands(side, link, scenario, lambda: False, lambda text: None).t0_ns
-            end = touch(side, link)
-            run_loop(side, benches[side], end, parts[side], timeline, t0, lambda: False)
-        finally:
-            link.close()
-            timeline.close()
-
-    for problem in in_threads(call).values():
-        if problem is not None:
-            raise problem
-    merge(folder, scenario.T_s, benches["controller"].controller.labels)
-    return {name: x[:] for name, x in read_recording(folder)[0].items()}
-
-
-def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
-    """Check that both are equal bit by bit, NaN included."""
-    assert set(one) == set(other)
-    for name in one:
-        assert one[name].tobytes() == other[name].tobytes(), name
+from ..support.links import PATIENT, assert_same, run_pair
 
 
 class Tampering:
@@ -122,7 +50,7 @@ def test_a_frame_lost_in_lockstep_is_asked_for_again(loser, make, run, tmp_path,
             return Tampering(link, lambda k, m: None if k in (20, 21, 40) else m)
         return link
 
-    apart = both_sides(make(link=PATIENT), tmp_path, endpoint, touch)
+    apart = run_pair(make(link=PATIENT), tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
     assert_same(apart, run(link=PATIENT).signals)
 
 
@@ -133,7 +61,7 @@ def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
         return link
 
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
-    signals = both_sides(scenario, tmp_path, endpoint, touch)
+    signals = run_pair(scenario, tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
     outcome = worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None)
     assert outcome.status == "safe"
     assert "gone" in outcome.reason
@@ -152,7 +80,7 @@ def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint
         return link
 
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
-    signals = both_sides(scenario, tmp_path, endpoint, touch)
+    signals = run_pair(scenario, tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
     assert worst(read_log(*sorted(tmp_path.glob("events_*.jsonl"))), None).status == "safe"
     assert len(signals["tick"]) in (20, 21)  # with tick 20 if the controller's last frame came
     assert np.ptp(signals["u_omega_u"]) <= 1e-9
@@ -167,7 +95,7 @@ def test_a_repeated_frame_is_used_once(make, run, tmp_path, endpoint):
         return Twice(link, lambda k, m: m)
 
     content = {"duration": 0.02, "link": PATIENT, "law": "vsg-2"}
-    apart = both_sides(make(**content), tmp_path, endpoint, touch)
+    apart = run_pair(make(**content), tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
     assert_same(apart, run(**content).signals)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from .pairs import run_pair
-from .test_loops import PATIENT, PORTS
+from ..support.links import PATIENT, PORTS, run_pair
 
 pytestmark = pytest.mark.processes
 

@@ -28,15 +28,11 @@ from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
-from ..runtime.support import every_law
-from .conftest import home_plant
-from .pairs import PATIENT, run_pair
-from .test_frames import resealed
-from .test_links import RIG, assert_same
+from ..support.frames import resealed
+from ..support.laws import every_law, home_plant
+from ..support.links import PATIENT, PORTS, RIG, assert_same, run_pair
 
 pytestmark = pytest.mark.processes
-
-PORTS = ("shm", "zmq")
 
 
 def three_ways(content: dict[str, Any], link: str, make: Any, run: Any, place: Path) -> Any:

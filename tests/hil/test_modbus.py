@@ -22,7 +22,7 @@ from sunspec2.modbus.modbus import ModbusClientException
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
-from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
+from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
 
 pytestmark = pytest.mark.processes
 

@@ -14,7 +14,7 @@ from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 
 from gfm_hil.modbus.image import VENDOR
 
-from .modbus_parts import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
+from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
 
 pytestmark = pytest.mark.processes
 

@@ -22,8 +22,8 @@ from gfm_hil.modbus.connection import CLIENTS, Server
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.modbus.serve import Address
 
-from .modbus_parts import SUNS
-from .test_modbus_device import Bench
+from ..support.modbus import SUNS
+from ..support.modbus_device import Bench
 
 pytestmark = pytest.mark.processes
 

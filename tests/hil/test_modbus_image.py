@@ -13,8 +13,8 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from gfm_hil.modbus.connection import Server
 from gfm_hil.modbus.image import BASE, VENDOR
 
-from ..runtime.support import every_law
-from .test_modbus_device import S_N, Bench
+from ..support.laws import every_law
+from ..support.modbus_device import S_N, Bench
 
 
 def test_the_image_is_a_sunspec_map():

@@ -24,7 +24,7 @@ from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.recording import parts as recording
 
-from .test_shm import header
+from ..support.shm import header
 
 pytestmark = pytest.mark.processes
 

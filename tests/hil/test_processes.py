@@ -6,29 +6,29 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from gfm_hil.core.roles import SIDES
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.toml_out import toml_text
+
+from ..support.processes import (
+    PATIENCE_S,
+    end,
+    has_run,
+    sides_of,
+    signals,
+    summary,
+    wait_for,
+    write,
+)
 
 pytestmark = pytest.mark.processes
 
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
-PATIENCE_S = 90.0
-
-
-def write(folder: Path, **content: Any) -> str:
-    """Write a scenario file to ``folder``; returns its path."""
-    path = folder / "scenario.toml"
-    path.write_text(toml_text({"title": "test", "duration": 0.1, **content}))
-    return str(path)
 
 
 def free_endpoint() -> str:
@@ -36,57 +36,6 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-
-
-def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
-    """Poll until ``what()`` is true; fail if the process ends or the timeout expires."""
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        found = what()
-        if found:
-            return found
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-    raise AssertionError("waited in vain")
-
-
-def has_run(folder: Path, ticks: int) -> bool:
-    """Whether the plant has recorded that many ticks."""
-    part = Part.open(folder, "plant")
-    return part is not None and int(part.progress[0]) >= ticks
-
-
-def sides_of(folder: Path) -> dict[str, int]:
-    """Process ids of the sides that record into ``folder``."""
-    found = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                words = (entry / "cmdline").read_bytes().decode().split("\0")
-                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-            except OSError:
-                continue
-            if str(folder) in words and state != "Z":
-                found.update({side: int(entry.name) for side in SIDES if side in words})
-    return found
-
-
-def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of a process that is about to end."""
-    out, err = process.communicate(timeout=PATIENCE_S)
-    assert "Traceback" not in err
-    return process.returncode, out, err
-
-
-def summary(folder: Path) -> dict[str, Any]:
-    """The content of summary.json."""
-    return json.loads((folder / "summary.json").read_text())
-
-
-def signals(folder: Path) -> dict[str, np.ndarray]:
-    """The content of signals.npz."""
-    with np.load(folder / "signals.npz") as file:
-        return dict(file)
 
 
 def assert_same(one: Path, other: Path) -> None:

@@ -35,7 +35,7 @@ from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 
-from .test_processes import has_run, sides_of, signals, summary, wait_for, write
+from ..support.processes import has_run, sides_of, signals, summary, wait_for, write
 
 pytestmark = pytest.mark.processes
 

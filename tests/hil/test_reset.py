@@ -14,7 +14,7 @@ from gfm_hil.scenario.model import Scenario
 from gfm_plant import CONTROLLER_SAFE
 from gfm_runtime.states import READY, RUNNING, SAFE
 
-from .pairs import PATIENT, run_pair
+from ..support.links import PATIENT, run_pair
 
 TRIP, RESET = 200, 700
 BASE = {

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import connect
 
-from .scope_pages import HAS_BROWSER, Browser, Rig, rig, wait_for
+from ..support.scope import HAS_BROWSER, Browser, Rig, rig, wait_for
 
 pytestmark = [
     pytest.mark.systems,

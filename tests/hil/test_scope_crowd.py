@@ -20,7 +20,7 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope
 from gfm_hil.scope.view import View
 
-from .scope_pages import Rig, mute, rig, serving, wait_for
+from ..support.scope import Rig, mute, rig, serving, wait_for
 
 pytestmark = pytest.mark.processes
 

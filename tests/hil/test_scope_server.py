@@ -25,7 +25,7 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope, static_files
 from gfm_hil.scope.view import HEAD
 
-from .scope_pages import addresses, serving
+from ..support.scope import addresses, serving
 
 pytestmark = pytest.mark.processes
 

@@ -11,7 +11,6 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,21 +24,9 @@ from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 
+from ..support.shm import header, segment_of
+
 Pair = tuple[ShmLink, ShmLink]
-
-
-def segment_of(endpoint: str) -> Path:
-    return segment.FOLDER / (segment.PREFIX + endpoint.removeprefix("shm://"))
-
-
-@pytest.fixture
-def endpoint() -> Iterator[str]:
-    """A new endpoint; checks at the end that nothing of it is left."""
-    endpoint = f"shm://test-{secrets.token_hex(8)}"
-    yield endpoint
-    left = segment_of(endpoint).exists()
-    segment_of(endpoint).unlink(missing_ok=True)
-    assert not left
 
 
 @pytest.fixture
@@ -174,10 +161,6 @@ def test_the_longest_name_and_a_fresh_one_are_good(tmp_path):
         kind.check_endpoint(endpoint)
         open_link("shm", "controller", endpoint).close()
         assert not segment_of(endpoint).exists()
-
-
-def header(version: int, owner: segment.Identity) -> bytes:
-    return struct.pack("<8sq3q", segment.MAGIC, version, *owner).ljust(segment.SIZE, b"\0")
 
 
 def test_a_memory_of_another_layout_is_refused(endpoint):

@@ -12,7 +12,7 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm.link import ShmLink
 
-from .test_shm import endpoint, segment_of
+from ..support.shm import endpoint, segment_of
 
 pytestmark = pytest.mark.processes
 
@@ -27,7 +27,7 @@ def peer(endpoint: str) -> Iterator[Peer]:
     started = []
 
     def call(side: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:
-        script = Path(__file__).with_name("shm_peer.py")
+        script = Path(__file__).parents[1] / "support" / "shm_peer.py"
         process = subprocess.Popen(
             [sys.executable, str(script), side, endpoint, what, str(n)],
             text=True,

@@ -26,11 +26,10 @@ from gfm_hil.scenario.model import load_scenario
 from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.record import open_record
 
-from .modbus_parts import GFMHIL
-from .scope_pages import RIG, addresses
-from .soak_parts import MB, Clients, Sampler, ports_in
-from .test_kill import places
-from .test_processes import PATIENCE_S, has_run, sides_of, signals, summary, wait_for
+from ..support.modbus import GFMHIL
+from ..support.processes import PATIENCE_S, has_run, places, sides_of, signals, summary, wait_for
+from ..support.scope import RIG, addresses
+from ..support.soak import MB, Clients, Sampler, ports_in
 
 pytestmark = pytest.mark.systems
 

@@ -19,8 +19,7 @@ from gfm_hil.links.zeromq.curve import key_files, write_keys
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.links.zeromq.options import ZmqOptions, beyond_loopback
 
-from .test_links import PATIENT, assert_same, both_sides, in_threads
-from .test_zmq_port import deliver
+from ..support.links import PATIENT, assert_same, deliver, in_threads, run_pair
 
 pytestmark = pytest.mark.processes
 
@@ -77,7 +76,7 @@ def arrives(plant: ZmqLink, controller: ZmqLink, seconds: float = 30.0) -> bool:
 
 def test_an_encrypted_run_is_bit_for_bit_in_process(make, run, tmp_path, tcp, keys):
     content = {"law": "vsg-2", "duration": 0.03, "link": PATIENT}
-    apart = both_sides(make(**content), tmp_path, tcp, options={"curve": str(keys)})
+    apart = run_pair(make(**content), tmp_path, "zmq", {"curve": str(keys)}, endpoint=tcp).signals
     assert_same(apart, run(**content).signals)
 
 

@@ -19,8 +19,8 @@ from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.links.zeromq.options import ZmqOptions
 
-from .conftest import home_plant
-from .test_links import PATIENT, RIG, assert_same, both_sides
+from ..support.laws import home_plant
+from ..support.links import PATIENT, RIG, assert_same, deliver, run_pair
 
 _FUNCTION = types.FunctionType(PORT_CALL)
 
@@ -28,12 +28,6 @@ _FUNCTION = types.FunctionType(PORT_CALL)
 @njit(types.int64(_FUNCTION, types.int64[::1], types.uint8[::1]), nogil=True)
 def compiled(function, handle, message):
     return function(handle, message)
-
-
-def deliver(link: Link, message: bytes) -> None:
-    """Send a message as soon as there is room."""
-    while not link.send(message):
-        time.sleep(0.001)
 
 
 class ByPort:
@@ -81,7 +75,7 @@ def test_lockstep_by_port_is_bit_for_bit_in_process(by_port, make, run, tmp_path
     def touch(side: Side, link: Link) -> Any:
         return ByPort(link) if side in by_port else link
 
-    apart = both_sides(make(**content), tmp_path, endpoint, touch)
+    apart = run_pair(make(**content), tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
     assert np.ptp(apart["true_p"]) > 0
     assert_same(apart, run(**content).signals)
 

@@ -23,7 +23,7 @@ from gfm_runtime.states import (
     STOPPED,
 )
 
-from .support import LAWS, REF, Running, Vector
+from ..support.laws import LAWS, REF, Running, Vector
 
 T_S = 1e-4
 

@@ -16,7 +16,7 @@ from gfm_runtime.elements import IF, INTEGRATOR, PI, Element, I, O, P
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.signals import NU, NY
 
-from .support import LAWS, REF, Running, Vector, blocks, mapped, repeatable, u_0, wander
+from ..support.laws import LAWS, REF, Running, Vector, blocks, mapped, repeatable, u_0, wander
 
 T_S = 1e-4
 

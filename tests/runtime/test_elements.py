@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gfm_runtime.elements import IF, INTEGRATOR, PD, PI, ZERO, D, Element, I, O, P, over, union
 from gfm_runtime.errors import LawError
 
-from .support import repeatable
+from ..support.laws import repeatable
 
 POINTS = (0.3 + 0j, 2j, 100j * math.pi, -0.4 + 7j, 1e4 + 1e3j)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gfm_runtime.errors import LawError
 from gfm_runtime.expressions import evaluate
 
-from .support import repeatable
+from ..support.laws import repeatable
 
 NUMBERS = {"H": 8.36, "D_p": 0.01, "k": -2.5}
 

@@ -17,7 +17,7 @@ from gfm_runtime.kernel import N_MAX
 from gfm_runtime.law import cell_name
 from gfm_runtime.signals import NU, NY, U_NAMES
 
-from .support import LAWS, REF, Running, Vector, drive, wander
+from ..support.laws import LAWS, REF, Running, Vector, drive, wander
 
 T_S = 1e-4
 f32 = np.float32

@@ -23,7 +23,7 @@ from gfm_runtime import (
 from gfm_runtime.elements import IF, PD, PI, D, Element, I, O, P
 from gfm_runtime.kernel import pack_law
 
-from .support import repeatable
+from ..support.laws import repeatable
 
 CUSTOM = """
 name = "custom-1"

@@ -10,7 +10,7 @@ from gfm_runtime.elements import IF, PD, Element, P, union
 from gfm_runtime.lawfile import ElementSpec
 from gfm_runtime.signals import NU, NY
 
-from .support import LAWS, REF, Running
+from ..support.laws import LAWS, REF, Running
 
 # Table II: name, then the fifteen cells phi_11 to phi_35; {} acts on the feedback only.
 TABLE_II = """

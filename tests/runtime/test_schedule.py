@@ -11,7 +11,7 @@ from gfm_runtime import LawError, LawSet, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import MAX_STAGES
 
-from .support import REF
+from ..support.laws import REF
 
 T_S = 1e-4
 

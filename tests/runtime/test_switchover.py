@@ -11,7 +11,7 @@ from gfm_runtime import DiscreteLaw, Law, Limits, change_law, discretise, get_la
 from gfm_runtime.elements import IF, PD, PI, Element, I, P
 from gfm_runtime.signals import NU
 
-from .support import LAWS, REF, Running, Vector, u_0, wander
+from ..support.laws import LAWS, REF, Running, Vector, u_0, wander
 
 T_S = 1e-4
 DISCRETE = {name: discretise(law, T_S) for name, law in LAWS.items()}

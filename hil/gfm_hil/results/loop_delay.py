@@ -1,9 +1,9 @@
 """The delay that a run measured, and whether a law's delay margin covers it.
 
 u[k] acts on the emulated plant at its set delay after the tick that sampled y[k]. A u[k] that has
-not arrived by the next tick is a miss: the plant goes on with the newest u it has, so what acts is
-older by the ticks since then. That is what eats into the margin. The time from y[k] sent to u[k]
-received says how near the misses are.
+not arrived by the next tick is a miss: the plant holds the last u, which is older by the ticks
+since then. This additional delay uses up the margin. The time from y[k] sent to u[k]
+received shows how close a run is to misses.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ class LoopDelay:
 
 
 def loop_delay(run: RecordedRun, set_s: float, margin_s: float) -> LoopDelay:
-    """What a run showed, beside a margin.
+    """The delays of a run, compared with a margin.
 
     Args:
         run: with its times, if it was in real time.
         set_s: the delay that the scenario sets between y[k] and u[k] acting, s.
-        margin_s: how much more the law stands, s.
+        margin_s: the additional delay that the law tolerates, s.
 
     Raises:
         UserError: the run lacks the plant's times.

@@ -1,7 +1,9 @@
-"""Both sides of a run in two threads of this process, over any link."""
+"""Links to test, and both sides of a run in two threads of this process."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +25,59 @@ from gfm_hil.recording.parts import Part
 from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario.model import Scenario
 
-from .test_links import in_threads
-
 PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
+
+
+RIG = {
+    "delay": {"samples": 1, "fraction": 0.3},
+    "adc": "DS2004",
+    "dac": "DS2101",
+    "sensors": {"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-4, "V": 1e-4}},
+}
+
+
+PORTS = ("shm", "zmq")  # links that the loops drive without a thread of Python
+
+
+def in_threads(call: Callable[[Side], Any]) -> dict[Side, Any]:
+    """The same call for both sides at once; returns each side's result or exception."""
+    found: dict[Side, Any] = {}
+
+    def one(side: Side) -> None:
+        try:
+            found[side] = call(side)
+        except Exception as problem:
+            found[side] = problem
+
+    threads = [threading.Thread(target=one, args=(side,), daemon=True) for side in SIDES]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return found
+
+
+def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    """Check that both are equal bit by bit, NaN included."""
+    assert set(one) == set(other)
+    for name in one:
+        assert one[name].tobytes() == other[name].tobytes(), name
+
+
+LINKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "shm": ("shm", {}),
+    "zmq": ("zmq", {}),
+    "zmq-portable": ("zmq", {"portable": True}),
+    "can": ("can", {}),
+}
+
+
+def deliver(link: Link, message: bytes) -> None:
+    """Send a message as soon as there is room."""
+    while not link.send(message):
+        time.sleep(0.001)
+
+
 Touch = Callable[[Side, Link], Link]
 
 
@@ -37,6 +89,7 @@ class Pair:
         signals, timing: as in signals.npz and timing.npz.
         faults: each side's counters of frames.
         injected: counters of each side's impairment stage.
+        counters: each side's, of a link that carries a message in several frames.
         log: lines of both event logs.
     """
 
@@ -44,6 +97,7 @@ class Pair:
     timing: dict[str, np.ndarray] = field(default_factory=dict)
     faults: dict[Side, dict[str, int]] = field(default_factory=dict)
     injected: dict[Side, dict[str, int]] = field(default_factory=dict)
+    counters: dict[Side, dict[str, int]] = field(default_factory=dict)
     log: list[dict[str, Any]] = field(default_factory=list)
 
     def ends(self) -> dict[str, tuple[str, str, int]]:
@@ -62,10 +116,12 @@ def run_pair(
     options: dict[str, Any] | None = None,
     touch: Touch = lambda side, link: link,
     stopped: Callable[[], bool] = lambda: False,
+    endpoint: str | None = None,
 ) -> Pair:
-    """Run a scenario over a new link; ``touch`` may wrap an end after the handshake."""
+    """Run a scenario over a link, new if there is no ``endpoint``; ``touch`` may wrap an end after
+    the handshake."""
     folder.mkdir(parents=True, exist_ok=True)
-    endpoint = link_kind(link).fresh(folder)
+    where = endpoint or link_kind(link).fresh(folder)
     benches = {side: make_bench(scenario) for side in SIDES}
     parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
     for side in SIDES:
@@ -74,15 +130,16 @@ def run_pair(
 
     def call(side: Side) -> None:
         bench, part, impairment = benches[side], parts[side], scenario.link.impairment
-        end = open_link(link, side, endpoint, options)
+        end = open_link(link, side, where, options)
         timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
-        used = touch(side, end)
+        used = end
         if impairment is not None and impairment.hits(side):
-            used = ImpairedLink(used, impairment, side)
+            used = ImpairedLink(end, impairment, side)  # compiles: before START
         try:
             t0 = shake_hands(side, end, scenario, lambda: False, lambda text: None).t0_ns
-            reader = run_loop(side, bench, used, part, timeline, t0, stopped)
+            reader = run_loop(side, bench, touch(side, used), part, timeline, t0, stopped)
             pair.faults[side] = dict(reader.faults)
+            pair.counters[side] = dict(getattr(end, "counters", {}))
             if isinstance(used, ImpairedLink):
                 pair.injected[side] = used.injected
         finally:

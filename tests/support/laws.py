@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import signal
 
-from gfm_runtime import DiscreteLaw, Law, law_names, load_law, pack_law, state_dtype, step
+from gfm_runtime import DiscreteLaw, Law, get_law, law_names, load_law, pack_law, state_dtype, step
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
@@ -150,3 +150,9 @@ def wander(ticks: int, seed: int = 1, size: float = 0.05) -> tuple[Vector, Vecto
     rng = np.random.default_rng(seed)
     slow = np.cumsum(rng.normal(size=(2, ticks, NY)), axis=1) / np.sqrt(ticks)
     return REF + size * slow[0], REF + size * (slow[1] + 0.1 * rng.normal(size=(ticks, NY)))
+
+
+def home_plant(law: str) -> dict[str, Any]:
+    """``plant`` with the grid for which a law's defaults are tuned."""
+    grid = get_law(law).home_grid
+    return {"factors": {"L_g": grid.L_g, "R_g": grid.R_g}}
