@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.compiled import compiled
 from gfm_plant.grid import advance_grid
 from gfm_plant.integrator import Held, Vector, integrate
 from gfm_plant.model import DELTA, V_DC, rates, terminal
@@ -23,6 +22,7 @@ from gfm_plant.names import (
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.records import MAX_DELAY, PlantRecord
+from gfm_runtime.compiled import compiled
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 

@@ -9,9 +9,9 @@ import math
 from typing import Any
 
 from gfm_plant.build import check_sub_step
-from gfm_plant.compiled import compiled
 from gfm_plant.model import DELTA
 from gfm_plant.records import PlantRecord
+from gfm_runtime.compiled import compiled
 
 
 def grid_frequency(st: PlantRecord, omega_g: float, rate: float | None = None) -> None:

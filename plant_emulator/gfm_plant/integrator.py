@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from gfm_plant.compiled import compiled
 from gfm_plant.model import Rates, circuit, terminal
+from gfm_runtime.compiled import compiled
 
 Vector = tuple[Any, ...]
 """(i_d, i_q, v_d, v_q, i_od, i_oq, v_dc, i_reg, i_load_d, i_load_q, sensed v_dc, p, q, V)"""

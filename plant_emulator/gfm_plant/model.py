@@ -14,10 +14,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from gfm_plant.compiled import compiled
+from gfm_runtime.compiled import cached, compiled
 
 N_X, N_U, N_Y = 8, 3, 5
 DELTA, V_DC = 6, 7  # where the angle and the DC voltage sit in x
@@ -80,7 +79,7 @@ def terminal(v_d: Any, v_q: Any, i_od: Any, i_oq: Any) -> tuple[Any, Any, Any]:
     return p, q, V
 
 
-@njit(cache=True)
+@cached
 def f(x: NDArray[Any], u: NDArray[Any], d: NDArray[Any], par: NDArray[np.void]) -> NDArray[Any]:
     """Return dx/dt, shape (8,), of the state x (8,) under u (3,) and d (2,), all of one dtype.
 
@@ -98,7 +97,7 @@ def f(x: NDArray[Any], u: NDArray[Any], d: NDArray[Any], par: NDArray[np.void]) 
     return dx
 
 
-@njit(cache=True)
+@cached
 def g(x: NDArray[Any], u: NDArray[Any]) -> NDArray[Any]:
     """Return the outputs y, shape (5,), of x (8,) and u (3,), both of one dtype."""
     p, q, V = terminal(x[2], x[3], x[4], x[5])

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from gfm_plant.compiled import compiled
+from gfm_runtime.compiled import compiled
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gfm_plant.compiled import compiled
 from gfm_plant.names import (
     BAD_COMMAND,
     CONTROLLER,
@@ -17,6 +16,7 @@ from gfm_plant.names import (
     TRIPS,
 )
 from gfm_plant.records import PlantRecord
+from gfm_runtime.compiled import compiled
 
 
 @compiled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gfm_plant.compiled import compiled
+from gfm_runtime.compiled import compiled
 
 
 @compiled

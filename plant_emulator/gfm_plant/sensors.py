@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.compiled import compiled
 from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussian
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecord
+from gfm_runtime.compiled import compiled
 
 
 @compiled

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
@@ -31,3 +34,27 @@ def test_arrays_come_in_and_views_of_them_are_had(decorator):
 
     x = np.arange(6.0).reshape(2, 3)
     assert tick(x) == 1 + 2 + 4 + 5
+
+
+def test_any_change_of_compiled_code_makes_numba_compile_again() -> None:
+    """A compiled function contains its callees, so its cache is as old as the oldest of them."""
+    from gfm_hil.engine.plant_ticks import plant_ticks
+    from gfm_plant import plant_sample
+    from gfm_runtime.compiled import _sources
+    from gfm_runtime.kernel import step
+
+    files, digest = _sources()
+    stamps = {f._cache._cache_file._source_stamp for f in (plant_ticks, plant_sample, step)}
+    assert stamps == {digest}
+    names = {"/".join(Path(file).parts[-2:]) for file in files}
+    assert {"recording/recorder.py", "gfm_plant/sensors.py", "gfm_runtime/kernel.py"} <= names
+    assert "cli/main.py" not in names
+
+
+def test_other_functions_keep_numbas_own_rule(tmp_path: Path) -> None:
+    from gfm_runtime.compiled import _own_stamp, _stamp
+
+    file = tmp_path / "theirs.py"
+    file.write_text("x = 1\n")
+    theirs = SimpleNamespace(_py_file=str(file))
+    assert _stamp(theirs) == _own_stamp(theirs)

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from gfm_runtime.compiled import cached
 
 BITS = 7
 _HALF = 1 << (BITS - 1)
@@ -21,7 +22,7 @@ RESOLUTION = 1 / _HALF  # largest width of a bucket relative to its lower end
 Counts = NDArray[np.int64]
 
 
-@njit(cache=True)
+@cached
 def record(counts, times_ns):
     """Count every time of ``times_ns`` (n,) in ``counts`` (BUCKETS,); longer ones in the last."""
     for t in times_ns:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import bursts
@@ -25,13 +24,14 @@ from gfm_hil.benchmark.pair import Pair, Policy, pair
 from gfm_hil.benchmark.rounds import rounds
 from gfm_hil.benchmark.spread import REST, summary
 from gfm_hil.realtime.clock import now_ns, sleep_until, wait_until
+from gfm_runtime.compiled import cached
 
 HYBRID, SPIN, SLEEP = range(3)
 WAITS = {"sleep+spin": HYBRID, "spin": SPIN, "nanosleep": SLEEP}
 _LEAD_NS = 2_000_000  # between the call and the first deadline
 
 
-@njit(cache=True, nogil=True)
+@cached
 def pace(first_ns, period_ns, how, late):
     """Fill ``late`` (ticks,) with the ns from each deadline to the loop's wake-up."""
     for k in range(len(late)):

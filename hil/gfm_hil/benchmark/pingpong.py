@@ -16,12 +16,12 @@ import time
 from typing import Any, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.links import Port
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.realtime.clock import between_looks, now_ns, wait_until
+from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group, names
 
 SILENCE_NS = 1_000_000_000
@@ -44,7 +44,7 @@ def plain(size: int) -> Messages:
     return np.resize(np.arange(251, dtype=np.uint8), (_DIFFERENT, size))
 
 
-@njit(cache=True, nogil=True)
+@cached
 def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_ns, took):
     """``ping`` through a port's functions."""
     answer = np.empty(LONGEST, np.uint8)
@@ -74,7 +74,7 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
     return n
 
 
-@njit(cache=True, nogil=True)
+@cached
 def pong_port(handle, send, receive, spins, messages, stop):
     """``pong`` through a port's functions, until ``stop[0]``."""
     heard = np.empty(LONGEST, np.uint8)

@@ -10,11 +10,11 @@ longer and gives the same results. Without emulation a frame is delivered as it 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from gfm_hil.links.can.frame_time import PAYLOADS, classic_time, fd_time
 from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
 from gfm_hil.realtime.atomics import copy
+from gfm_runtime.compiled import cached
 
 PLACES = 128  # for frames that wait for the bus, and as many again for frames that were sent
 _LONGEST = PAYLOADS[-1]
@@ -45,19 +45,19 @@ def set_bus(bus: np.ndarray, fd: bool, bitrate: int, data_bitrate: int) -> None:
         bus["time"][0, length] = round(time * 1e9)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def has_room(bus):
     """Whether another frame may ``arrive``."""
     return bus[0].waiting < PLACES and bus[0].through < PLACES
 
 
-@njit(cache=True, nogil=True)
+@cached
 def busy(bus):
     """Whether a frame is on the bus or waits for it."""
     return bus[0].waiting > 0 or bus[0].through > 0
 
 
-@njit(cache=True, nogil=True)
+@cached
 def arrive(bus, places, frame, deliver, now):
     """Queue a frame; one of our own (``deliver`` = 0) only occupies the bus.
 
@@ -80,13 +80,13 @@ def arrive(bus, places, frame, deliver, now):
         b.waiting += 1
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _fill(places, k, frame, deliver, at):
     places[k].at, places[k].deliver = at, deliver
     copy(places[k : k + 1].ctypes.data + _FRAME_AT, frame.ctypes.data, MTU_FD)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _arbitrate(b, places, now):
     """Move every frame that has won arbitration by now from waiting to delivery."""
     while b.waiting > 0 and b.through < PLACES:
@@ -111,7 +111,7 @@ def _arbitrate(b, places, now):
             places[k] = places[k + 1]
 
 
-@njit(cache=True, nogil=True)
+@cached
 def is_through(bus, places, now):
     """Whether a frame is ready for delivery."""
     b = bus[0]
@@ -120,7 +120,7 @@ def is_through(bus, places, now):
     return b.through > 0 and places[PLACES + b.first].at <= now
 
 
-@njit(cache=True, nogil=True)
+@cached
 def deliver(bus, places, frame):
     """Copy the frame that ``is_through`` found into ``frame``, an array of ``wire.frame_dtype``."""
     b = bus[0]

@@ -13,7 +13,8 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numba import njit
+
+from gfm_runtime.compiled import cached
 
 _CRC_15 = 0x4599  # x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
 PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes; the index is the DLC
@@ -73,7 +74,7 @@ def classic_time(length: int, bitrate: float, number: int | None = None) -> floa
     return float(len(bits) + 15 + _most_stuffed(wire) + 1 + _TAIL) / bitrate
 
 
-@njit(cache=True)
+@cached
 def _most_stuffed(bits):
     """Most stuff bits that a classic frame's bits (-1: any) and their CRC can need."""
     # by CRC, last bit and its run 1 … 4: a stuff bit follows the fifth

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from cantools.database.can import Database, Message
-from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import SIDES, Side
@@ -30,6 +29,7 @@ from gfm_hil.links.can.dbc import (
 )
 from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.wire import crc8
+from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group, names
 
 
@@ -159,7 +159,7 @@ def plan_of(database: Database) -> Plan:
     return plan
 
 
-@njit(cache=True, nogil=True)
+@cached
 def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
     """Write values rounded to counts, and add the end-to-end protection.
 
@@ -189,7 +189,7 @@ def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
     return saturated
 
 
-@njit(cache=True, nogil=True)
+@cached
 def unpack_vector(payload, index, start, scale, offset, values):
     """Write a frame's values into the vector; an invalid count becomes NaN."""
     for k in range(len(index)):

@@ -8,7 +8,6 @@ and compiled loops use the same node through the same code. The node reads and w
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import Side
@@ -48,6 +47,7 @@ from gfm_hil.links.can.vectors import (
 from gfm_hil.links.can.wire import BUS_OFF, ERROR, EXTENDED, REMOTE, frame_dtype
 from gfm_hil.links.port import Port, port_function
 from gfm_hil.realtime.clock import now_ns
+from gfm_runtime.compiled import cached
 
 NOTHING, LOST = -1, -2  # no message; the bus is lost, see ``lost``
 
@@ -114,42 +114,42 @@ class Node:
             set_bus(self.bus, options.fd, options.bitrate, options.data_bitrate)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _state(handle):
     return handle[:_SOCKETS].view(state_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _sockets(handle):
     return handle[_SOCKETS:_SENDER].view(socket_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _subrate(handle):
     return handle[_SUBRATE:_BUS].view(subrate_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _bus(handle):
     return handle[_BUS:_PLACES].view(bus_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _places(handle):
     return handle[_PLACES:_OUT].view(place_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _out(handle):
     return handle[_OUT:_INTO].view(frame_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _into(handle):
     return handle[_INTO:_END].view(frame_dtype)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def compose(handle, message):
     """Write the CAN frames of a message to ``out``; returns how many, or NOTHING if the message is
     not a frame of the loops and must be sent in segments."""
@@ -159,7 +159,7 @@ def compose(handle, message):
     return encode(handle[_SENDER:_RECEIVER].view(sender_dtype), message, _out(handle))
 
 
-@njit(cache=True, nogil=True)
+@cached
 def room_to_send(handle):
     """Whether there is room to send another frame; if not, count it as dropped."""
     if _bus(handle)[0].waiting < PLACES:
@@ -168,7 +168,7 @@ def room_to_send(handle):
     return False
 
 
-@njit(cache=True, nogil=True)
+@cached
 def account(handle, frame):
     """Let a frame that we have sent occupy the emulated bus."""
     bus = _bus(handle)
@@ -176,14 +176,14 @@ def account(handle, frame):
         arrive(bus, _places(handle), frame, 0, now_ns())
 
 
-@njit(cache=True, nogil=True)
+@cached
 def bring(handle, frame):
     """Queue a frame that another node sent."""
     bus = _bus(handle)
     arrive(bus, _places(handle), frame, 1, now_ns())
 
 
-@njit(cache=True, nogil=True)
+@cached
 def put(handle, frame):
     """Send the frame in an array; False if it was dropped or the bus is lost."""
     if not room_to_send(handle):
@@ -200,7 +200,7 @@ def put(handle, frame):
     return False
 
 
-@njit(cache=True, nogil=True)
+@cached
 def send(handle, message):
     """Send a message of the loops: 1, or 0 if any part of it was dropped."""
     if _state(handle)[0].open == 0:
@@ -214,7 +214,7 @@ def send(handle, message):
     return 1 if sent else 0
 
 
-@njit(cache=True, nogil=True)
+@cached
 def fetch(handle):
     """Read the frames that the socket has; returns whether one is ready to be processed."""
     sockets, bus = _sockets(handle), _bus(handle)
@@ -231,7 +231,7 @@ def fetch(handle):
     return is_through(bus, places, now_ns() if bus[0].emulate else 0)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def receive(handle, message):
     """The next message.
 
@@ -256,7 +256,7 @@ def receive(handle, message):
     return size
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _from_bus(handle, message):
     """The next message that came over the bus."""
     state = _state(handle)
@@ -277,7 +277,7 @@ def _from_bus(handle, message):
     return NOTHING
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _take(handle, state, frame, message):
     """Process a frame; returns the length of the message that it completes, NOTHING, or LOST."""
     receiver = handle[_RECEIVER:_JOINER].view(receiver_dtype)
@@ -302,7 +302,7 @@ def _take(handle, state, frame, message):
     return NOTHING
 
 
-@njit(cache=True, nogil=True)
+@cached
 def sleep(handle, ms):
     """Sleep until the socket has a frame, at most ``ms``; not while a frame is on the bus."""
     if _state(handle)[0].open != 0 and not busy(_bus(handle)):

@@ -12,12 +12,12 @@ import struct
 import zlib
 
 import numpy as np
-from numba import njit
 
 from gfm_hil.core.roles import SIDES, Side
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.wire import number
 from gfm_hil.links.crc import crc32
+from gfm_runtime.compiled import cached
 
 NOTHING, OTHER_DBC = -1, -2
 
@@ -87,7 +87,7 @@ def set_joiner(joiner: np.ndarray, plan: Plan, side: Side) -> None:
     j["message"] = NOTHING
 
 
-@njit(cache=True, nogil=True)
+@cached
 def join(joiner, frame, message):
     """Add a segment to its message.
 
@@ -122,7 +122,7 @@ def join(joiner, frame, message):
     return _whole(j, message)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _whole(j, message):
     size = j.used - _HEAD_BYTES
     if size < 0 or number(j.text, 4, 4) != crc32(j.text[_HEAD_BYTES:], size):

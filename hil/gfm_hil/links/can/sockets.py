@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic as _numba_intrinsic
 
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
 from gfm_hil.realtime.clock import now_ns
+from gfm_runtime.compiled import cached
 
 intrinsic: Any = _numba_intrinsic  # its stubs count typingctx among the caller's arguments
 
@@ -108,7 +109,7 @@ def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = (
     record["poll"] = fd | select.POLLIN << _EVENTS
 
 
-@njit(cache=True, nogil=True)
+@cached
 def write_frame(sockets, frame):
     """Send the frame in an array of ``wire.frame_dtype``; returns 0 or the errno."""
     s, address = sockets[0], frame.ctypes.data
@@ -130,7 +131,7 @@ def write_frame(sockets, frame):
     return problem
 
 
-@njit(cache=True, nogil=True)
+@cached
 def read_frame(sockets, frame):
     """Receive into the frame in an array of ``wire.frame_dtype``; returns 1, 0 if none is there,
     or the negative errno."""
@@ -143,7 +144,7 @@ def read_frame(sockets, frame):
     return 1
 
 
-@njit(cache=True, nogil=True)
+@cached
 def sleep_for_frame(sockets, ms):
     """Sleep until the socket is readable, at most ``ms``."""
     _poll(sockets.ctypes.data + _POLL_AT, ms)

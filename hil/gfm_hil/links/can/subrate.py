@@ -11,7 +11,6 @@ its last frames at once.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from gfm_hil.core.roles import Side
 from gfm_hil.links.can.wire import (
@@ -26,6 +25,7 @@ from gfm_hil.links.can.wire import (
     size_and_head,
     undamaged,
 )
+from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group
 from gfm_runtime.states import RUNNING, STOPPED
 
@@ -71,14 +71,14 @@ def set_subrate(subrate: np.ndarray, side: Side, every: int) -> None:
     s["due"] = s["asked"] = s["given"] = s["ticks"] = NOTHING
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _good(s, whose, message, size):
     if size != s.size[whose] or not begins_with(s.head[whose], message):
         return False
     return undamaged(message, size)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def goes(subrate, message):
     """Whether to send a message of ours; called for every message."""
     s = subrate[0]
@@ -89,7 +89,7 @@ def goes(subrate, message):
     return tick % s.every == 0 or message[STATE] != s.ordinary[0]
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _under(message, size, tick, sequence):
     """Rewrite a frame's tick and sequence."""
     put_number(message, TICK, 8, tick)
@@ -98,7 +98,7 @@ def _under(message, size, tick, sequence):
     return size
 
 
-@njit(cache=True, nogil=True)
+@cached
 def made(subrate, message):
     """Write the next frame made for the reader: its length, or NOTHING."""
     s = subrate[0]
@@ -115,7 +115,7 @@ def made(subrate, message):
     return _under(message, size, tick - s.left, sequence - s.left)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def admit(subrate, message, size):
     """Take a message from the bus and replace it in ``message`` by the one for the reader;
     returns its length, or NOTHING."""
@@ -125,7 +125,7 @@ def admit(subrate, message, size):
     return _command(s, message, size) if s.plant else _measurement(subrate, message, size)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _measurement(subrate, message, size):
     s = subrate[0]
     missing = 0
@@ -140,7 +140,7 @@ def _measurement(subrate, message, size):
     return made(subrate, message)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _command(s, message, size):
     tick, sequence = number(message, TICK, 8), number(message, SEQUENCE, 4)
     free, oldest = -1, 0
@@ -163,7 +163,7 @@ def _command(s, message, size):
     return NOTHING
 
 
-@njit(cache=True, nogil=True)
+@cached
 def in_force(subrate, message):
     """The plant: write the command for the tick that is due; returns its length, or NOTHING if it
     has not arrived."""

@@ -17,7 +17,6 @@ A CAN frame that fails its check becomes a frame that fails the reader's check a
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from gfm_hil.links.can.dbc import SENDERS
 from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
@@ -42,6 +41,7 @@ from gfm_hil.links.can.wire import (
     undamaged,
 )
 from gfm_hil.realtime.atomics import copy
+from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group
 
 #: a CAN frame: identifier and payload
@@ -136,7 +136,7 @@ def _set_table(record: np.ndarray, plan: Plan, group: Group) -> None:
     r["status_width"] = [fields[name][0].itemsize for name in _SAID]
 
 
-@njit(cache=True, nogil=True)
+@cached
 def encode(sender, message, frames):
     """The CAN frames of a frame of the bench, in the order in which to send them.
 
@@ -190,12 +190,12 @@ def encode(sender, message, frames):
     return count
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _head(frame, number, length, flags):
     frame.id, frame.length, frame.flags = number, length, flags
 
 
-@njit(cache=True, nogil=True)
+@cached
 def knows(receiver, number):
     """Whether an identifier belongs to this vector or to its sender's status."""
     r = receiver[0]
@@ -205,7 +205,7 @@ def knows(receiver, number):
     return number == r.status_number
 
 
-@njit(cache=True, nogil=True)
+@cached
 def decode(receiver, frame, message):
     """Take a CAN frame of this vector (see ``knows``).
 
@@ -232,7 +232,7 @@ def decode(receiver, frame, message):
     return _put(r, part, data, message)
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _learn(r, data):
     sequence = _count_on(r, np.int64(data[1]))
     if sequence < r.sequence:
@@ -245,13 +245,13 @@ def _learn(r, data):
         r.told[k] = number(data, r.status_at[k], r.status_width[k])
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _count_on(r, counter):
     """The full sequence from its received low bits."""
     return r.sequence + (counter - r.sequence + _BEHIND) % _SEQUENCES - _BEHIND
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _put(r, part, data, message):
     counter = np.int64(data[1])
     if counter != r.counter:

@@ -8,11 +8,11 @@ every link, in Python and in compiled loops.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gfm_hil.links.impaired.settings import Impairment
 from gfm_hil.realtime.clock import end_this_process, now_ns
+from gfm_runtime.compiled import cached
 
 INNER, INNER_WORDS = 0, 1  # address and length of the wrapped link's handle
 _RANDOM, _LOSS, _LOSS_MORE, _CORRUPT, _BITS, _DUPLICATE, _REORDER = range(2, 9)
@@ -54,7 +54,7 @@ def make_stage(settings: Impairment, side_number: int) -> NDArray[np.int64]:
     return h
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _draw(h):
     """An integer of [0, 2^32) by xorshift64*."""
     x = np.uint64(h[_RANDOM])
@@ -65,7 +65,7 @@ def _draw(h):
     return np.int64((x * np.uint64(0x2545F4914F6CDD1D)) >> np.uint64(32))
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _keep(h, message, size, due, key):
     """Copy a message into a free place of the queue; if there is none, count it as dropped and
     return -1."""
@@ -83,7 +83,7 @@ def _keep(h, message, size, due, key):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@cached
 def _flip(h, message, size):
     """Flip the set number of different bits, all choices equally likely."""
     left = min(h[_BITS], 8 * size)
@@ -93,7 +93,7 @@ def _flip(h, message, size):
             left -= 1
 
 
-@njit(cache=True, nogil=True)
+@cached
 def waiting(h):
     """How many messages are in the queue."""
     count = 0
@@ -102,7 +102,7 @@ def waiting(h):
     return count
 
 
-@njit(cache=True, nogil=True)
+@cached
 def admit(h, message, size):
     """Apply the faults to a received message; if it is not lost, put it into the queue.
 
@@ -158,7 +158,7 @@ def admit(h, message, size):
         h[held + _DUE], h[held + _KEY] = due, 3 * n + 2
 
 
-@njit(cache=True, nogil=True)
+@cached
 def release(h, message):
     """Write the next message that is due to ``message``; returns its length in bytes, or 0."""
     best = -1
