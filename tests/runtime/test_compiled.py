@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
-from gfm_plant import compiled as of_the_plant
 from gfm_runtime.compiled import compiled, inlined
 
 
-@pytest.mark.parametrize("decorator", [compiled, inlined, of_the_plant.compiled])
+@pytest.mark.parametrize("decorator", [compiled, inlined])
 def test_what_allocates_does_not_compile(decorator):
     @decorator
     def tick(n):
@@ -23,7 +22,7 @@ def test_what_allocates_does_not_compile(decorator):
         tick(3)
 
 
-@pytest.mark.parametrize("decorator", [compiled, of_the_plant.compiled])
+@pytest.mark.parametrize("decorator", [compiled])
 def test_arrays_come_in_and_views_of_them_are_had(decorator):
     @decorator
     def tick(x):
