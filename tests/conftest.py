@@ -32,6 +32,7 @@ settings.load_profile("gfmhil")
 # Fuzzing of any length, see CONTRIBUTING.md. An input that exceeds the deadline is a bug.
 settings.register_profile("fuzz", deadline=60_000, max_examples=20_000)
 
+_MOST_WORKERS = 8  # more would compile the same functions once more each
 _SYSTEMS = ("apt", "soak", "uml")
 FAST, TIERS = "fast", ("full", "processes", "systems")
 
@@ -58,8 +59,11 @@ def chosen(config: pytest.Config) -> set[str]:
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Run the fast tier on all processors, a file at a time, unless told how many (``-n``)."""
+    if hasattr(config, "workerinput"):  # a worker, which must not start workers
+        return
     if chosen(config) <= {FAST, "full"} and getattr(config.option, "numprocesses", 0) is None:
-        config.option.numprocesses, config.option.dist = "logical", "loadfile"
+        workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
+        config.option.numprocesses, config.option.dist = workers, "loadfile"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
