@@ -36,33 +36,34 @@ inlined: Any = njit(**FREE, forceinline=True)
 #: decorator for a function of a tick that needs numba's runtime, as slices of arrays do
 cached: Any = njit(cache=True, nogil=True)
 
-_PACKAGES = ("gfm_runtime", "gfm_plant", "gfm_hil")
+#: where compiled functions, and constants that they contain, come from
+_PLACES = {
+    "gfm_runtime": ("",),
+    "gfm_plant": ("",),
+    "gfm_hil": ("core", "realtime", "links", "recording", "engine"),
+}
 _own_stamp = _SourceFileBackedLocatorMixin.get_source_stamp
 
 
-def _folders() -> list[Path]:
-    """The folders of the packages whose compiled functions call one another."""
-    specs = [find_spec(package) for package in _PACKAGES]  # imports none of them
-    return [Path(at) for s in specs if s for at in s.submodule_search_locations or ()]
-
-
 @cache
-def _sources() -> tuple[frozenset[str], bytes]:
-    """Every file with compiled code, and a digest of all of them."""
-    digest, files = hashlib.sha256(), []
-    for folder in _folders():
-        for file in sorted(folder.rglob("*.py")):
-            text = file.read_bytes()
-            if b"compiled" in text or b"numba" in text:
-                files.append(str(file))
-                digest.update(text)
-    return frozenset(files), digest.digest()
+def _sources() -> tuple[tuple[Path, ...], bytes]:
+    """The folders of our packages, and a digest of all that may be compiled into a function."""
+    digest, folders = hashlib.sha256(), []
+    for package, rooms in _PLACES.items():
+        spec = find_spec(package)  # does not import it
+        for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
+            folders.append(folder)
+            for room in rooms:
+                for file in sorted((folder / room).rglob("*.py")):
+                    digest.update(file.read_bytes())
+    return tuple(folders), digest.digest()
 
 
 def _stamp(locator: Any) -> Any:
-    """What numba compares with the stamp in its cache: of our files, all of them together."""
-    files, digest = _sources()
-    return digest if str(locator._py_file) in files else _own_stamp(locator)
+    """What numba compares with the stamp in its cache; of our files, it covers all of them."""
+    folders, digest = _sources()
+    own, file = _own_stamp(locator), Path(locator._py_file)
+    return (own, digest) if any(file.is_relative_to(folder) for folder in folders) else own
 
 
 _SourceFileBackedLocatorMixin.get_source_stamp = _stamp  # type: ignore[method-assign]

@@ -218,7 +218,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
     for side in ("plant", "controller"):
         part = Part.create(going, side, scenario.ticks)
         part.signals[:], part.progress[:] = 1.0, (10, 0)
-        (going / f"desk_{side}.json").write_text(
+        (going / f"commands_{side}.json").write_text(
             f'{{"endpoint": "ipc://{held}/{side}", "T_s": 0.0001, "names": ["vsg-2"], "laws":'
             ' [{"label": "vsg-2", "name": "vsg-2", "gains": {"D_p": 0.01}},'
             ' {"label": "b", "name": "b", "gains": {}}]}'

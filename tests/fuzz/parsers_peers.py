@@ -52,7 +52,7 @@ def _frames(place: Path) -> Iterator[Take]:
                     assert (values == 7.0).all()
                     assert sum(reader.faults.values()) == 1
                 else:
-                    assert len(sealed) == 24 + 8 * count and 0 <= tick < 2**62
+                    assert len(sealed) == 24 + 8 * count and 0 <= tick < 2**63
                     assert zlib.crc32(sealed[:-4]).to_bytes(4, "little") == sealed[-4:]
                     assert values.tobytes() == sealed[20:-4]
 

@@ -198,7 +198,7 @@ LOOKS = (
 
 
 @contextlib.contextmanager
-def _desk(place: Path) -> Iterator[Take]:
+def _commands(place: Path) -> Iterator[Take]:
     """An input is an operator's message, its parts separated by line ends."""
     context = zmq.Context()
     with contextlib.ExitStack() as stack:
@@ -223,7 +223,7 @@ def _desk(place: Path) -> Iterator[Take]:
 
 @contextlib.contextmanager
 def _loop(place: Path, side: Any) -> Iterator[tuple[str, list[bool]]]:
-    """A desk whose loop only carries out commands; yields its place and the stop requests."""
+    """A command server whose loop only carries out commands; yields its place and the stops."""
     bench, stopped, bell, over = make_bench(SCENARIO), [], threading.Event(), threading.Event()
     timeline = Timeline(bench, place / f"events_{side}.jsonl", (side,))
 
@@ -269,5 +269,5 @@ def _jsons(many: tuple[dict[str, Any], ...]) -> st.SearchStrategy[bytes]:
 SERVERS = (
     Parser("modbus", _modbus, _requests),
     Parser("scope", _scope, lambda: lines(_jsons(LOOKS))),
-    Parser("commands", _desk, lambda: _jsons(EVENTS) | lines(_jsons(EVENTS))),
+    Parser("commands", _commands, lambda: _jsons(EVENTS) | lines(_jsons(EVENTS))),
 )

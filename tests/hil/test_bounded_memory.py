@@ -267,18 +267,18 @@ sys.stdin.readline()
 def test_a_long_answer_costs_an_operator_nothing(child, tmp_path, attack_now):
     from gfm_hil.core import temporary as scratch
 
-    with scratch.temporary("gfmhil-desk-") as place:
+    with scratch.temporary("gfmhil-commands-") as place:
         announced = {"endpoint": f"ipc://{place}/controller"}
-        (tmp_path / "desk_controller.json").write_text(json.dumps(announced), encoding="utf-8")
-        with zmq.Context() as context, context.socket(zmq.REP) as desk:
-            desk.set(zmq.LINGER, 0)
-            desk.bind(announced["endpoint"])
+        (tmp_path / "commands_controller.json").write_text(json.dumps(announced), encoding="utf-8")
+        with zmq.Context() as context, context.socket(zmq.REP) as server:
+            server.set(zmq.LINGER, 0)
+            server.bind(announced["endpoint"])
             process = child(OPERATOR.format(folder=str(tmp_path)))
             assert line(process) == "ready"
             before = peak_kb(process)
-            assert desk.poll(PATIENCE_S * 1000)
-            desk.recv()
-            desk.send(bytes(BIG))
+            assert server.poll(PATIENCE_S * 1000)
+            server.recv()
+            server.send(bytes(BIG))
             said = line(process)
     grown = peak_kb(process) - before
     assert said == f"{tmp_path}: the controller does not answer"

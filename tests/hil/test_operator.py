@@ -13,6 +13,7 @@ import pytest
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import SIDES
 from gfm_hil.engine.announcement import present
 from gfm_hil.operator import Operator
 from gfm_hil.recording.log import read_log
@@ -48,7 +49,7 @@ def going(request, tmp_path):
     command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder)]
     process = subprocess.Popen([*command, "--quiet", "--no-figures"], stdout=subprocess.DEVNULL)
     try:
-        wait_for(lambda: all((folder / f"desk_{s}.json").exists() for s in ("plant", "controller")))
+        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in SIDES))
         yield process, folder
     finally:
         process.kill()
@@ -87,7 +88,7 @@ def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
     assert np.flatnonzero(signals["true_omega_g"] < 0.9999)[0] == grid["tick"]
     told = [e for e in read_log(folder / "events.jsonl") if e.get("by") == "operator"]
     assert [e["tick"] for e in told] == [reference["tick"], law["tick"], grid["tick"]]
-    assert not list(folder.glob("desk_*"))
+    assert not list(folder.glob("commands_*"))
 
 
 def test_a_trip_is_waited_for_and_reset_and_gains_change(going):
@@ -171,9 +172,9 @@ def test_the_command(going):
 
 
 def test_what_a_killed_run_has_announced_is_not_going_on(tmp_path):
-    with scratch.temporary("gfmhil-desk-") as place:
+    with scratch.temporary("gfmhil-commands-") as place:
         endpoint = {"endpoint": f"ipc://{place}/plant"}
-        (tmp_path / "desk_plant.json").write_text(json.dumps(endpoint), encoding="utf-8")
+        (tmp_path / "commands_plant.json").write_text(json.dumps(endpoint), encoding="utf-8")
         assert present(tmp_path) == ["plant"]
         Operator(tmp_path).close()
     place.mkdir()  # as after SIGKILL

@@ -32,9 +32,11 @@ class Ends:
     def __init__(self, folder: Path, bench: Any) -> None:
         self.timeline = Timeline(bench, folder / "events_controller.jsonl", ("controller",))
         self.stops, self.tick = 0, 0
-        self.desk = CommandServer("controller", bench, self.timeline, folder, self.ring, self.stop)
+        self.server = CommandServer(
+            "controller", bench, self.timeline, folder, self.wake, self.stop
+        )
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         self.tick += 1
         self.timeline.carry_out(self.tick)
 
@@ -46,19 +48,19 @@ class Ends:
 @pytest.fixture
 def ends(make, tmp_path):
     found = Ends(tmp_path, make_bench(make()))
-    with found.desk:
+    with found.server:
         yield found
     found.timeline.close()
 
 
 def ask(folder: Path, *messages: bytes) -> list[dict[str, Any]]:
     """The command server's answers to raw messages."""
-    desk = announced(folder, "controller")
-    assert desk is not None
+    server = announced(folder, "controller")
+    assert server is not None
     answers = []
     with zmq.Context() as context, context.socket(zmq.REQ) as socket:
         socket.set(zmq.LINGER, 0)
-        socket.connect(desk["endpoint"])
+        socket.connect(server["endpoint"])
         for message in messages:
             socket.send(message)
             assert socket.poll(60_000), message
@@ -132,10 +134,10 @@ def test_no_descriptor_left_is_not_the_end_of_a_run(
 
 
 def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
-    with scratch.temporary("gfmhil-desk-") as place:
+    with scratch.temporary("gfmhil-commands-") as place:
         assert scratch.held(place)
-        (tmp_path / "desk_plant.json").write_text("[1]", encoding="utf-8")
-        with pytest.raises(UserError, match=r"desk_plant\.json: not an announcement"):
+        (tmp_path / "commands_plant.json").write_text("[1]", encoding="utf-8")
+        with pytest.raises(UserError, match=r"commands_plant\.json: not an announcement"):
             present(tmp_path)
     assert not scratch.held(place)
 
@@ -144,7 +146,7 @@ def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
     "10.3", "1,000 commands at once to the command server, then a stop", "1,000 carried out"
 )
 def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_now) -> None:
-    ends.desk._rate._clock = lambda: ends.desk._rate._since  # on a machine of any speed
+    ends.server._rate._clock = lambda: ends.server._rate._since  # on a machine of any speed
     answers = ask(tmp_path, *[json.dumps(P_REF).encode()] * 1000, b'{"type": "stop"}')
     refused = [a["error"] for a in answers if not a["ok"]]
     assert all(a["ok"] for a in answers[:200]) and answers[-1] == {"ok": True}

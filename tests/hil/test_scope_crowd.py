@@ -202,7 +202,7 @@ def test_half_open_connections_end_by_themselves(scope, monkeypatch) -> None:
 def lab(tmp_path_factory) -> Iterator[Rig]:
     """A run in progress with its scope."""
     with rig(tmp_path_factory.mktemp("crowd")) as found:
-        wait_for(lambda: len(list(found.folder.glob("desk_*.json"))) == 2)
+        wait_for(lambda: len(list(found.folder.glob("commands_*.json"))) == 2)
         yield found
 
 

@@ -24,7 +24,9 @@ from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 
-from ..support.shm import header, segment_of
+from ..support.shm import endpoint, header, segment_of
+
+__all__ = ["endpoint"]
 
 Pair = tuple[ShmLink, ShmLink]
 
@@ -157,10 +159,10 @@ def test_a_name_that_is_none(side, name):
 
 def test_the_longest_name_and_a_fresh_one_are_good(tmp_path):
     kind = link_kind("shm")
-    for endpoint in ("shm://" + "x" * 200, kind.fresh(tmp_path)):
-        kind.check_endpoint(endpoint)
-        open_link("shm", "controller", endpoint).close()
-        assert not segment_of(endpoint).exists()
+    for name in ("shm://" + "x" * 200, kind.fresh(tmp_path)):
+        kind.check_endpoint(name)
+        open_link("shm", "controller", name).close()
+        assert not segment_of(name).exists()
 
 
 def test_a_memory_of_another_layout_is_refused(endpoint):

@@ -97,7 +97,7 @@ def run_and_stream(start, folder: Path, mode: str, *options: str):
 def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[str, np.ndarray]:
     """Stop the run; returns its recording."""
     until = time.monotonic() + PATIENCE_S
-    while not all((folder / f"desk_{side}.json").exists() for side in SIDES):
+    while not all((folder / f"commands_{side}.json").exists() for side in SIDES):
         assert time.monotonic() < until
         time.sleep(0.05)
     operator = Operator(folder)

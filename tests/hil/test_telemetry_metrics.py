@@ -103,7 +103,7 @@ def test_quantiles_are_of_the_last_ten_seconds(recorded):
     assert found["gfmhil_slack_seconds", "0"] == pytest.approx(5e-6)
     assert found["gfmhil_round_trip_seconds", "0.999"] == pytest.approx(30e-6)
     assert found["gfmhil_round_trip_seconds", "1"] == pytest.approx(95e-6)
-    # without a desk the law has only a number
+    # without a command server the law has only a number
     assert found["gfmhil_law_info", "1"] == 1
     assert found["gfmhil_state", "SAFE"] == 1
 

@@ -10,8 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Identity(BaseModel):
-    """An operator. The desk's socket is in a folder of this user alone, so that only programs of
-    this user can say who gives a command; each server reports what it knows about its peer.
+    """An operator. The command server's socket is in a folder of this user alone, so that only
+    programs of this user can say who gives a command; each server reports what it knows of its
+    peer.
 
     Attributes:
         through: what passes the command on: scope, modbus, tell or python.

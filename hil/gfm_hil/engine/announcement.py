@@ -34,7 +34,7 @@ class Announcement(BaseModel):
 
 def announcement(folder: Path, side: Side) -> Path:
     """The file in which a role's command server says how to reach it."""
-    return folder / f"desk_{side}.json"
+    return folder / f"commands_{side}.json"
 
 
 def announced(folder: Path, side: Side) -> dict[str, Any] | None:

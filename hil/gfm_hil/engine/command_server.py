@@ -4,7 +4,7 @@ A command is an event of a scenario without its time. A thread that the loop nev
 it, puts a good one into the timeline and wakes the loop, which carries it out between two ticks.
 The answer names that tick. ``by`` in the command says who gives
 it (see ``Identity``), and the log of the run records that. The socket is a ZeroMQ REP on a Unix
-path in a folder that only this user can read; ``desk_<side>.json`` in the run folder names it.
+path in a folder that only this user can read; ``commands_<side>.json`` in the run folder names it.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class CommandServer:
         self._socket.set(zmq.RCVHWM, _ROOM)
         with contextlib.ExitStack() as stack:
             stack.callback(self._context.destroy, linger=0)
-            place = stack.enter_context(scratch.temporary("gfmhil-desk-"))
+            place = stack.enter_context(scratch.temporary("gfmhil-commands-"))
             endpoint = f"{SCHEME}{place}/{self._side}"
             try:
                 self._socket.bind(endpoint)
@@ -91,7 +91,7 @@ class CommandServer:
                     f"TMPDIR = {place.parent}: no socket can be made there: {problem}"
                 ) from None
             self._resources = stack.pop_all()
-        self._thread = threading.Thread(target=self._serve, name=f"{self._side}-desk", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="commands", daemon=True)
         self._thread.start()
         self._endpoint = endpoint
         self._announce()
@@ -141,7 +141,7 @@ class CommandServer:
         except (UserError, ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
         except Exception as problem:  # our own mistake must not end the server
-            _LOG.exception("the %s's desk: %r", self._side, message[:200])
+            _LOG.exception("the %s's command server: %r", self._side, message[:200])
             return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
 
     def _checked(self, content: Any) -> Any:

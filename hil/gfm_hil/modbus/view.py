@@ -91,7 +91,7 @@ class Watcher:
             with contextlib.suppress(UserError):  # slightly old names will do
                 self._said = {**self._said, **self._operator.snapshot()}
             self._code, self._asked = code, now
-        if "active" not in self._said:  # the controller's desk is not open yet
+        if "active" not in self._said:  # the controller's command server is not open yet
             return None
         return View(
             row=row,

@@ -103,19 +103,19 @@ class Operator:
             found |= run.row("controller", done - 1)
             found["state"] = _word(folder, "state", dict(enumerate(STATES)), found["state"])
             found["reason"] = _word(folder, "reason", dict(enumerate(REASONS)), run.safe_reason)
-            if (desk := announced(folder, "controller")) is not None:
-                law = _word(folder, "law", dict(enumerate(desk["laws"])), found["law"])
+            if (server := announced(folder, "controller")) is not None:
+                law = _word(folder, "law", dict(enumerate(server["laws"])), found["law"])
                 found["active"], found["gains"] = law["name"], law["gains"]
-                found["laws"], found["T_s"] = desk["names"], desk["T_s"]
+                found["laws"], found["T_s"] = server["names"], server["T_s"]
         return found
 
     def _ask(self, side: Side, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
-        desk = announced(self._folder, side)
-        if desk is None:
+        server = announced(self._folder, side)
+        if server is None:
             raise UserError(f"{self._folder}: the {side} is not running")
         content = {**event, "by": (by or self._local).plain()}
         try:
-            answer = self._exchange(side, desk["endpoint"], content)
+            answer = self._exchange(side, server["endpoint"], content)
         except zmq.ZMQError as problem:  # for example no descriptor for a socket
             raise UserError(f"{self._folder}: the {side} cannot be asked: {problem}") from None
         if not answer["ok"]:

@@ -305,7 +305,7 @@ def _conclude(run: Run, figures: bool) -> None:
 def _clear(folder: Path) -> None:
     """Remove what the files of a complete run were made of, and what a killed process left."""
     remove_parts(folder)
-    for pattern in (_LOCK, "events_*", "link_*.json", "desk_*.json", _ENDED):
+    for pattern in (_LOCK, "events_*", "link_*.json", "commands_*.json", _ENDED):
         for path in folder.glob(pattern):
             path.unlink()
     for path in unfinished(folder):

@@ -43,7 +43,7 @@ class Record:
         self.T_s, self.capacity = self.scenario.T_s, self.scenario.ticks
         self._run = LiveRun(self.folder)
         self._done = 0
-        self._met = False  # whether the run's desks have been seen
+        self._met = False  # whether the run's command servers have been seen
 
     @property
     def f_b(self) -> float:
@@ -73,10 +73,10 @@ class Record:
 
     def look_up_laws(self) -> None:
         """Read the laws behind the indices in column ``law`` again: gains may have changed."""
-        desk = announced(self.folder, "controller")
-        if desk is None:  # a foreign controller, or it has ended
+        server = announced(self.folder, "controller")
+        if server is None:  # a foreign controller, or it has ended
             return
-        self.laws = [_law(law["label"], law["name"], law["gains"]) for law in desk["laws"]]
+        self.laws = [_law(law["label"], law["name"], law["gains"]) for law in server["laws"]]
 
     def events(self) -> list[dict[str, Any]]:
         """The events so far, in order of time."""
@@ -96,7 +96,7 @@ class Record:
         return {key: str(content[key]) for key in ("status", "reason")}
 
     def _gone(self) -> dict[str, str] | None:
-        """The end of a run without a summary: its desks were seen and exist no more."""
+        """The end of a run without a summary: its command servers were seen and exist no more."""
         there = bool(present(self.folder))
         self._met |= there
         if self._met and not there:

@@ -80,9 +80,9 @@ class RunCollector(Collector):
                 yield metric
 
     def _seen(self, follower: Follower) -> dict[str, Any]:
-        """The newest tick in words; laws by index if no desk gives their names."""
+        """The newest tick in words; laws by index if no command server gives their names."""
         seen: dict[str, Any] = {}
-        with contextlib.suppress(UserError):  # no desk: in process, not open yet, or not readable
+        with contextlib.suppress(UserError):  # no command server, or none yet
             self._operator = self._operator or Operator(follower.folder)
             seen = self._operator.snapshot()
         done = follower.run.done("controller")
