@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from PIL import Image
 
 from benchmarks.scope_server import measure
-from tests.hil.scope_pages import RIG, Browser, Rig, rig, wait_for
+from tests.support.scope import RIG, Browser, Rig, rig, wait_for
 
 HERE = Path(__file__).resolve().parent
 IN_THE_LAB = RIG.replace("that is told what to do", "in the lab")
