@@ -31,7 +31,7 @@ def test_versus_motulator() -> None:
 
 @pytest.mark.full
 def test_observers() -> None:
-    words = ["--clients", "3", "--turns", "1", "--seconds", "0.3"]
+    words = ["--clients", "3", "--rounds", "1", "--seconds", "0.3"]
     bare, none, many = rows_of("observers", *words)["rows"]
     assert [row["what"] for row in (bare, none, many)] == ["bare pacing", "no client", "clients"]
     assert min(row["ticks"] for row in (bare, none, many)) > 1000
@@ -40,7 +40,7 @@ def test_observers() -> None:
 
 @pytest.mark.full
 def test_keep_awake() -> None:
-    rows = rows_of("keep_awake", "--links", "shm", "--turns", "1", "--seconds", "0.3")
+    rows = rows_of("keep_awake", "--links", "shm", "--rounds", "1", "--seconds", "0.3")
     assert [(row["keep_awake"], row["ticks"]) for row in rows] == [
         ("never", 3000),
         ("always", 3000),

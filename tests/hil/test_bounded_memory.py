@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from gfm_hil.links.base import LONGEST
+from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF
 from gfm_hil.telemetry import blocks
 
 pytestmark = pytest.mark.processes
@@ -232,8 +233,8 @@ def test_what_waits_for_a_reader_is_bounded(reader, attack_now):
 
 
 def test_the_largest_block_gets_through():
-    rows = blocks.Rows("plant", 0, np.ones((5000, len(blocks.COLUMNS["plant"]))),
-                       np.zeros((5000, len(blocks.TIMES["plant"])), np.int64))  # fmt: skip
+    rows = blocks.Rows("plant", 0, np.ones((5000, len(SIGNALS_OF["plant"]))),
+                       np.zeros((5000, len(TIMES_OF["plant"])), np.int64))  # fmt: skip
     (message,) = blocks.messages(rows)
     with zmq.Context() as context, context.socket(zmq.PUB) as sender:
         port = sender.bind_to_random_port("tcp://127.0.0.1")
