@@ -138,7 +138,7 @@ def test_a_set_point_reverts(device, run):
 
 
 @pytest.mark.attack(
-    "10.6", "who moved the set-point over Modbus?", "`by`: operator, whoever it was"
+    "10.6", "who moved the set-point over Modbus?", '`by`: "operator", with no name'
 )
 def test_the_log_says_who_commanded(device, run, attack_now):
     before = len(settled(run))

@@ -245,7 +245,7 @@ def test_whatever_an_event_is_it_is_answered(lab, event, text, attack_now) -> No
     attack_now("refused in one line; the next command from the same page is carried out")
 
 
-@pytest.mark.attack("10.1", "who gave this command?", "`by`: operator, whoever it was")
+@pytest.mark.attack("10.1", "who gave this command?", '`by`: "operator", with no name')
 def test_the_log_says_who_commanded(lab, attack_now) -> None:
     with operator(lab) as page:
         host, port = page.local_address[:2]

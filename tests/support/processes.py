@@ -44,7 +44,7 @@ def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
             return found
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
-    raise AssertionError("waited in vain")
+    raise AssertionError("the condition did not come true in time")
 
 
 def has_run(folder: Path, ticks: int) -> bool:

@@ -62,7 +62,7 @@ def wait_for(what: Callable[[], Any], patience: float = PATIENCE_S) -> Any:
     """Poll until the result is true; returns the result."""
     until = time.monotonic() + patience
     while not (found := what()):
-        assert time.monotonic() < until, "waited in vain"
+        assert time.monotonic() < until, "the condition did not come true in time"
         time.sleep(0.05)
     return found
 

@@ -242,7 +242,7 @@ def _until(take: Callable[[], Any], wanted: Callable[[Any], bool]) -> Any:
     """Call ``take`` until its result is the wanted one."""
     until = time.monotonic() + PATIENCE_S
     while not wanted(found := take()):
-        assert time.monotonic() < until, "waited in vain"
+        assert time.monotonic() < until, "the condition did not come true in time"
         time.sleep(0.002)
     return found
 

@@ -150,10 +150,10 @@ def _next_frame(end, records, r, ctl, sent):
 def _lock(r, k, now, seen, slept):
     """Learn from frame k when the next one will come.
 
-    ``phase`` follows the earliest arrivals against k T, since a late frame was held up and says
-    nothing of the plant's clock. A frame counts as ``seen`` to come only if the loop looked for it
-    in vain first: another may have waited in a link's own thread, which had to run before. A frame
-    that was there after a sleep shows that the sleep was too long.
+    ``phase`` follows the earliest arrivals against k T, because a late frame says nothing of the
+    plant's clock. A frame counts as ``seen`` to arrive only after empty reads: without them it may
+    have waited in a link's own thread. A frame that was there right after a sleep shows that the
+    sleep was too long.
     """
     away = float(now - r.t0 - k * r.T)
     if seen:

@@ -38,7 +38,7 @@ loop_dtype = np.dtype(
     [
         ("realtime", "i8"),
         ("clock_every", "i8"),  # reads of the link between two reads of the clock, at first
-        ("spin_limit", "i8"),  # lockstep: reads in vain after which the loop may sleep
+        ("spin_limit", "i8"),  # lockstep: empty reads after which the loop may sleep
         ("tick", "i8"),  # plant: the next one; controller: the last one received, -1 before
         ("t0", "i8"),  # of tick 0, ns
         ("T", "i8"),  # sampling time, ns
