@@ -106,7 +106,7 @@ def test_side_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
         toml_text({"title": "long", "duration": 600.0, "link": {"peer_timeout_s": 60.0}})
     )
     both = ("--endpoint", endpoint, "--mode", "lockstep", "--quiet")
-    if os.environ["NOTIFY_SOCKET"].startswith("@"):  # a pumped link is tried in one of the two cases
+    if os.environ["NOTIFY_SOCKET"].startswith("@"):  # try a pumped link too
         both += ("--option", "portable=true")
     monkeypatch.setenv("WATCHDOG_USEC", "400000")
     controller = start("controller", str(scenario), *both, "--out", "c")
