@@ -183,11 +183,11 @@ def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing
 def _times(folder: Path) -> Timing:
     """What both sides have recorded so far, as in timing.npz."""
     run = LiveRun(folder)
-    done = min(run.done(side) for side in run.parts)
+    done = min(run.done(role) for role in run.parts)
     return {
-        f"{side}_{name}": np.array(run.columns[f"{side}_{name}"][:done])
-        for side in run.parts
-        for name in TIMES_OF[side]
+        f"{role}_{name}": np.array(run.columns[f"{role}_{name}"][:done])
+        for role in run.parts
+        for name in TIMES_OF[role]
     }
 
 

@@ -22,7 +22,7 @@ from gfm_hil.benchmark.contenders import FRAME, Contender, free_port, memory_fol
 from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.pingpong import LinkEnd
 from gfm_hil.benchmark.rounds import Spread, ratio
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.zeromq.curve import Curve, write_keys
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.realtime.environment import environment
@@ -57,15 +57,15 @@ class Setting:
     sleeps: bool = False
     keys: Path | None = None
 
-    def open(self, side: Side, payload: int) -> LinkEnd:
+    def open(self, role: Role, payload: int) -> LinkEnd:
         """One end; the controller's first."""
-        return LinkEnd(_End(self, side), Contender.messages(side, payload))
+        return LinkEnd(_End(self, role), Contender.messages(role, payload))
 
 
 class _End:
     """A socket with a port, for the loops of the benchmark."""
 
-    def __init__(self, setting: Setting, side: Side) -> None:
+    def __init__(self, setting: Setting, role: Role) -> None:
         self._context = zmq.Context()
         for option, value in setting.context.items():
             self._context.set(option, value)
@@ -74,8 +74,8 @@ class _End:
         self._socket = self._context.socket(setting.kind)
         for option, value in {**ROOM, **setting.options}.items():
             self._socket.set(option, value)
-        self._curve = Curve(self._socket, side, setting.keys) if setting.keys else None
-        if side == "controller":
+        self._curve = Curve(self._socket, role, setting.keys) if setting.keys else None
+        if role == "controller":
             self._socket.bind(setting.endpoint)
         else:
             self._socket.connect(setting.endpoint)

@@ -27,9 +27,9 @@ DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
 ROOT = DEPLOY.parent
 COMPOSE, CONTAINERFILE = (DEPLOY / "container" / n for n in ("compose.yaml", "Containerfile"))
 TUNE = DEPLOY / "tune-realtime"
-SIDES = ("controller", "plant")
+ROLES = ("controller", "plant")
 OBSERVERS = ("modbus", "scope", "stream")
-SERVICES = (*SIDES, "bench", *OBSERVERS)
+SERVICES = (*ROLES, "bench", *OBSERVERS)
 SYSTEM_UNITS = Path("/usr/lib/systemd/system")
 
 needs_systemd = pytest.mark.skipif(
@@ -49,8 +49,8 @@ def call(*command: str | Path, **more: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, text=True, capture_output=True, check=False, **more)
 
 
-def unit(side: str) -> Path:
-    return DEPLOY / "systemd" / f"gfmhil-{side}@.service"
+def unit(role: str) -> Path:
+    return DEPLOY / "systemd" / f"gfmhil-{role}@.service"
 
 
 def settings(path: Path, section: str = "Service") -> dict[str, list[str]]:
@@ -107,15 +107,15 @@ def test_services_expose_little(name):
     assert done.returncode == 0, done.stdout
 
 
-def test_both_services_differ_only_in_their_side():
-    found = [settings(unit(side)) for side in SIDES]
-    for side, service in zip(SIDES, found, strict=True):
-        start = f"/opt/gfmhil/bin/gfmhil {side} /etc/gfmhil/%i.toml"
+def test_both_services_differ_only_in_their_role():
+    found = [settings(unit(role)) for role in ROLES]
+    for role, service in zip(ROLES, found, strict=True):
+        start = f"/opt/gfmhil/bin/gfmhil {role} /etc/gfmhil/%i.toml"
         assert service.pop("ExecStart") == [start]
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("name", [*SIDES, "bench"])
+@pytest.mark.parametrize("name", [*ROLES, "bench"])
 def test_services_fit_the_program(name):
     found = {key: " ".join(values) for key, values in settings(unit(name)).items()}
     assert found["LimitRTPRIO"] == str(PRIORITY)
@@ -215,7 +215,7 @@ def test_image_gets_every_file_that_the_build_needs(tmp_path):
     assert not [name for name in names if "__pycache__" in name]
 
 
-def test_sides_meet_with_the_arguments_keys_and_names_of_the_compose_file(tmp_path):
+def test_roles_meet_with_the_arguments_keys_and_names_of_the_compose_file(tmp_path):
     yaml = pytest.importorskip("yaml")
     keys = tmp_path / "keys"
     assert call(sys.executable, "-m", "gfm_hil", "keys", "--out", keys).returncode == 0
@@ -229,16 +229,16 @@ def test_sides_meet_with_the_arguments_keys_and_names_of_the_compose_file(tmp_pa
         port = str(probe.getsockname()[1])
     services = yaml.safe_load(interpolated(COMPOSE.read_text(), GFMHIL_PORT=port))["services"]
     running = []
-    for side in SIDES:
-        mounted = tmp_path / side  # only the keys that the file mounts for this side
+    for role in ROLES:
+        mounted = tmp_path / role  # only the keys that the file mounts for this side
         mounted.mkdir()
-        for secret in services[side]["secrets"]:
+        for secret in services[role]["secrets"]:
             shutil.copy(keys / secret["source"], mounted / Path(secret["target"]).name)
         words = [
             word.replace("/run/keys", str(mounted)).replace("/etc/gfmhil", str(tmp_path))
-            for word in services[side]["command"]
+            for word in services[role]["command"]
         ]
-        words += ["--out", str(tmp_path / f"{side}-run"), "--quiet"]
+        words += ["--out", str(tmp_path / f"{role}-run"), "--quiet"]
         running.append(
             subprocess.Popen([sys.executable, "-m", "gfm_hil", *words], stderr=subprocess.PIPE)
         )

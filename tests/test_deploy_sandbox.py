@@ -27,7 +27,7 @@ import zmq
 from gfm_hil.scenario.toml_out import toml_text
 
 UNITS = Path(__file__).resolve().parents[1] / "deploy" / "systemd"
-SIDES = ("controller", "plant")
+ROLES = ("controller", "plant")
 PR_SET_NO_NEW_PRIVS, PR_CAPBSET_DROP, CAPABILITIES = 38, 24, range(41)
 PR_SET_MDWE, PR_GET_MDWE = 65, 66
 ALLOW, ERRNO = 0x7FFF0000, 0x00050000  # SCMP_ACT_* of seccomp.h
@@ -48,9 +48,9 @@ pytestmark = [
 ]
 
 
-def setting(side: str, key: str) -> list[str]:
+def setting(role: str, key: str) -> list[str]:
     """The values of one key of a side's unit."""
-    lines = (UNITS / f"gfmhil-{side}@.service").read_text().splitlines()
+    lines = (UNITS / f"gfmhil-{role}@.service").read_text().splitlines()
     return [line.partition("=")[2] for line in lines if line.startswith(f"{key}=")]
 
 
@@ -68,20 +68,20 @@ def calls_of(group: str) -> set[str]:
     return found
 
 
-def confine(side: str) -> Callable[[], None]:
+def confine(role: str) -> Callable[[], None]:
     """A function to call between fork and exec that applies this unit's restrictions."""
     try:
         library = ctypes.CDLL("libseccomp.so.2")
     except OSError:
         pytest.skip("needs libseccomp")
     library.seccomp_init.restype = ctypes.c_void_p
-    permitted = [c for group in setting(side, "SystemCallFilter") for c in calls_of(group)]
+    permitted = [c for group in setting(role, "SystemCallFilter") for c in calls_of(group)]
     libc = ctypes.CDLL(None, use_errno=True)
-    (given,) = setting(side, "CapabilityBoundingSet")
+    (given,) = setting(role, "CapabilityBoundingSet")
     assert given == ""
     limits = []
     for key, (number, same) in LIMITS.items():
-        for value in setting(side, key):
+        for value in setting(role, key):
             limit = resource.RLIM_INFINITY if value == "infinity" else int(value)
             limits.append((number, limit, same))
 
@@ -113,9 +113,9 @@ def state() -> Iterator[Path]:
         yield Path(folder)
 
 
-def environment(side: str, state: Path) -> dict[str, str]:
+def environment(role: str, state: Path) -> dict[str, str]:
     """The unit's Environment=, its directories below ``state``; the loops are compiled already."""
-    words = " ".join(x for x in setting(side, "Environment") if "NUMBA_CACHE_DIR" not in x)
+    words = " ".join(x for x in setting(role, "Environment") if "NUMBA_CACHE_DIR" not in x)
     for specifier in ("%t/gfmhil", "%C/gfmhil"):
         words = words.replace(specifier, str(state))
     return {"PATH": os.environ["PATH"], **dict(word.split("=", 1) for word in words.split())}
@@ -163,7 +163,7 @@ def test_functions_are_compiled_and_kept_within_it_but_not_without_writable_code
     assert "cannot allocate executable memory" in refused.stderr
 
 
-def test_sides_run_in_real_time_within_what_their_units_leave(state):
+def test_roles_run_in_real_time_within_what_their_units_leave(state):
     scenario = state / "rig.toml"
     content: dict[str, Any] = {
         "title": "rig",
@@ -180,22 +180,22 @@ def test_sides_run_in_real_time_within_what_their_units_leave(state):
     scenario.write_text(toml_text(content))
     processes = [
         subprocess.Popen(
-            [sys.executable, "-m", "gfm_hil", side, str(scenario), "--quiet", "--out", side],
-            cwd=state, env=environment(side, state), preexec_fn=confine(side),
+            [sys.executable, "-m", "gfm_hil", role, str(scenario), "--quiet", "--out", role],
+            cwd=state, env=environment(role, state), preexec_fn=confine(role),
             stderr=subprocess.PIPE, text=True,
         )
-        for side in SIDES
+        for role in ROLES
     ]  # fmt: skip
     try:
-        for side, process in zip(SIDES, processes, strict=True):
+        for role, process in zip(ROLES, processes, strict=True):
             _, err = process.communicate(timeout=550)
-            assert (process.returncode, err) == (0, ""), side
+            assert (process.returncode, err) == (0, ""), role
     finally:
         for process in processes:
             process.kill()
             process.wait()
-    for side in SIDES:
-        events = [json.loads(x) for x in (state / side / "events.jsonl").read_text().splitlines()]
+    for role in ROLES:
+        events = [json.loads(x) for x in (state / role / "events.jsonl").read_text().splitlines()]
         (got,) = [event for event in events if event["event"] == "scheduling"]
         assert got["policy"] == "fifo 50"
         assert got["memory_locked"] is True

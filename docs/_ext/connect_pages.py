@@ -119,8 +119,8 @@ def handshake() -> str:
     there, back = Queue[bytes](), Queue[bytes]()
     plant, controller = _Wire(back, there), _Wire(there, back)
 
-    def run(side, link):
-        shake_hands(side, link, scenario, lambda: False, lambda text: None)
+    def run(role, link):
+        shake_hands(role, link, scenario, lambda: False, lambda text: None)
 
     answering = threading.Thread(target=run, args=("controller", controller), daemon=True)
     answering.start()

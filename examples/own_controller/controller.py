@@ -54,7 +54,7 @@ def greet(socket):
         if said["kind"] == "start":
             return
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        answer = {**said, "side": "controller", "boot": boot, "name": NAME}
+        answer = {**said, "role": "controller", "boot": boot, "name": NAME}
         socket.send(GREETING + json.dumps(answer).encode())
 
 

@@ -136,7 +136,7 @@ static double answer_hello(link_t *link, const char *hello) {
         fclose(file);
     }
     const int size = snprintf(answer, sizeof answer,
-                              GREETING "{\"kind\": \"hello\", \"side\": \"controller\", "
+                              GREETING "{\"kind\": \"hello\", \"role\": \"controller\", "
                                        "\"boot\": \"%s\", \"version\": %s, \"table\": %s, "
                                        "\"T_s\": %s, \"laws\": %s, \"digest\": %s, "
                                        "\"name\": \"" NAME "\"}",

@@ -93,7 +93,7 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         predicted[k] = loop.plant.C[1] @ x[: len(loop.plant.A)]
         x = loop.A @ x
     bench.st["x"][0, DELTA] += angle
-    parts = [Part.create(place, side, ticks) for side in ("plant", "controller")]
+    parts = [Part.create(place, role, ticks) for role in ("plant", "controller")]
     done = run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     assert done == ticks
     p = parts[0].signals[:, PLANT_COLUMNS.index("y_p")]

@@ -196,7 +196,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": plant}
     bench = make_bench(check_scenario(content, "test"))
     bench.st["x"][0, DELTA] += 1e-7
-    parts = [Part.create(tmp, side, ticks) for side in ("plant", "controller")]
+    parts = [Part.create(tmp, role, ticks) for role in ("plant", "controller")]
     run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     p = np.diff(parts[0].signals[:, PLANT_COLUMNS.index("true_p")])
     third = ticks // 3

@@ -215,15 +215,15 @@ def _runs(place: Path) -> tuple[Path, Path]:
     held.mkdir(0o700)
     going.mkdir()
     (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")
-    for side in ("plant", "controller"):
-        part = Part.create(going, side, scenario.ticks)
+    for role in ("plant", "controller"):
+        part = Part.create(going, role, scenario.ticks)
         part.signals[:], part.progress[:] = 1.0, (10, 0)
-        (going / f"commands_{side}.json").write_text(
-            f'{{"endpoint": "ipc://{held}/{side}", "T_s": 0.0001, "names": ["vsg-2"], "laws":'
+        (going / f"commands_{role}.json").write_text(
+            f'{{"endpoint": "ipc://{held}/{role}", "T_s": 0.0001, "names": ["vsg-2"], "laws":'
             ' [{"label": "vsg-2", "name": "vsg-2", "gains": {"D_p": 0.01}},'
             ' {"label": "b", "name": "b", "gains": {}}]}'
         )
-        (going / f"events_{side}.jsonl").write_text('{"tick": 1, "t": 0.1, "event": "a"}\n')
+        (going / f"events_{role}.jsonl").write_text('{"tick": 1, "t": 0.1, "event": "a"}\n')
     return finished, going
 
 
@@ -286,11 +286,11 @@ def _segment(place: Path) -> Iterator[Take]:
     path = segment.FOLDER / f"{segment.PREFIX}{name}"
 
     def take(content: bytes) -> None:
-        for side in ("plant", "controller"):
+        for role in ("plant", "controller"):
             path.write_bytes(content.replace(_OWNER, segment._PLANT.pack(*segment.myself())))
             path.chmod(0o600)
             with contextlib.suppress(UserError):
-                link = ShmLink(side, f"shm://{name}")
+                link = ShmLink(role, f"shm://{name}")
                 try:
                     link.wait(0.0)
                     for _ in range(3):

@@ -13,7 +13,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.handshake import _what_runs, shake_hands
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
 from gfm_hil.links.can.layout import plan_of
@@ -92,11 +92,11 @@ def _handshake(place: Path) -> Iterator[Take]:
     def take(script: bytes) -> None:
         for name, value in ours.items():
             script = script.replace(name, value)
-        for side in SIDES:
+        for role in ROLES:
             link, said, now = Liar(script.split(b"\n")), [], time.monotonic_ns()
             try:
                 start = shake_hands(
-                    side, link, SCENARIO, lambda link=link: not link.messages, said.append
+                    role, link, SCENARIO, lambda link=link: not link.messages, said.append
                 )
                 assert abs(start.t0_ns - now) < 24 * 3600e9
             except PeerLost as problem:
@@ -109,8 +109,8 @@ def _handshake(place: Path) -> Iterator[Take]:
 def _hellos() -> st.SearchStrategy[bytes]:
     fit = '"version": @version@, "table": "@table@", "T_s": @T_s@, "laws": "@laws@"'
     both = [
-        f'GFMHIL {{"side": "{side}", "boot": "b", {fit}, "digest": "@digest@", "kind": "hello"}}'
-        for side in SIDES
+        f'GFMHIL {{"role": "{role}", "boot": "b", {fit}, "digest": "@digest@", "kind": "hello"}}'
+        for role in ROLES
     ]
     start = 'GFMHIL {"kind": "start", "t0": 123456789}'
     whole = st.sampled_from([text.encode() for text in (*both, start)])
@@ -123,12 +123,12 @@ def _can(place: Path) -> Iterator[Take]:
     plans = {fd: plan_of(read_dbc(write_dbc(fd))) for fd in (True, False)}
 
     def take(content: bytes) -> None:
-        for fd, side in ((True, "controller"), (False, "plant")):
-            node = Node(plans[fd], side, CanOptions(fd=fd))
+        for fd, role in ((True, "controller"), (False, "plant")):
+            node = Node(plans[fd], role, CanOptions(fd=fd))
             untouched = [part.copy() for part in (node.sender, node.sockets, node.out)]
             room = np.full(LONGEST + 128, 0xA5, np.uint8)
-            reader = FrameReader("y" if side == "controller" else "u")
-            values = np.empty(NY if side == "controller" else NU)
+            reader = FrameReader("y" if role == "controller" else "u")
+            values = np.empty(NY if role == "controller" else NU)
             for at in range(0, len(content), 69):
                 frame, piece = np.zeros(1, frame_dtype), content[at : at + 69].ljust(69, b"\0")
                 frame["id"], frame["length"] = struct.unpack("<IB", piece[:5])
@@ -149,11 +149,11 @@ def _can(place: Path) -> Iterator[Take]:
 
 def _can_seeds() -> list[bytes]:
     seeds = []
-    for fd, side, group, values in ((True, "plant", "y", Y), (False, "controller", "u", Y[:NU])):
+    for fd, role, group, values in ((True, "plant", "y", Y), (False, "controller", "u", Y[:NU])):
         plan = plan_of(read_dbc(write_dbc(fd)))
         sender, writer = VectorSender(plan, group, 3), FrameWriter(group)
         frames = [f for k in range(4) for f in sender.frames(writer.pack(k, 2, 0, values))]
-        frames += SegmentSender(plan, side).frames(b'GFMHIL {"kind": "hello", "side": "plant"}' * 4)
+        frames += SegmentSender(plan, role).frames(b'GFMHIL {"kind": "hello", "role": "plant"}' * 4)
         seeds.append(b"".join(struct.pack("<IB64s", n, len(d), d) for n, d in frames))
     return seeds
 

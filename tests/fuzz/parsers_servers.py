@@ -20,7 +20,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.announcement import announcement
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
@@ -203,7 +203,7 @@ def _commands(place: Path) -> Iterator[Take]:
     context = zmq.Context()
     with contextlib.ExitStack() as stack:
         stack.callback(context.destroy, linger=0)
-        loops = [stack.enter_context(_loop(place, side)) for side in SIDES]
+        loops = [stack.enter_context(_loop(place, role)) for role in ROLES]
 
         def take(message: bytes) -> None:
             for endpoint, stopped in loops:
@@ -222,10 +222,10 @@ def _commands(place: Path) -> Iterator[Take]:
 
 
 @contextlib.contextmanager
-def _loop(place: Path, side: Any) -> Iterator[tuple[str, list[bool]]]:
+def _loop(place: Path, role: Any) -> Iterator[tuple[str, list[bool]]]:
     """A command server whose loop only carries out commands; yields its place and the stops."""
     bench, stopped, bell, over = make_bench(SCENARIO), [], threading.Event(), threading.Event()
-    timeline = Timeline(bench, place / f"events_{side}.jsonl", (side,))
+    timeline = Timeline(bench, place / f"events_{role}.jsonl", (role,))
 
     def work() -> None:
         for tick in range(2**40):
@@ -238,8 +238,8 @@ def _loop(place: Path, side: Any) -> Iterator[tuple[str, list[bool]]]:
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        with CommandServer(side, bench, timeline, place, bell.set, lambda: stopped.append(True)):
-            found = json.loads(announcement(place, side).read_text())
+        with CommandServer(role, bench, timeline, place, bell.set, lambda: stopped.append(True)):
+            found = json.loads(announcement(place, role).read_text())
             yield found["endpoint"], stopped
         assert thread.is_alive()
     finally:

@@ -19,7 +19,7 @@ import can
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import load_scenario
@@ -114,15 +114,15 @@ with can.Bus(interface="socketcan", channel="vcan0", fd=True) as bus:
 
 def test_another_dbc_is_refused_by_both_processes():
     Path("other.dbc").write_text(write_dbc(True).replace("(0.0002,0.0)", "(0.0004,0.0)"))
-    sides = {
+    roles = {
         "controller": start("controller", write("one.toml", {}), "--out", "one"),
         "plant": start(
             "plant", write("two.toml", {"options": {"dbc": "other.dbc"}}), "--out", "two"
         ),
     }
-    for side, process in sides.items():
+    for role, process in roles.items():
         said = process.communicate(timeout=PATIENCE_S)[0]
-        other = SIDES[1 - SIDES.index(side)]
+        other = ROLES[1 - ROLES.index(role)]
         assert f"the {other} uses another DBC" in " ".join(said.split())
         assert process.returncode == 3
 

@@ -64,7 +64,7 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path: Path, capsys: Any) -
 @pytest.mark.apt
 def test_the_message_is_the_frame_unless_told_otherwise() -> None:
     payload = parser("bench").parse_args(["bench", "latency"]).payload
-    there, back = (Contender.messages(side, payload) for side in ("plant", "controller"))
+    there, back = (Contender.messages(role, payload) for role in ("plant", "controller"))
     assert (there.shape[1], back.shape[1]) == (payload, 48) == (FRAME, 48)
     assert bytes(there[0, :2]) == bytes(back[0, :2]) == b"GF"
     assert Contender.messages("controller", 100).shape[1] == 100

@@ -57,11 +57,11 @@ def test_frame_that_never_came_is_the_links() -> None:
     assert found(timing) == ["link"]
 
 
-@pytest.mark.parametrize("side", ["plant", "controller"])
-def test_side_that_stood_still_while_it_looked(side: str) -> None:
+@pytest.mark.parametrize("role", ["plant", "controller"])
+def test_role_that_stood_still_while_it_looked(role: str) -> None:
     timing = good()
-    timing[f"{side}_stall"][7] = 85_000
-    if side == "controller":
+    timing[f"{role}_stall"][7] = 85_000
+    if role == "controller":
         timing["controller_received"][7] += 85_000
         timing["controller_sent"][7] += 85_000
     timing["plant_received"][7] = -1

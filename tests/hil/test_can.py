@@ -16,7 +16,7 @@ import pytest
 from numba import njit
 
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.can.dbc import write_dbc
@@ -60,16 +60,16 @@ def stranger(endpoint: str) -> Iterator[LoopbackBus]:
     bus.shutdown()
 
 
-def both_sides(
+def both_roles(
     scenario: Scenario,
     folder: Path,
     endpoint: str,
-    touch: Callable[[Side, Link], Link] = lambda side, link: link,
+    touch: Callable[[Role, Link], Link] = lambda role, link: link,
     **options: Any,
-) -> tuple[dict[str, np.ndarray], dict[Side, tuple[dict, dict]]]:
+) -> tuple[dict[str, np.ndarray], dict[Role, tuple[dict, dict]]]:
     """Run a scenario over CAN: the signals, and each side's faults and counters."""
     pair = run_pair(scenario, folder, "can", options, touch, endpoint=endpoint)
-    return pair.signals, {side: (pair.faults[side], pair.counters[side]) for side in SIDES}
+    return pair.signals, {role: (pair.faults[role], pair.counters[role]) for role in ROLES}
 
 
 BOTH_WAYS = pytest.mark.parametrize("portable", [True, False])
@@ -85,7 +85,7 @@ def test_lockstep_over_can_is_a_run_in_process_in_counts(
     content = {"law": law, "plant": plant, "duration": 0.03, "seed": 7}
     content |= {"link": PATIENT, "events": EVENTS}
     scenario = make(**content)
-    apart, found = both_sides(scenario, tmp_path, endpoint, portable=portable)
+    apart, found = both_roles(scenario, tmp_path, endpoint, portable=portable)
     expected = quantised_run(scenario, tmp_path)
     assert np.ptp(apart["true_p"]) > 0
     for name, column in expected.items():
@@ -103,7 +103,7 @@ def test_lockstep_over_can_is_a_run_in_process_in_counts(
 def test_every_nth_tick_only_is_a_hold_and_a_delay(every, fd, portable, make, tmp_path, endpoint):
     content = {"duration": 0.0302, "law": "vsg-2", "link": PATIENT, "events": EVENTS}
     options = {"every": every, "fd": fd, "portable": portable}
-    apart, found = both_sides(make(**content), tmp_path, endpoint, **options)
+    apart, found = both_roles(make(**content), tmp_path, endpoint, **options)
     expected = quantised_run(make(**content), tmp_path, every)
     for name, column in expected.items():
         assert apart[name].tobytes() == column.tobytes(), name
@@ -116,7 +116,7 @@ def test_any_backend_of_python_can(make, tmp_path):
     """With python-can's virtual bus for tests, classic CAN: a vector in two frames."""
     scenario = make(duration=0.02, law="vsg-2", link=PATIENT, events=EVENTS)
     options = {"interface": "virtual", "fd": False, "every": 4}
-    apart, _ = both_sides(scenario, tmp_path, "can://test", **options)
+    apart, _ = both_roles(scenario, tmp_path, "can://test", **options)
     assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path, 4)["true_p"].tobytes()
 
 
@@ -137,14 +137,14 @@ def test_a_flood_of_frames_of_others_changes_nothing(portable, make, tmp_path, e
 
     thread = threading.Thread(target=flood)
 
-    def touch(side: Side, link: Link) -> Link:
-        if side == "controller":  # both are on the bus, after the handshake
+    def touch(role: Role, link: Link) -> Link:
+        if role == "controller":  # both are on the bus, after the handshake
             send(others[0])  # at least one, even if the other thread hardly runs
             thread.start()
         return link
 
     try:
-        apart, found = both_sides(scenario, tmp_path, endpoint, touch, portable=portable)
+        apart, found = both_roles(scenario, tmp_path, endpoint, touch, portable=portable)
     finally:
         over.set()
         if thread.is_alive():
@@ -168,8 +168,8 @@ def test_frames_in_our_name_without_our_check_are_refused(
     # a late greeting: a handshake message between the frames
     greeting = SegmentSender(load_plan(CanOptions()), "plant").frames(b"?" * 100)
 
-    def touch(side: Side, link: Link) -> Link:
-        if side == "controller":  # after the handshake: later frames go to the loops
+    def touch(role: Role, link: Link) -> Link:
+        if role == "controller":  # after the handshake: later frames go to the loops
             for _ in range(bad):
                 stranger.send(disturbance)
             for number, data in greeting:
@@ -178,7 +178,7 @@ def test_frames_in_our_name_without_our_check_are_refused(
                 )
         return link
 
-    apart, found = both_sides(scenario, tmp_path, endpoint, touch, portable=portable)
+    apart, found = both_roles(scenario, tmp_path, endpoint, touch, portable=portable)
     assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()
     faults, _ = found["controller"]
     assert (faults["crc"], faults["size"]) == (bad, 1)
@@ -194,9 +194,9 @@ def portable() -> bool:
 
 
 @pytest.fixture
-def pair(endpoint: str, portable: bool) -> Iterator[dict[Side, Any]]:
+def pair(endpoint: str, portable: bool) -> Iterator[dict[Role, Any]]:
     """Both ends of a link."""
-    ends = {side: open_link("can", side, endpoint, {"portable": portable}) for side in SIDES}
+    ends = {role: open_link("can", role, endpoint, {"portable": portable}) for role in ROLES}
     yield ends
     for end in ends.values():
         end.close()
@@ -272,12 +272,12 @@ def call_port(function, handle, message):
 def test_a_bus_that_goes_away_ends_a_compiled_run(make, tmp_path, endpoint, stranger):
     off = can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False)
 
-    def touch(side: Side, link: Link) -> Link:
+    def touch(role: Role, link: Link) -> Link:
         stranger.send(off)
         return link
 
     with pytest.raises(PeerLost, match="went bus off"):
-        both_sides(make(duration=10.0, link=PATIENT), tmp_path, endpoint, touch)
+        both_roles(make(duration=10.0, link=PATIENT), tmp_path, endpoint, touch)
 
 
 @pytest.mark.parametrize("portable", [True])
@@ -293,14 +293,14 @@ def test_a_full_buffer_is_said_and_counted(pair, monkeypatch, number):
     assert not end.send(b"a message")
 
 
-def test_another_dbc_is_refused_on_both_sides(make, tmp_path, endpoint):
+def test_another_dbc_is_refused_on_both_roles(make, tmp_path, endpoint):
     other = tmp_path / "other.dbc"
     other.write_text(write_dbc(True).replace("(0.0002,0.0)", "(0.0004,0.0)"))
 
-    def call(side: Side) -> None:
-        link = open_link("can", side, endpoint, {"dbc": str(other)} if side == "plant" else {})
+    def call(role: Role) -> None:
+        link = open_link("can", role, endpoint, {"dbc": str(other)} if role == "plant" else {})
         try:
-            shake_hands(side, link, make(link=PATIENT), lambda: False, lambda text: None)
+            shake_hands(role, link, make(link=PATIENT), lambda: False, lambda text: None)
         finally:
             link.close()
 
@@ -314,6 +314,6 @@ def test_another_dbc_is_refused_on_both_sides(make, tmp_path, endpoint):
 def test_an_emulated_bus_changes_when_and_not_what(portable, make, tmp_path, endpoint):
     scenario = make(duration=0.005, law="vsg-2", link={**PATIENT, "repeat_s": 5.0})
     began = time.monotonic()
-    apart, _ = both_sides(scenario, tmp_path, endpoint, emulate=True, portable=portable)
+    apart, _ = both_roles(scenario, tmp_path, endpoint, emulate=True, portable=portable)
     assert time.monotonic() - began > scenario.ticks * 90e-6  # of 97.1 µs an exchange
     assert apart["true_p"].tobytes() == quantised_run(scenario, tmp_path)["true_p"].tobytes()

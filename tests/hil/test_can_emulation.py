@@ -131,7 +131,7 @@ def test_a_link_waits_for_what_is_on_the_bus(tmp_path: Path, portable):
     """A segment of the handshake, 13 ms at 10 kbit/s."""
     slow = {"fd": False, "bitrate": 10_000, "every": 50, "emulate": True, "portable": portable}
     endpoint = link_kind("can").fresh(tmp_path)
-    one, other = (open_link("can", side, endpoint, slow) for side in ("plant", "controller"))
+    one, other = (open_link("can", role, endpoint, slow) for role in ("plant", "controller"))
     try:
         one.send(b"")
         assert not other.wait(0.001)

@@ -20,7 +20,7 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 from websockets.sync.client import ClientConnection, connect
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
@@ -55,7 +55,7 @@ def lab(tmp_path) -> Iterator[tuple[Path, list[subprocess.Popen[str]]]]:
     started = [run]
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (4096, before[1]))
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in SIDES))
+        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
         for server, *options in (["scope"], ["modbus", "--heartbeat", "30000"]):
             command = [server, str(folder), "--port", "0", *options]
             started.append(begin(*command, preexec_fn=few))

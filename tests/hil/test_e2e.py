@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links.frame import FrameError, FrameReader
 from gfm_hil.scenario.model import Scenario
@@ -17,13 +17,13 @@ from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 from ..support.frames import FAR, REALTIME, T_NS, Forger
 
-by_side = pytest.mark.parametrize("side", SIDES)
+by_role = pytest.mark.parametrize("role", ROLES)
 
 
-def limited(side: Side, scenario: Scenario) -> FrameReader:
+def limited(role: Role, scenario: Scenario) -> FrameReader:
     """The reader of a side in real time, the plant's at tick 100, after a good frame of tick 90."""
-    reader = FrameReader.of(side, scenario)
-    if side == "plant":
+    reader = FrameReader.of(role, scenario)
+    if role == "plant":
         reader.record["newest"] = 100
     reader.unpack(Forger(reader.group).forge(90, 0), np.zeros(len(names(reader.group))))
     return reader
@@ -46,10 +46,10 @@ def fault_of(reader: FrameReader, sequence: int, tick: int, state: int = 0, reas
 
 
 @pytest.mark.attack("1.1", "a good CRC, and a frozen, far, old or skipped tick", "used")
-@by_side
+@by_role
 @pytest.mark.parametrize("tick", [90, 89, FAR, 90 + 5_002, 2**63 + 91, 2**64 - 1])
-def test_a_tick_at_which_the_peer_cannot_be_is_refused(side, tick, make):
-    reader = limited(side, make(**REALTIME))
+def test_a_tick_at_which_the_peer_cannot_be_is_refused(role, tick, make):
+    reader = limited(role, make(**REALTIME))
     assert fault_of(reader, 1, tick) == "tick"
     assert fault_of(reader, 1, 91) == ""  # as if the refused one had never come
 
@@ -66,27 +66,27 @@ def test_u_is_taken_from_k_minus_hold_to_k_and_no_other(make, attack_now):
 
 
 @pytest.mark.attack("1.3", "a state byte of 99 or a reason byte of 200", "running; IndexError")
-@by_side
+@by_role
 @pytest.mark.parametrize(("state", "reason"), [(5, 0), (99, 0), (255, 0), (SAFE, 7), (0, 200)])
-def test_a_state_or_reason_without_a_meaning_is_refused(side, state, reason, make):
-    reader = limited(side, make(**REALTIME))
+def test_a_state_or_reason_without_a_meaning_is_refused(role, state, reason, make):
+    reader = limited(role, make(**REALTIME))
     assert fault_of(reader, 1, 91, state, reason) == "state"
     assert fault_of(reader, 1, 91, SAFE, len(REASONS) - 1) == ""
 
 
 @pytest.mark.attack("1.4", "a frame replayed after the sequence has wrapped", "used")
-@by_side
-def test_a_replay_after_the_wrap_is_refused_for_its_tick(side, make):
-    reader = limited(side, make(**REALTIME))
+@by_role
+def test_a_replay_after_the_wrap_is_refused_for_its_tick(role, make):
+    reader = limited(role, make(**REALTIME))
     reader.record["next"] = 5  # the sequence has wrapped; 7 once belonged to tick 7
     assert fault_of(reader, 7, 7) == "tick"
     assert fault_of(reader, 5, 91) == ""
 
 
 @pytest.mark.attack("1.5", "a sequence that jumps by two thousand million", "used")
-@by_side
-def test_a_jump_of_the_sequence_is_bounded(side, make, attack_now):
-    reader = limited(side, make(**REALTIME))
+@by_role
+def test_a_jump_of_the_sequence_is_bounded(role, make, attack_now):
+    reader = limited(role, make(**REALTIME))
     jump = int(reader.record["jump"][0])
     assert fault_of(reader, 2 + jump, 91) == "out_of_sequence"
     assert fault_of(reader, 2**31, 91) == "out_of_sequence"
@@ -95,14 +95,14 @@ def test_a_jump_of_the_sequence_is_bounded(side, make, attack_now):
     attack_now(f"refused beyond {jump} missing frames")
 
 
-@by_side
-def test_a_peer_that_leaves_is_heard_under_its_last_tick_and_the_next(side, make):
+@by_role
+def test_a_peer_that_leaves_is_heard_under_its_last_tick_and_the_next(role, make):
     for tick, fault in ((90, ""), (101, ""), (89, "tick"), (2**62, "tick")):
-        reader = limited(side, make(**REALTIME))
+        reader = limited(role, make(**REALTIME))
         reader.record["newest"] = 100
         assert fault_of(reader, 1, tick, STOPPED) == fault
         assert reader.left == (not fault)
-    late = limited(side, make(**REALTIME, after_trip="wait"))
+    late = limited(role, make(**REALTIME, after_trip="wait"))
     assert fault_of(late, 1, 90, SAFE) == "tick"  # in this scenario a safe side keeps running
 
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.loop_thread import run_loop
-from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
@@ -38,8 +38,8 @@ from ..support.links import LINKS
 pytestmark = pytest.mark.processes
 
 BAD = np.array([0.9, 1.05, 0.8])  # a u that no honest frame of these tests carries
-GROUPS: dict[Side, Group] = {"plant": "u", "controller": "y"}  # what each side hears
-OTHER: dict[Side, Side] = {"plant": "controller", "controller": "plant"}
+GROUPS: dict[Role, Group] = {"plant": "u", "controller": "y"}  # what each side hears
+OTHER: dict[Role, Role] = {"plant": "controller", "controller": "plant"}
 LIMIT_S = 20.0
 LOCKSTEP = {"mode": "lockstep", "duration": 4.0}
 
@@ -49,11 +49,11 @@ by_link = pytest.mark.parametrize("link", LINKS)
 class Liar:
     """The other side's end of the link, and its received frames: time, tick, state, reason."""
 
-    def __init__(self, link: Link, side: Side) -> None:
+    def __init__(self, link: Link, role: Role) -> None:
         self._link, self.over = link, threading.Event()
-        self.usual = 0 if side == "plant" else RUNNING
-        self.forger = Forger("y" if side == "plant" else "u")
-        self.reader = FrameReader(GROUPS[side])
+        self.usual = 0 if role == "plant" else RUNNING
+        self.forger = Forger("y" if role == "plant" else "u")
+        self.reader = FrameReader(GROUPS[role])
         self.heard: list[tuple[int, int, int, int]] = []
 
     def say(self, tick: int, state: int | None = None, reason: int = 0, values: Any = None) -> None:
@@ -101,16 +101,16 @@ class Found:
 
 
 def lied_to(
-    side: Side, scenario: Scenario, folder: Path, link: str, lie: Callable[[Liar], None]
+    role: Role, scenario: Scenario, folder: Path, link: str, lie: Callable[[Liar], None]
 ) -> Found:
     """Run one side over one of ``LINKS`` against a peer that runs ``lie``."""
     name, options = LINKS[link]
     endpoint = link_kind(name).fresh(folder)
-    bench, part = make_bench(scenario), Part.create(folder, side, scenario.ticks)
-    compile_side(side, bench, part)
-    ends = {s: open_link(name, s, endpoint, options) for s in SIDES}
-    liar = Liar(ends[OTHER[side]], OTHER[side])
-    timeline = Timeline(bench, folder / "events.jsonl", (side,))
+    bench, part = make_bench(scenario), Part.create(folder, role, scenario.ticks)
+    compile_role(role, bench, part)
+    ends = {s: open_link(name, s, endpoint, options) for s in ROLES}
+    liar = Liar(ends[OTHER[role]], OTHER[role])
+    timeline = Timeline(bench, folder / "events.jsonl", (role,))
     thread = threading.Thread(target=lie, args=(liar,))
     begin = time.monotonic()
 
@@ -119,14 +119,14 @@ def lied_to(
 
     try:
         thread.start()
-        assert ends[side].wait(30)
+        assert ends[role].wait(30)
         t0 = time.monotonic_ns()
-        reader = run_loop(side, bench, ends[side], part, timeline, t0, stopped)
+        reader = run_loop(role, bench, ends[role], part, timeline, t0, stopped)
         liar.over.set()
         thread.join()
         give_up = time.monotonic() + LIMIT_S
         while not liar.heard_the_end() and time.monotonic() < give_up:
-            ends[OTHER[side]].wait(0.1)
+            ends[OTHER[role]].wait(0.1)
             liar.listen()
     finally:
         liar.over.set()
@@ -154,7 +154,7 @@ def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now
     assert set(found.refused) <= {"tick"}
     assert found.reader.e2e == "invalid"
     faults = found.reader.faults
-    end = {"side": "controller", "faults": faults, "e2e": found.reader.e2e, "one_clock": True}
+    end = {"role": "controller", "faults": faults, "e2e": found.reader.e2e, "one_clock": True}
     (place / "link_controller.json").write_text(json.dumps(end), encoding="utf-8")
     (place / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     summary = finish(scenario, place, [scenario.law], 0.0, figures=False).summary

@@ -82,10 +82,10 @@ def exported(folder: Path, place: Path) -> tuple[list[can.Message], cantools.dat
 def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, frames):
     heard = run_over_can(tmp_path / "run", port, **options)
     found, dbc = exported(tmp_path / "run", tmp_path)
-    for side, group, count in (("plant", "y", frames["y"]), ("controller", "u", frames["u"])):
+    for role, group, count in (("plant", "y", frames["y"]), ("controller", "u", frames["u"])):
         numbers = {m.frame_id for m in dbc.messages if m.name.startswith(VECTORS[group])}
         assert len(numbers) == count
-        numbers.add(dbc.get_message_by_name(STATUS[side]).frame_id)
+        numbers.add(dbc.get_message_by_name(STATUS[role]).frame_id)
         there = [(m.arbitration_id, bytes(m.data), m.is_fd) for m in heard
                  if m.arbitration_id in numbers]  # fmt: skip
         rebuilt = [(m.arbitration_id, bytes(m.data), m.is_fd) for m in found
@@ -93,7 +93,7 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
         assert rebuilt == there[: len(rebuilt)]
         # the rest: a side's last frames and, of u, frames that the plant no longer read
         said_last = (count + 1) * LAST
-        nobody_took = count if side == "controller" and options.get("every", 1) > 1 else 0
+        nobody_took = count if role == "controller" and options.get("every", 1) > 1 else 0
         assert 0 < len(there) - len(rebuilt) <= said_last + nobody_took
     segments = {dbc.get_message_by_name(name).frame_id for name in SEGMENT.values()}
     assert not segments & {m.arbitration_id for m in found}
@@ -138,8 +138,8 @@ def test_a_safe_state_is_said_with_its_reason(tmp_path):
     }
     heard = run_over_can(tmp_path / "run", 19540, content)
     found, dbc = exported(tmp_path / "run", tmp_path)
-    for side in ("plant", "controller"):
-        message = dbc.get_message_by_name(STATUS[side])
+    for role in ("plant", "controller"):
+        message = dbc.get_message_by_name(STATUS[role])
         told = [bytes(m.data) for m in heard if m.arbitration_id == message.frame_id]
         again = [bytes(m.data) for m in found if m.arbitration_id == message.frame_id]
         assert again == told[: len(again)]
@@ -148,7 +148,7 @@ def test_a_safe_state_is_said_with_its_reason(tmp_path):
         assert ("SAFE", "the plant's protection tripped") in said
 
 
-def test_both_sides_are_needed(run, tmp_path):
+def test_both_roles_are_needed(run, tmp_path):
     folder = run(duration=0.02).folder
     with np.load(folder / "signals.npz") as file:
         kept = {name: file[name] for name in file.files if not name.startswith("y_")}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.scenario.model import check_scenario
 
 from ..support.links import LINKS, PATIENT, Pair, run_pair
@@ -57,12 +57,12 @@ def unharmed(link: str, ticks: int) -> dict[str, np.ndarray]:
 
 def check(pair: Pair, link: str, ticks: int) -> None:
     """Check that the signals are unchanged, and that exactly the injected faults are counted."""
-    assert {side: end[0] for side, end in pair.ends().items()} == dict.fromkeys(SIDES, "completed")
+    assert {role: end[0] for role, end in pair.ends().items()} == dict.fromkeys(ROLES, "completed")
     plain = unharmed(link, ticks)
     for name in plain:
         assert pair.signals[name].tobytes() == plain[name].tobytes(), name
-    for side, other in zip(SIDES, reversed(SIDES), strict=True):
-        i, faults = pair.injected[side], pair.faults[side]
+    for role, other in zip(ROLES, reversed(ROLES), strict=True):
+        i, faults = pair.injected[role], pair.faults[role]
         assert i["seen"] >= ticks
         assert faults["crc"] == i["corrupted"]
         gone = i["lost"] + i["corrupted"] + i["reordered"] + i["dropped"]
@@ -80,7 +80,7 @@ def test_every_fault_is_counted_and_no_result_changes(link, kind, place):
     check(pair, link, TICKS)
     if "delay" not in IMPAIRMENTS[kind]:
         hit = ("lost", "corrupted", "duplicated", "reordered", "paused")
-        assert all(sum(pair.injected[side][h] for h in hit) > 0 for side in SIDES)
+        assert all(sum(pair.injected[role][h] for h in hit) > 0 for role in ROLES)
 
 
 @pytest.mark.skipif(
@@ -100,8 +100,8 @@ def test_every_fault_is_counted_in_a_hundred_thousand_ticks(link, kind, place):
 
 def row(link: str, kind: str, pair: Pair) -> str:
     """The sum of both sides' counters as a row of a table in Markdown."""
-    i = {name: sum(pair.injected[s][name] for s in SIDES) for name in pair.injected["plant"]}
-    f = {name: sum(pair.faults[s][name] for s in SIDES) for name in pair.faults["plant"]}
+    i = {name: sum(pair.injected[s][name] for s in ROLES) for name in pair.injected["plant"]}
+    f = {name: sum(pair.faults[s][name] for s in ROLES) for name in pair.faults["plant"]}
     told = [i[n] for n in ("seen", "lost", "corrupted", "duplicated", "reordered", "refused")]
     counted = [f[n] for n in ("lost", "crc", "repeated", "out_of_sequence")]
     return f"| {link} | {kind} | " + " | ".join(f"{n:,}" for n in (*told, *counted)) + " |"

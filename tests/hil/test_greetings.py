@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine import handshake
 from gfm_hil.engine.handshake import Start, shake_hands
 from gfm_hil.links import Link, open_link
@@ -30,21 +30,21 @@ __all__ = ["shm_endpoint"]
 
 SHORT = {**PATIENT, "start_timeout_s": 0.8}
 DAY_NS = 86_400_000_000_000
-Ends = dict[Side, Link]
+Ends = dict[Role, Link]
 
 
 @pytest.fixture(params=["zmq", "shm"])
 def ends(request, endpoint, shm_endpoint) -> Iterator[Ends]:
     where = endpoint if request.param == "zmq" else shm_endpoint
-    links: Ends = {side: open_link(request.param, side, where) for side in SIDES}
+    links: Ends = {role: open_link(request.param, role, where) for role in ROLES}
     yield links
-    for side in reversed(SIDES):
-        links[side].close()
+    for role in reversed(ROLES):
+        links[role].close()
 
 
 def hello(scenario: Scenario, **other: Any) -> bytes:
     """The plant's greeting, with the given changes."""
-    said = {"kind": "hello", "side": "plant", "boot": handshake._boot()}
+    said = {"kind": "hello", "role": "plant", "boot": handshake._boot()}
     return b"GFMHIL " + json.dumps({**said, **handshake._what_runs(scenario), **other}).encode()
 
 
@@ -64,7 +64,7 @@ NO_GREETINGS = {
     "[]": "should be an object",
     "[" * 400: "recursion limit",
     '{"kind": "hello", "si': "Invalid JSON: EOF",
-    '{"kind": "hello", "side": "plant", "boot": 1}': "hello.boot: Input should be a valid string",
+    '{"kind": "hello", "role": "plant", "boot": 1}': "hello.boot: Input should be a valid string",
     '{"kind": "\\u001b[2J"}': r"kind = '\x1b[2J': must be one of 'hello', 'start'",
     "\x1b[2J\udcff": r"not b'\x1b[2J\xff'",
     start("1e999")[7:].decode(): "start.t0: Input should be a valid integer, not inf",
@@ -136,7 +136,7 @@ def test_a_long_greeting_is_refused_before_it_is_read(make, attack_now):
 @pytest.mark.parametrize("name", ["", " x", "x" * 65, "\x1b[2J", "x\n", "\u202ex"])
 def test_a_controller_whose_name_cannot_be_printed_is_refused(name, make):
     with pytest.raises(handshake._Refused, match=r"hello\.name: String should match"):
-        handshake._read(hello(make(), side="controller", name=name))
+        handshake._read(hello(make(), role="controller", name=name))
 
 
 def test_a_peer_that_says_nothing_is_told_from_none(ends, make):
@@ -144,9 +144,9 @@ def test_a_peer_that_says_nothing_is_told_from_none(ends, make):
     ends["plant"].send(b"x")  # so that it is connected
     assert ends["controller"].wait(30)
     ends["controller"].receive()
-    for side in SIDES:  # the controller first: the plant's greetings would wait for it
+    for role in ROLES:  # the controller first: the plant's greetings would wait for it
         with pytest.raises(PeerLost, match="; a peer is connected but says nothing"):
-            shake_hands(side, ends[side], make(link=SHORT), lambda: False, said.append)
+            shake_hands(role, ends[role], make(link=SHORT), lambda: False, said.append)
     assert len(said) == 2
     assert all(text.endswith(" …; a peer is connected but says nothing") for text in said)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine import handshake
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links.can.link import CanLink
@@ -26,22 +26,22 @@ from ..support.links import PATIENT, in_threads, run_pair
 pytestmark = pytest.mark.processes
 
 
-def meet(scenarios: dict[Side, Scenario], endpoint: str) -> dict[Side, Any]:
+def meet(scenarios: dict[Role, Scenario], endpoint: str) -> dict[Role, Any]:
     """Shake hands, each side with its scenario."""
 
-    def call(side: Side) -> Any:
-        link = ZmqLink(side, endpoint)
+    def call(role: Role) -> Any:
+        link = ZmqLink(role, endpoint)
         try:
-            return shake_hands(side, link, scenarios[side], lambda: False, lambda text: None)
+            return shake_hands(role, link, scenarios[role], lambda: False, lambda text: None)
         finally:
             link.close()
 
     return in_threads(call)
 
 
-def test_both_sides_agree_on_the_start(make, endpoint):
+def test_both_roles_agree_on_the_start(make, endpoint):
     scenario = make(link=PATIENT)
-    found = meet(dict.fromkeys(SIDES, scenario), endpoint)
+    found = meet(dict.fromkeys(ROLES, scenario), endpoint)
     assert found["controller"] == found["plant"]
     assert found["plant"].t0_ns > 0 and found["plant"].one_clock
     assert found["plant"].controller == "gfmhil" and len(found["plant"].run) == 16
@@ -52,7 +52,7 @@ def test_another_clock_is_not_read_as_ours(make, endpoint, monkeypatch):
     boots = iter(["one", "another"])
     monkeypatch.setattr("gfm_hil.engine.handshake._boot", lambda: next(boots))
     before = time.monotonic_ns()
-    found = meet(dict.fromkeys(SIDES, make(link=PATIENT)), endpoint)
+    found = meet(dict.fromkeys(ROLES, make(link=PATIENT)), endpoint)
     assert not found["plant"].one_clock and not found["controller"].one_clock
     assert before < found["controller"].t0_ns < time.monotonic_ns() + 20_000_000
 
@@ -78,7 +78,7 @@ def test_the_drift_of_two_clocks_is_read_off_the_earliest_arrivals():
         ({"T_s": 5e-5}, "sampling time T_s (5e-05, ours is 0.0001)"),
     ],
 )
-def test_a_misfit_is_refused_on_both_sides_and_named(other, name, make, endpoint):
+def test_a_misfit_is_refused_on_both_roles_and_named(other, name, make, endpoint):
     found = meet({"controller": make(link=PATIENT), "plant": make(link=PATIENT, **other)}, endpoint)
     assert isinstance(found["controller"], PeerLost)
     assert isinstance(found["plant"], PeerLost)
@@ -95,7 +95,7 @@ def test_a_misfit_of_signal_tables_is_named(what, name, make, endpoint, monkeypa
     new = 77 if what == "TABLE_VERSION" else lambda: next(given)
     link, scenario = ZmqLink("plant", endpoint), make(link=PATIENT)
     monkeypatch.setattr(handshake, what, new)
-    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
     monkeypatch.undo()
     controller = ZmqLink("controller", endpoint)
     try:
@@ -112,7 +112,7 @@ def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
     """From the first HELLO on, silence means that the peer is lost."""
     link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
     scenario = make(link={**PATIENT, "peer_timeout_s": 0.3})
-    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
     try:
         link.send(b"GFMHIL " + json.dumps(hello).encode())
         with pytest.raises(PeerLost, match="the plant came but did not start"):
@@ -126,7 +126,7 @@ def test_a_frame_says_that_the_plant_has_started(make, endpoint):
     """A frame also tells when, if START was lost; other messages do not."""
     link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
     scenario, frames = make(link=PATIENT), FrameWriter("y")
-    hello = {"kind": "hello", "side": "plant", "boot": "", **handshake._what_runs(scenario)}
+    hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
     k, T_ns, y = 7, 100_000, np.ones(NY)
     spoilt = bytearray(frames.pack(k, 0, 0, y))
     spoilt[30] ^= 1
@@ -173,15 +173,15 @@ def test_a_run_does_without_START(kind, end, options, make, tmp_path, monkeypatc
         assert found.signals[name].tobytes() == column.tobytes(), name
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_nobody_comes(side, make, endpoint):
+@pytest.mark.parametrize("role", ROLES)
+def test_nobody_comes(role, make, endpoint):
     said: list[str] = []
-    link = ZmqLink(side, endpoint)
+    link = ZmqLink(role, endpoint)
     scenario = make(link={**PATIENT, "start_timeout_s": 0.8, "endpoint": endpoint})
-    other = {"controller": "plant", "plant": "controller"}[side]
+    other = {"controller": "plant", "plant": "controller"}[role]
     try:
         with pytest.raises(PeerLost, match=f"the {other} did not come within 0.8 s"):
-            shake_hands(side, link, scenario, lambda: False, said.append)
+            shake_hands(role, link, scenario, lambda: False, said.append)
     finally:
         link.close()
     assert said == [f"waiting for the {other} at {endpoint} …"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
@@ -228,8 +228,8 @@ def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
 
     scenario = make(duration=2.0)
     bench = make_bench(scenario)
-    parts = {side: Part.create(tmp_path, side, scenario.ticks) for side in SIDES}
-    timeline = Timeline(bench, tmp_path / "events_both.jsonl", SIDES)
+    parts = {role: Part.create(tmp_path, role, scenario.ticks) for role in ROLES}
+    timeline = Timeline(bench, tmp_path / "events_both.jsonl", ROLES)
     run_inproc(bench, parts["plant"], parts["controller"], timeline, lambda ticks: ticks < 4000)
     timeline.close()
     (tmp_path / "scenario.toml").write_text("")

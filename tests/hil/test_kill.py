@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 
-from ..support.processes import end, has_run, places, sides_of, signals, summary, wait_for, write
+from ..support.processes import end, has_run, places, roles_of, signals, summary, wait_for, write
 
 pytestmark = pytest.mark.systems
 
@@ -42,13 +42,13 @@ def watchdog_s(folder: Path, victim: str) -> float:
     """Time from the last frame of the killed side to the end of the other one."""
     other = "plant" if victim == "controller" else "controller"
     (last,) = [e for e in log_of(folder) if e["event"] == "end"]
-    assert last["side"] == other and last["status"] == "safe"
+    assert last["role"] == other and last["status"] == "safe"
     with np.load(folder / "timing.npz") as file:
         return (last["clock_ns"] - file[f"{other}_received"].max()) * 1e-9
 
 
 @pytest.mark.timeout(30 + 30 * ROUNDS)
-def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
+def test_kill_9_of_either_role_at_random_ticks(start, tmp_path):
     chance = random.Random(SEED)
     done = 0
     for k in range(2 * ROUNDS):
@@ -57,7 +57,7 @@ def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
         link, mode, victim = (
             chance.choice(("shm", "zmq")),
             chance.choice(("lockstep", "realtime")),
-            chance.choice(SIDES),
+            chance.choice(ROLES),
         )
         ticks = chance.randrange(1, 3000)
         folder = tmp_path / f"run{k}"
@@ -74,7 +74,7 @@ def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
         outside: set[Path] = set()
         with contextlib.suppress(KeyError, OSError):  # a run may end by itself at any moment
             outside = places(folder)
-            os.kill(sides_of(folder)[victim], signal.SIGKILL)
+            os.kill(roles_of(folder)[victim], signal.SIGKILL)
         code, out, _ = end(process)
         found = json.loads(out)
         if sum(e["event"] == "end" for e in log_of(folder)) == 2:
@@ -95,7 +95,7 @@ def test_kill_9_of_either_side_at_random_ticks(start, tmp_path):
                 late = file["plant_received"] < 0
             # the plant itself counts ticks, however long they took
             assert late[-HOLD - 1 :].all() and n > HOLD
-        assert sides_of(folder) == {}
+        assert roles_of(folder) == {}
         assert not any(path.exists() for path in outside)
         if REPORT:
             with Path(REPORT).open("a", encoding="utf-8") as file:
@@ -114,18 +114,18 @@ def test_without_a_survivor_the_next_run_clears_up(start, tmp_path):
     scenario = write(tmp_path, **content, **patient, duration=60.0)
     process = start("run", scenario, "--out", str(folder), "--no-figures")
     wait_for(lambda: has_run(folder, 300), process)
-    sides, outside = sides_of(folder), places(folder)
-    for number in (process.pid, *sides.values()):
+    roles, outside = roles_of(folder), places(folder)
+    for number in (process.pid, *roles.values()):
         os.kill(number, signal.SIGKILL)
     process.communicate()
-    wait_until(lambda: sides_of(folder) == {})
+    wait_until(lambda: roles_of(folder) == {})
     assert all(path.exists() for path in outside)
     scenario = write(tmp_path, **content, **patient)
     code, *_ = end(start("run", scenario, "--out", str(tmp_path / "next"), "--no-figures"))
     assert code in (0, 3)  # depends on the load of the machine
     assert not any(path.exists() for path in outside)
     assert {path.name for path in (folder / "parts").iterdir()} == {
-        f"{side}_{what}.npy" for side in SIDES for what in ("signals", "times", "progress")
+        f"{role}_{what}.npy" for role in ROLES for what in ("signals", "times", "progress")
     }
     assert np.isfinite(np.load(folder / "parts" / "plant_signals.npy")[:300]).all()
 
@@ -139,8 +139,8 @@ def wait_until(what: Any) -> None:
 
 
 @pytest.mark.parametrize("link", ["shm", "zmq"])
-@pytest.mark.parametrize("victim", SIDES)
-def test_a_side_that_hangs_makes_the_other_safe_and_ends_when_it_goes_on(
+@pytest.mark.parametrize("victim", ROLES)
+def test_a_role_that_hangs_makes_the_other_safe_and_ends_when_it_goes_on(
     victim, link, start, tmp_path
 ):
     """SIGSTOP of one side, and SIGCONT after the other has ended."""
@@ -151,20 +151,20 @@ def test_a_side_that_hangs_makes_the_other_safe_and_ends_when_it_goes_on(
             tmp_path, mode="realtime", law="vsg-2", duration=60.0, link=options,
             late_policy={"hold": 5000},
         )  # fmt: skip
-        sides = {
-            side: start(side, scenario, "--out", str(tmp_path / side), "--quiet") for side in SIDES
+        roles = {
+            role: start(role, scenario, "--out", str(tmp_path / role), "--quiet") for role in ROLES
         }
         other = "plant" if victim == "controller" else "controller"
-        wait_for(lambda: has_run(tmp_path / "plant", 300), sides["plant"])
-        os.kill(sides[victim].pid, signal.SIGSTOP)
+        wait_for(lambda: has_run(tmp_path / "plant", 300), roles["plant"])
+        os.kill(roles[victim].pid, signal.SIGSTOP)
         try:
-            assert end(sides[other])[0] == 3
+            assert end(roles[other])[0] == 3
         finally:
-            os.kill(sides[victim].pid, signal.SIGCONT)
-        assert end(sides[victim])[0] in (3, 130)
-        for side in SIDES:
-            found = summary(tmp_path / side)
-            assert found["reason"], side
+            os.kill(roles[victim].pid, signal.SIGCONT)
+        assert end(roles[victim])[0] in (3, 130)
+        for role in ROLES:
+            found = summary(tmp_path / role)
+            assert found["reason"], role
         assert summary(tmp_path / other)["status"] == "safe"
         recorded = signals(tmp_path / other)
         assert np.isfinite(recorded["ref_P_ref" if other == "controller" else "true_p"]).any()

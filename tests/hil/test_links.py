@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.waiting import send_last
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.frame import FrameReader, FrameWriter, frame_dtype
@@ -43,10 +43,10 @@ class Tampering:
         return getattr(self._link, name)
 
 
-@pytest.mark.parametrize("loser", SIDES)
+@pytest.mark.parametrize("loser", ROLES)
 def test_a_frame_lost_in_lockstep_is_asked_for_again(loser, make, run, tmp_path, endpoint):
-    def touch(side: Side, link: Link) -> Any:
-        if side == loser:
+    def touch(role: Role, link: Link) -> Any:
+        if role == loser:
             return Tampering(link, lambda k, m: None if k in (20, 21, 40) else m)
         return link
 
@@ -55,8 +55,8 @@ def test_a_frame_lost_in_lockstep_is_asked_for_again(loser, make, run, tmp_path,
 
 
 def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
-    def touch(side: Side, link: Link) -> Any:
-        if side == "plant":
+    def touch(role: Role, link: Link) -> Any:
+        if role == "plant":
             return Tampering(link, lambda k, m: None if k >= 20 else m)
         return link
 
@@ -74,8 +74,8 @@ def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint
         tick = np.frombuffer(message, frame_dtype("u"))["tick"][0]  # not k: a slow plant repeats
         return message if tick < 20 else message[:30] + b"\xff\xff" + message[32:]
 
-    def touch(side: Side, link: Link) -> Any:
-        if side == "controller":
+    def touch(role: Role, link: Link) -> Any:
+        if role == "controller":
             return Tampering(link, damage)
         return link
 
@@ -87,7 +87,7 @@ def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint
 
 
 def test_a_repeated_frame_is_used_once(make, run, tmp_path, endpoint):
-    def touch(side: Side, link: Link) -> Any:
+    def touch(role: Role, link: Link) -> Any:
         class Twice(Tampering):
             def send(self, message: bytes) -> bool:
                 return self._link.send(message) and self._link.send(message)

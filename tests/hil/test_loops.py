@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.loop_thread import run_loop
-from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, Port, open_link, port_function
@@ -112,7 +112,7 @@ def test_a_trip_and_a_safe_state(plant, status, link, make, run, place):
     ported, together = three_ways(content, link, make, run, place)
     assert together.summary["status"] == status
     ends = ported.ends()
-    assert {ends[side][0] for side in SIDES} == {status}
+    assert {ends[role][0] for role in ROLES} == {status}
     own = "plant" if status == "tripped" else "controller"
     assert ends[own][1] == together.summary["reason"]
 
@@ -137,8 +137,8 @@ class Deaf:
         return getattr(self._link, name)
 
 
-def deaf(which: Side) -> Callable[[Side, Link], Any]:
-    return lambda side, link: Deaf(link) if side == which else link
+def deaf(which: Role) -> Callable[[Role, Link], Any]:
+    return lambda role, link: Deaf(link) if role == which else link
 
 
 LIVE = {**PATIENT, "type": "shm"}
@@ -209,7 +209,7 @@ class Alone:
 
 
 def alone(
-    side: Side,
+    role: Role,
     scenario: Scenario,
     folder: Path,
     heard: list[bytes],
@@ -219,18 +219,18 @@ def alone(
     """Run one side's loop over messages that are in the link before it starts."""
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
     bench = make_bench(scenario)
-    part = Part.create(folder, side, scenario.ticks)
-    compile_side(side, bench, part)
-    ends = {s: open_link(link, s, endpoint) for s in SIDES}
-    other: Side = "plant" if side == "controller" else "controller"
-    timeline = Timeline(bench, folder / "events.jsonl", (side,))
+    part = Part.create(folder, role, scenario.ticks)
+    compile_role(role, bench, part)
+    ends = {s: open_link(link, s, endpoint) for s in ROLES}
+    other: Role = "plant" if role == "controller" else "controller"
+    timeline = Timeline(bench, folder / "events.jsonl", (role,))
     try:
         for message in heard:
             assert ends[other].send(message)
-        assert not heard or ends[side].wait(30)
+        assert not heard or ends[role].wait(30)
         t0 = time.monotonic_ns()
-        reader = run_loop(side, bench, ends[side], part, timeline, t0, stopped)
-        answers = FrameReader("u" if side == "controller" else "y")
+        reader = run_loop(role, bench, ends[role], part, timeline, t0, stopped)
+        answers = FrameReader("u" if role == "controller" else "y")
         values, said = np.zeros(len(names(answers.group))), []
         while ends[other].wait(0.05):
             message = ends[other].receive()
@@ -275,15 +275,15 @@ def test_a_controller_whose_plant_falls_silent_is_safe_after_hold_and_one_more(h
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-@pytest.mark.parametrize("side", SIDES)
-def test_silence_of_the_other_side_ends_either(side, mode, place, make):
+@pytest.mark.parametrize("role", ROLES)
+def test_silence_of_the_other_role_ends_either(role, mode, place, make):
     scenario = make(
         mode=mode, link={**LIVE, "peer_timeout_s": 0.3}, late_policy={"hold": 10**6}, duration=2
     )
-    other = "plant" if side == "controller" else "controller"
-    found = alone(side, scenario, place, [])
+    other = "plant" if role == "controller" else "controller"
+    found = alone(role, scenario, place, [])
     assert found.end[:2] == ("safe", f"the {other}'s process is gone")
-    if side == "controller":  # the plant has filled the link with unread frames
+    if role == "controller":  # the plant has filled the link with unread frames
         assert found.said[-1][1:] == (SAFE, LOST_PEER)
 
 
@@ -295,8 +295,8 @@ def test_the_stop_flag_ends_both(mode, link, place, make):
     scenario = make(**content, late_policy={"hold": 10**6})
     pair = run_pair(scenario, place, link, stopped=lambda: time.monotonic() - begin > 1.0)
     ends = pair.ends()
-    assert {ends[side][0] for side in SIDES} == {"interrupted"}
-    assert "stopped by the operator" in {ends[side][1] for side in SIDES}
+    assert {ends[role][0] for role in ROLES} == {"interrupted"}
+    assert "stopped by the operator" in {ends[role][1] for role in ROLES}
 
 
 def test_an_event_whose_tick_was_lost_is_carried_out_with_the_next_frame(place, make):

@@ -19,7 +19,7 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP, SunSpecModbusClientException
 from sunspec2.modbus.modbus import ModbusClientException
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
@@ -37,7 +37,7 @@ def run(tmp_path_factory) -> Iterator[Path]:
     command = [*GFMHIL, "run", str(place / "served.toml"), "--out", str(folder)]
     process = subprocess.Popen([*command, "--quiet", "--no-figures"], stdout=subprocess.DEVNULL)
     try:
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in SIDES))
+        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
         yield folder
     finally:
         process.send_signal(signal.SIGINT)

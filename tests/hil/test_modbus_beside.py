@@ -12,7 +12,7 @@ import sunspec2.device as sunspec
 from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.modbus.image import VENDOR
 
 from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
@@ -36,7 +36,7 @@ def test_stop_ends_the_run_and_the_server_with_it(tmp_path):
     command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(folder), "--quiet"]
     going = subprocess.Popen([*command, "--no-figures"], stdout=subprocess.DEVNULL)
     try:
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in SIDES))
+        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
         server, port = start(folder)
         with ModbusTcpClient("127.0.0.1", port=port) as plain:
             sunspec.set_model_defs_path([MODELS, sunspec.models_dir])

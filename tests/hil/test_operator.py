@@ -13,7 +13,7 @@ import pytest
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.announcement import present
 from gfm_hil.operator import Operator
 from gfm_hil.recording.log import read_log
@@ -49,7 +49,7 @@ def going(request, tmp_path):
     command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder)]
     process = subprocess.Popen([*command, "--quiet", "--no-figures"], stdout=subprocess.DEVNULL)
     try:
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in SIDES))
+        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
         yield process, folder
     finally:
         process.kill()

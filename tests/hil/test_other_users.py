@@ -209,11 +209,11 @@ def test_a_lock_that_is_kept_is_told(tmp_path, attack_now):
 
 
 @as_root
-@pytest.mark.parametrize("side", ["controller", "plant"])
+@pytest.mark.parametrize("role", ["controller", "plant"])
 @pytest.mark.attack(
     "2.5", "another user makes the shared memory that root's plant waits for", "it was joined"
 )
-def test_memory_of_another_user_is_refused(side, shared, other, monkeypatch, attack_now):
+def test_memory_of_another_user_is_refused(role, shared, other, monkeypatch, attack_now):
     monkeypatch.setattr(segment, "FOLDER", shared)
     other(
         "open('gfmhil-link-x', 'wb').write(sys.stdin.buffer.read())",
@@ -221,7 +221,7 @@ def test_memory_of_another_user_is_refused(side, shared, other, monkeypatch, att
     )
     path = shared / "gfmhil-link-x"
     with pytest.raises(UserError, match=rf"belongs to another user \(uid {OTHER}\)") as found:
-        ShmLink(side, "shm://x")
+        ShmLink(role, "shm://x")
     assert path.stat().st_uid == OTHER
     attack_now(f"either side refuses it: {str(found.value).rpartition(': ')[2]}")
 
@@ -277,16 +277,16 @@ except TimeoutError:
 
 
 @as_root
-@pytest.mark.parametrize("side", ["controller", "plant"])
+@pytest.mark.parametrize("role", ["controller", "plant"])
 @pytest.mark.attack(
     "2.8",
     "another user listens at the ipc endpoint",
     "root's plant connected; root's controller removed the socket where no process listened",
 )
-def test_a_socket_of_another_user_is_refused(side, shared, other, attack_now):
+def test_a_socket_of_another_user_is_refused(role, shared, other, attack_now):
     other(LISTEN)
     with pytest.raises(UserError, match=rf"link belongs to another user \(uid {OTHER}\)") as found:
-        ZmqLink(side, f"ipc://{shared}/link").close()
+        ZmqLink(role, f"ipc://{shared}/link").close()
     attack_now(str(found.value).rpartition("/")[2])
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import Part
 
 from ..support.processes import (
     PATIENCE_S,
     end,
     has_run,
-    sides_of,
+    roles_of,
     signals,
     summary,
     wait_for,
@@ -78,7 +78,7 @@ def test_two_processes_in_lockstep_are_bit_for_bit_one(start, tmp_path):
     assert left == {"scenario.toml", "signals.npz", "timing.npz", "events.jsonl", "summary.json"}
 
 
-def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
+def test_both_roles_started_by_hand_over_tcp(start, tmp_path):
     scenario = write(
         tmp_path,
         law="vsg-2",
@@ -86,16 +86,16 @@ def test_both_sides_started_by_hand_over_tcp(start, tmp_path):
         events=[{"t": 0.05, "type": "reference", "P_ref": 0.6}],
         link={"peer_timeout_s": 20.0, "endpoint": free_endpoint()},
     )
-    processes = {side: start(side, scenario, "--out", side) for side in reversed(SIDES)}
-    for side, process in processes.items():
+    processes = {role: start(role, scenario, "--out", role) for role in reversed(ROLES)}
+    for role, process in processes.items():
         code, out, _ = end(process)
         assert code == 0, out
         assert "completed" in out
-        found = summary(tmp_path / side)
+        found = summary(tmp_path / role)
         assert (found["status"], found["ticks"], found["laws"]) == ("completed", 1000, ["vsg-2"])
-        assert found["misses"] == (0 if side == "plant" else None)
-        assert f"{'–' if side == 'controller' else 0} misses" in out
-        assert not (tmp_path / side / "parts").exists()
+        assert found["misses"] == (0 if role == "plant" else None)
+        assert f"{'–' if role == 'controller' else 0} misses" in out
+        assert not (tmp_path / role / "parts").exists()
     plant, controller = signals(tmp_path / "plant"), signals(tmp_path / "controller")
     assert "true_p" in plant and "true_p" not in controller
     assert controller["ref_P_ref"][-1] == 0.6
@@ -148,53 +148,53 @@ def test_ctrl_c_ends_both_and_keeps_the_data(start, tmp_path):
     scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
     process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
     wait_for(lambda: has_run(folder, 200), process)
-    assert set(sides_of(folder)) == set(SIDES)
+    assert set(roles_of(folder)) == set(ROLES)
     process.send_signal(signal.SIGINT)
     code, out, _ = end(process)
     found = json.loads(out)
     assert code == 130
     assert found["status"] == "interrupted"
     assert found["reason"] in ("stopped by the operator", "the controller was stopped")
-    assert sides_of(folder) == {}
+    assert roles_of(folder) == {}
     recorded = signals(folder)
     assert len(recorded["t"]) == found["ticks"] >= 200
     assert not np.isnan(recorded["true_p"]).any()
     assert not (folder / "parts").exists()
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_a_side_that_is_killed_is_reported_and_what_both_recorded_is_kept(side, start, tmp_path):
+@pytest.mark.parametrize("role", ROLES)
+def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, start, tmp_path):
     scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
     process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
     wait_for(lambda: has_run(folder, 200), process)
-    os.kill(sides_of(folder)[side], signal.SIGKILL)
+    os.kill(roles_of(folder)[role], signal.SIGKILL)
     code, out, err = end(process)
     found = json.loads(out)
     assert code == 3
-    assert (found["status"], found["reason"]) == ("safe", f"the {side} was ended by SIGKILL")
+    assert (found["status"], found["reason"]) == ("safe", f"the {role} was ended by SIGKILL")
     assert found["reason"] in err
     recorded = signals(folder)
     assert len(recorded["t"]) == found["ticks"] >= 200
     for name in ("true_p", "u_omega_u", "ref_P_ref"):
         assert not np.isnan(recorded[name][:200]).any()
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
-    other = "plant" if side == "controller" else "controller"
-    assert [e["side"] for e in events if e["event"] == "end"] == [other]
-    assert sides_of(folder) == {}
+    other = "plant" if role == "controller" else "controller"
+    assert [e["role"] for e in events if e["event"] == "end"] == [other]
+    assert roles_of(folder) == {}
 
 
-def test_without_the_command_that_started_them_both_sides_end_too(start, tmp_path):
+def test_without_the_command_that_started_them_both_roles_end_too(start, tmp_path):
     scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
     process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
     wait_for(lambda: has_run(folder, 200), process)
     process.kill()
     process.communicate()
     end_at = time.monotonic() + PATIENCE_S
-    while sides_of(folder) and time.monotonic() < end_at:
+    while roles_of(folder) and time.monotonic() < end_at:
         time.sleep(0.02)
-    assert sides_of(folder) == {}
-    for side in SIDES:
-        part = Part.open(folder, side)
+    assert roles_of(folder) == {}
+    for role in ROLES:
+        part = Part.open(folder, role)
         assert not np.isnan(part.signals[:200]).any()
 
 

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from gfm_hil.cli import main
 from gfm_hil.core import files
 from gfm_hil.core.errors import Unfinished, UserError
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording import npz
 from gfm_hil.recording.merge import merge
@@ -35,7 +35,7 @@ from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 
-from ..support.processes import has_run, sides_of, signals, summary, wait_for, write
+from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
 
 pytestmark = pytest.mark.processes
 
@@ -105,7 +105,7 @@ def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsy
     assert main(["recover", str(folder)]) == 2
     assert capsys.readouterr().err == f"gfmhil: {folder}: the run is still going on\n"
     memory = (folder / "parts").resolve()
-    for number in (process.pid, *sides_of(folder).values()):
+    for number in (process.pid, *roles_of(folder).values()):
         os.kill(number, signal.SIGKILL)
     process.communicate()
     while held(folder / ".lock"):
@@ -118,7 +118,7 @@ def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsy
     recorded = signals(folder)
     assert len(recorded["t"]) == found["ticks"] >= 300
     assert np.isfinite(recorded["true_p"]).all()
-    assert names(folder) - {f"{side}.log" for side in SIDES} == DRAWN | (
+    assert names(folder) - {f"{role}.log" for role in ROLES} == DRAWN | (
         {"timing.png"} if mode == "realtime" else set()
     )
     assert not memory.exists()
@@ -304,7 +304,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
     attack_now(f"ended in order at tick {run.summary['ticks']}; exit code 3; recovered with room")
 
 
-def test_a_side_whose_log_cannot_be_written_ends_both(small_disk, start, tmp_path):
+def test_a_role_whose_log_cannot_be_written_ends_both(small_disk, start, tmp_path):
     events = [{"type": "reference", "tick": 100 * k, "P_ref": 0.5} for k in range(1, 120)]
     scenario = write(
         tmp_path,
@@ -417,15 +417,15 @@ def test_the_memory_of_recover_does_not_grow_with_the_run(make, tmp_path, attack
     folder.mkdir()
     (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     chance = np.random.default_rng(1)
-    for side in SIDES:
-        part = Part.create(folder, side, ticks)
+    for role in ROLES:
+        part = Part.create(folder, role, ticks)
         for first in range(0, ticks, 100_000):
             rows = part.signals[first : first + 100_000]
             rows[:] = chance.normal(1.0, 0.1, rows.shape)
             times = part.times[first : first + 100_000]
             times[:] = 100_000 * np.arange(first, first + 100_000)[:, None]
             times += chance.integers(0, 90_000, times.shape)
-        if side == "controller":
+        if role == "controller":
             part.signals[:, 5] = 0
     code = (
         "import sys; from pathlib import Path; from gfm_hil.results.run_folder import recover\n"
@@ -513,7 +513,7 @@ def test_a_file_that_could_not_be_written_leaves_the_old_one(tmp_path):
 def test_merging_leaves_the_parts(left):
     scenario, folder, laws, *_ = left
     merge(folder, scenario.T_s, laws)
-    assert {f"{side}_signals.npy" for side in SIDES} <= names(folder / "parts")
+    assert {f"{role}_signals.npy" for role in ROLES} <= names(folder / "parts")
     assert make_bench(scenario).controller.labels == laws
 
 

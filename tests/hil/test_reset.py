@@ -72,9 +72,9 @@ def test_over_a_link_it_is_the_same_to_the_bit(kind, tmp_path):
     for name in ours:
         assert np.array_equal(ours[name], pair.signals[name], equal_nan=True), name
     assert {end[0] for end in pair.ends().values()} == {"completed"}
-    said = [(e["event"], e["side"]) for e in pair.log if e["event"] in ("tripped", "recovered")]
+    said = [(e["event"], e["role"]) for e in pair.log if e["event"] in ("tripped", "recovered")]
     assert sorted(said) == sorted(
-        (event, side) for event in ("tripped", "recovered") for side in ("plant", "controller")
+        (event, role) for event in ("tripped", "recovered") for role in ("plant", "controller")
     )
 
 

@@ -44,14 +44,14 @@ def record(memory) -> Iterator[Record]:
     """A process that has recorded 60 of 100 ticks and then sleeps."""
     started = []
 
-    def call(folder: Path, side: str) -> subprocess.Popen[str]:
+    def call(folder: Path, role: str) -> subprocess.Popen[str]:
         folder.mkdir(exist_ok=True)
         where = (
             "import gfm_hil.recording.parts as r, pathlib; "
             f"r._MEMORY = pathlib.Path({str(memory)!r})"
         )
         process = subprocess.Popen(
-            [sys.executable, "-c", where + HOLD, str(folder), side],
+            [sys.executable, "-c", where + HOLD, str(folder), role],
             text=True,
             stdout=subprocess.PIPE,
         )
@@ -120,7 +120,7 @@ def test_what_a_killed_run_recorded_in_memory_is_moved_to_its_folder(record, mem
     assert {path.name for path in folder.iterdir()} == {"parts"}
 
 
-def test_it_stays_while_one_side_lives(record, memory, tmp_path):
+def test_it_stays_while_one_role_lives(record, memory, tmp_path):
     folder = tmp_path / "run"
     plant, controller = record(folder, "plant"), record(folder, "controller")
     kill(plant)
@@ -129,7 +129,7 @@ def test_it_stays_while_one_side_lives(record, memory, tmp_path):
     kill(controller)
     another_run(tmp_path)
     assert not (folder / "parts").is_symlink()
-    assert all(recording.Part.open(folder, side) for side in ("plant", "controller"))
+    assert all(recording.Part.open(folder, role) for role in ("plant", "controller"))
     assert list(memory.iterdir()) == []
 
 

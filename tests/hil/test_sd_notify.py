@@ -98,7 +98,7 @@ def test_watchdog_comes_after_a_silent_peer_and_only_to_whom_it_is_meant_for(
         assert ("WATCHDOG_USEC=6000000" in manager.lines()) == (pid == "own")
 
 
-def test_side_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
+def test_role_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
     manager, start, endpoint, tmp_path, monkeypatch
 ):
     scenario = tmp_path / "long.toml"

@@ -151,10 +151,10 @@ def test_the_next_plant_goes_on_where_the_last_one_stopped(endpoint):
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../x", "a b", "ä", "x" * 201, "x\n"])
-@pytest.mark.parametrize("side", ["controller", "plant"])
-def test_a_name_that_is_none(side, name):
+@pytest.mark.parametrize("role", ["controller", "plant"])
+def test_a_name_that_is_none(role, name):
     with pytest.raises(UserError, match="must be shm://name, the name of 1 to 200 letters"):
-        open_link("shm", side, f"shm://{name}")
+        open_link("shm", role, f"shm://{name}")
 
 
 def test_the_longest_name_and_a_fresh_one_are_good(tmp_path):
@@ -178,9 +178,9 @@ def test_a_memory_of_another_layout_is_refused(endpoint):
 def test_a_file_that_is_none_of_ours_is_refused_and_kept(endpoint):
     path = segment_of(endpoint)
     path.write_bytes(b"somebody's")
-    for side in ("controller", "plant"):
+    for role in ("controller", "plant"):
         with pytest.raises(UserError, match="is no link of ours"):
-            ShmLink(side, endpoint)
+            ShmLink(role, endpoint)
     assert path.read_bytes() == b"somebody's"
     path.unlink()
 

@@ -26,10 +26,10 @@ def peer(endpoint: str) -> Iterator[Peer]:
     """Start a side as a process and wait until it has opened its end."""
     started = []
 
-    def call(side: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:
+    def call(role: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:
         script = Path(__file__).parents[1] / "support" / "shm_peer.py"
         process = subprocess.Popen(
-            [sys.executable, str(script), side, endpoint, what, str(n)],
+            [sys.executable, str(script), role, endpoint, what, str(n)],
             text=True,
             stdout=subprocess.PIPE,
         )
@@ -49,7 +49,7 @@ def kill(process: subprocess.Popen[str]) -> None:
 
 
 def test_nothing_is_torn_lost_or_doubled_in_a_million_messages_each_way(peer):
-    controller, plant = (peer(side, "flood", 1_000_000) for side in ("controller", "plant"))
+    controller, plant = (peer(role, "flood", 1_000_000) for role in ("controller", "plant"))
     for process in (controller, plant):
         assert process.communicate(timeout=110)[0] == "1000000 0\n"
 

@@ -27,7 +27,7 @@ from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.record import open_record
 
 from ..support.modbus import GFMHIL
-from ..support.processes import PATIENCE_S, has_run, places, sides_of, signals, summary, wait_for
+from ..support.processes import PATIENCE_S, has_run, places, roles_of, signals, summary, wait_for
 from ..support.scope import RIG, addresses
 from ..support.soak import MB, Clients, Sampler, ports_in
 
@@ -109,7 +109,7 @@ def test_nothing_grows_and_nothing_is_left(link, capsys, attack_now):
         clients, started,
     ):  # fmt: skip
         folder, run = clients.folder, started["run"]
-        pids = {name: process.pid for name, process in started.items()} | sides_of(folder)
+        pids = {name: process.pid for name, process in started.items()} | roles_of(folder)
         outside = places(folder)
         sampler = Sampler(pids)
         while time.monotonic() - sampler.begin < SOAK_S or clients.rounds < 8:
@@ -150,7 +150,7 @@ def test_nothing_grows_and_nothing_is_left(link, capsys, attack_now):
     assert found["ticks"] == len(recorded["t"]) >= ticks
     assert np.isfinite(recorded["true_p"]).all()
     assert np.unique(recorded["law"][np.isfinite(recorded["law"])]).size >= 2
-    assert all(found["injected"][side]["lost"] > 0 for side in ("controller", "plant"))
+    assert all(found["injected"][role]["lost"] > 0 for role in ("controller", "plant"))
     assert left == {"soak.toml", "run"} and not any(path.exists() for path in outside)
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
     most = max(sampler.rise(name, first) - by_design.get(name, 0.0) for name in pids)

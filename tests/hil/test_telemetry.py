@@ -16,7 +16,7 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.operator import Operator
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
 from gfm_hil.recording.parts import Part
@@ -97,7 +97,7 @@ def run_and_stream(start, folder: Path, mode: str, *options: str):
 def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[str, np.ndarray]:
     """Stop the run; returns its recording."""
     until = time.monotonic() + PATIENCE_S
-    while not all((folder / f"commands_{side}.json").exists() for side in SIDES):
+    while not all((folder / f"commands_{role}.json").exists() for role in ROLES):
         assert time.monotonic() < until
         time.sleep(0.05)
     operator = Operator(folder)
@@ -123,19 +123,19 @@ def test_plotjuggler_reads_what_was_recorded(start, listen, tmp_path):
         assert time.monotonic() < until
         juggler.receive(1.0)
     recorded = stop(folder, run, stream)
-    ticks = {side: [int(k) for _, k in juggler.series[f"gfmhil/{side}/tick"]]
-             for side in ("plant", "controller")}  # fmt: skip
+    ticks = {role: [int(k) for _, k in juggler.series[f"gfmhil/{role}/tick"]]
+             for role in ("plant", "controller")}  # fmt: skip
     for path, points in juggler.series.items():
-        _, side, *rest = path.split("/")
+        _, role, *rest = path.split("/")
         name = "_".join(rest)
         if name in recorded and name != "tick":
             seen = np.array(points)
-            np.testing.assert_array_equal(seen[:, 1], recorded[name][ticks[side]])
-            np.testing.assert_allclose(seen[:, 0], recorded["t"][ticks[side]], atol=1e-9)
+            np.testing.assert_array_equal(seen[:, 1], recorded[name][ticks[role]])
+            np.testing.assert_allclose(seen[:, 0], recorded["t"][ticks[role]], atol=1e-9)
     for path in ("plant/y/p", "plant/u/E_u", "plant/true/omega_g", "controller/ref/P_ref",
                  "controller/state"):  # fmt: skip
         assert len(juggler.series[f"gfmhil/{path}"]) >= 200
-    assert {k % 20 for side in ticks.values() for k in side} == {0}  # 500 Hz of 10 kHz
+    assert {k % 20 for role in ticks.values() for k in role} == {0}  # 500 Hz of 10 kHz
     assert {misses for _, misses in juggler.series["gfmhil/plant/misses"]} == {0.0}
     assert "gfmhil/plant/slack_us" not in juggler.series  # lockstep has no deadlines
 
@@ -149,15 +149,15 @@ def test_blocks_have_every_tick(start, tmp_path):
         while min(len(found["plant"]), len(found["controller"])) < 10:
             assert time.monotonic() < until
             if block := reader.receive(1.0):
-                found[block.side].append(block.rows)
+                found[block.role].append(block.rows)
     recorded = stop(folder, run, stream)
-    for side, times in (("plant", PLANT_TIMES), ("controller", CONTROLLER_TIMES)):
-        rows = np.concatenate(found[side])
+    for role, times in (("plant", PLANT_TIMES), ("controller", CONTROLLER_TIMES)):
+        rows = np.concatenate(found[role])
         ticks = rows["tick"]
         assert (np.diff(ticks) == 1).all()
         for name in rows.dtype.names[1:]:
             plain = name.removesuffix("_ns")
-            whole = recorded[f"{side}_{plain}" if name != plain and plain in times else name]
+            whole = recorded[f"{role}_{plain}" if name != plain and plain in times else name]
             np.testing.assert_array_equal(rows[name], whole[ticks], err_msg=name)
 
 
@@ -278,11 +278,11 @@ def test_a_run_streams_itself(start, listen, tmp_path):
     assert said.endswith(" ticks sent on\n")
 
 
-def test_a_side_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):
+def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):
     file = tmp_path / "sent.toml"
     file.write_text(SCENARIO.format(mode="lockstep").replace("shm", "zmq"), encoding="utf-8")
     words = [str(file), "--endpoint", endpoint, "--quiet", "--out"]
-    sides = [start(side, *words, side) for side in ("controller", "plant")]
+    roles = [start(role, *words, role) for role in ("controller", "plant")]
     stream = start("stream", "controller", "--wait", "--port", "0")
     juggler = listen(stream.stdout.readline().split()[1].rpartition(":")[2])
     until = time.monotonic() + PATIENCE_S
@@ -290,10 +290,10 @@ def test_a_side_alone_streams_its_own_columns(start, listen, tmp_path, endpoint)
         assert time.monotonic() < until
         juggler.receive(1.0)
     assert {path.split("/")[1] for path in juggler.series} == {"controller"}
-    sides[0].terminate()
-    for process in (*sides, stream):
+    roles[0].terminate()
+    for process in (*roles, stream):
         process.communicate(timeout=PATIENCE_S)
-    assert [process.returncode for process in (*sides, stream)] == [130, 130, 0]
+    assert [process.returncode for process in (*roles, stream)] == [130, 130, 0]
 
 
 def test_a_port_that_is_taken_is_named(start, tmp_path):
@@ -327,10 +327,10 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
     find, calls = Part.open, iter(range(100))
     problems = {2: OSError(24, "Too many open files"), 3: ValueError("a mistake of ours")}
 
-    def sometimes(folder: Path, side: Side) -> Part | None:
+    def sometimes(folder: Path, role: Role) -> Part | None:
         if problem := problems.get(next(calls, 0)):
             raise problem
-        return find(folder, side)
+        return find(folder, role)
 
     monkeypatch.setattr(Part, "open", sometimes)
     with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:

@@ -63,8 +63,8 @@ def test_a_run_is_collected_while_it_goes_on(start, tmp_path):
     stream.communicate(timeout=PATIENCE_S)
     assert (run.returncode, stream.returncode) == (130, 0)
     assert {name for name, _ in second} == set(METRICS) - {"gfmhil_slack_seconds"}
-    for side in ("plant", "controller"):
-        assert 0 < first["gfmhil_ticks_total", side] < second["gfmhil_ticks_total", side]
+    for role in ("plant", "controller"):
+        assert 0 < first["gfmhil_ticks_total", role] < second["gfmhil_ticks_total", role]
     assert second["gfmhil_misses_total", ""] == 0
     assert second["gfmhil_state", "RUNNING"] == 1
     assert second["gfmhil_state", "SAFE"] == 0

@@ -12,7 +12,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import PeerLost, UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import open_link
 from gfm_hil.links.zeromq.curve import key_files, write_keys
@@ -145,9 +145,9 @@ def test_nobody_gets_in_while_there_is_nobody_to_ask(controller, tcp, keys, othe
 
 
 def test_an_abstract_socket_is_refused():
-    for side in SIDES:
+    for role in ROLES:
         with pytest.raises(UserError, match=r"'ipc://@rig': an abstract socket is no file"):
-            open_link("zmq", side, "ipc://@rig")
+            open_link("zmq", role, "ipc://@rig")
 
 
 def test_a_plant_talks_to_no_other_controller(tcp, keys, others, tmp_path):
@@ -162,22 +162,22 @@ def test_a_plant_talks_to_no_other_controller(tcp, keys, others, tmp_path):
 
 @pytest.mark.parametrize("knows", ["no key", "a wrong key"])
 def test_both_wait_in_vain_and_say_so(knows, make, tcp, keys, others, tmp_path):
-    options: dict[Side, ZmqOptions] = {"controller": curve(keys), "plant": ZmqOptions()}
+    options: dict[Role, ZmqOptions] = {"controller": curve(keys), "plant": ZmqOptions()}
     if knows == "a wrong key":
         options["plant"] = curve(mixed(tmp_path, others, keys))
     scenario = make(link={**PATIENT, "start_timeout_s": 1.5, "endpoint": tcp})
 
-    def call(side: Side) -> None:
-        link = ZmqLink(side, tcp, options[side])
+    def call(role: Role) -> None:
+        link = ZmqLink(role, tcp, options[role])
         try:
-            shake_hands(side, link, scenario, lambda: False, lambda text: None)
+            shake_hands(role, link, scenario, lambda: False, lambda text: None)
         finally:
             link.close()
 
     found = in_threads(call)
-    for side, other in zip(SIDES, SIDES[::-1], strict=True):
-        assert isinstance(found[side], PeerLost)
-        assert f"the {other} did not come within 1.5 s" in str(found[side])
+    for role, other in zip(ROLES, ROLES[::-1], strict=True):
+        assert isinstance(found[role], PeerLost)
+        assert f"the {other} did not come within 1.5 s" in str(found[role])
 
 
 @pytest.mark.parametrize(
@@ -202,10 +202,10 @@ def test_what_counts_as_beyond_this_machine(endpoint, beyond):
     assert beyond_loopback(endpoint) is beyond
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_unencrypted_beyond_this_machine_is_refused_unless_meant(side):
+@pytest.mark.parametrize("role", ROLES)
+def test_unencrypted_beyond_this_machine_is_refused_unless_meant(role):
     with pytest.raises(UserError) as found:
-        open_link("zmq", side, "tcp://0.0.0.0:5555")
+        open_link("zmq", role, "tcp://0.0.0.0:5555")
     text = str(found.value)
     assert text.startswith("link: endpoint = 'tcp://0.0.0.0:5555': goes beyond this machine")
     assert "link.options.curve" in text
@@ -213,7 +213,7 @@ def test_unencrypted_beyond_this_machine_is_refused_unless_meant(side):
     with socket.socket() as probe:
         probe.bind(("0.0.0.0", 0))
         port = probe.getsockname()[1]
-    open_link("zmq", side, f"tcp://0.0.0.0:{port}", {"plain": True}).close()
+    open_link("zmq", role, f"tcp://0.0.0.0:{port}", {"plain": True}).close()
 
 
 def test_the_command_refuses_it_and_takes_options(capsys, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numba import njit, types
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links import Link
 from gfm_hil.links.port import PORT_CALL
 from gfm_hil.links.zeromq.link import ZmqLink
@@ -50,9 +50,9 @@ class ByPort:
 
 
 @pytest.fixture
-def ends(endpoint: str) -> Iterator[dict[Side, ZmqLink]]:
+def ends(endpoint: str) -> Iterator[dict[Role, ZmqLink]]:
     """Both ends of a link that has already carried a message each way."""
-    links = {side: ZmqLink(side, endpoint) for side in SIDES}
+    links = {role: ZmqLink(role, endpoint) for role in ROLES}
     deliver(links["plant"], b"hello")
     assert links["controller"].wait(30)
     assert links["controller"].receive() == b"hello"
@@ -61,7 +61,7 @@ def ends(endpoint: str) -> Iterator[dict[Side, ZmqLink]]:
         link.close()
 
 
-@pytest.mark.parametrize("by_port", [("plant",), ("controller",), SIDES])
+@pytest.mark.parametrize("by_port", [("plant",), ("controller",), ROLES])
 def test_lockstep_by_port_is_bit_for_bit_in_process(by_port, make, run, tmp_path, endpoint):
     content = {
         "law": "vsg-2",
@@ -72,8 +72,8 @@ def test_lockstep_by_port_is_bit_for_bit_in_process(by_port, make, run, tmp_path
         "events": [{"tick": 50, "type": "reference", "P_ref": 0.55}],
     }
 
-    def touch(side: Side, link: Link) -> Any:
-        return ByPort(link) if side in by_port else link
+    def touch(role: Role, link: Link) -> Any:
+        return ByPort(link) if role in by_port else link
 
     apart = run_pair(make(**content), tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
     assert np.ptp(apart["true_p"]) > 0
@@ -82,9 +82,9 @@ def test_lockstep_by_port_is_bit_for_bit_in_process(by_port, make, run, tmp_path
 
 def test_messages_of_any_size_either_way_in_order(ends):
     sent = [bytes(range(k)) for k in (1, 68, 84, 255)]
-    for side, other in zip(SIDES, SIDES[::-1], strict=True):
+    for role, other in zip(ROLES, ROLES[::-1], strict=True):
         for message in sent:
-            assert ByPort(ends[side]).send(message)
+            assert ByPort(ends[role]).send(message)
         for k, message in enumerate(sent):  # alternately through port and pyzmq
             link = ByPort(ends[other]) if k % 2 else ends[other]
             assert ends[other].wait(30)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.segments import LONGEST, join, joiner_dtype, set_joiner
 from gfm_hil.links.can.subrate import admit, goes, in_force, made, set_subrate, subrate_dtype
@@ -45,9 +45,9 @@ class VectorReceiver:
 class Joiner:
     """Joins the other side's segments; returns a message or a code."""
 
-    def __init__(self, plan: Plan, side: Side) -> None:
+    def __init__(self, plan: Plan, role: Role) -> None:
         self._record, self._message = np.zeros(1, joiner_dtype), np.zeros(LONGEST, np.uint8)
-        set_joiner(self._record, plan, side)
+        set_joiner(self._record, plan, role)
 
     damaged = property(lambda self: int(self._record["damaged"][0]))
     theirs = property(lambda self: int(self._record["theirs"][0]))
@@ -63,10 +63,10 @@ class Joiner:
 class Subrate:
     """One side's stage, fed by ``receive``."""
 
-    def __init__(self, side: Side, every: int, receive: Callable[[], bytes | None]) -> None:
+    def __init__(self, role: Role, every: int, receive: Callable[[], bytes | None]) -> None:
         self._record, self._message = np.zeros(1, subrate_dtype), np.zeros(100, np.uint8)
         self._receive = receive
-        set_subrate(self._record, side, every)
+        set_subrate(self._record, role, every)
 
     def goes(self, message: bytes) -> bool:
         return bool(goes(self._record, np.frombuffer(message, np.uint8)))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
@@ -35,7 +35,7 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
     With an exchange every n ticks, y is held, and so is u, which takes n ticks to arrive.
     """
     b = make_bench(scenario)
-    timeline = Timeline(b, folder / "events.jsonl", SIDES)
+    timeline = Timeline(b, folder / "events.jsonl", ROLES)
     rows = np.full((scenario.ticks, len(PLANT_COLUMNS)), np.nan)
     command, sent = b.u.copy(), []
     for tick in range(scenario.ticks):

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.loop_thread import run_loop
-from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
@@ -39,17 +39,17 @@ RIG = {
 PORTS = ("shm", "zmq")  # links that the loops drive without a thread of Python
 
 
-def in_threads(call: Callable[[Side], Any]) -> dict[Side, Any]:
+def in_threads(call: Callable[[Role], Any]) -> dict[Role, Any]:
     """The same call for both sides at once; returns each side's result or exception."""
-    found: dict[Side, Any] = {}
+    found: dict[Role, Any] = {}
 
-    def one(side: Side) -> None:
+    def one(role: Role) -> None:
         try:
-            found[side] = call(side)
+            found[role] = call(role)
         except Exception as problem:
-            found[side] = problem
+            found[role] = problem
 
-    threads = [threading.Thread(target=one, args=(side,), daemon=True) for side in SIDES]
+    threads = [threading.Thread(target=one, args=(role,), daemon=True) for role in ROLES]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -78,7 +78,7 @@ def deliver(link: Link, message: bytes) -> None:
         time.sleep(0.001)
 
 
-Touch = Callable[[Side, Link], Link]
+Touch = Callable[[Role, Link], Link]
 
 
 @dataclass
@@ -95,15 +95,15 @@ class Pair:
 
     signals: dict[str, np.ndarray] = field(default_factory=dict)
     timing: dict[str, np.ndarray] = field(default_factory=dict)
-    faults: dict[Side, dict[str, int]] = field(default_factory=dict)
-    injected: dict[Side, dict[str, int]] = field(default_factory=dict)
-    counters: dict[Side, dict[str, int]] = field(default_factory=dict)
+    faults: dict[Role, dict[str, int]] = field(default_factory=dict)
+    injected: dict[Role, dict[str, int]] = field(default_factory=dict)
+    counters: dict[Role, dict[str, int]] = field(default_factory=dict)
     log: list[dict[str, Any]] = field(default_factory=list)
 
     def ends(self) -> dict[str, tuple[str, str, int]]:
         """How each side ended: status, reason, tick."""
         return {
-            e["side"]: (e["status"], e["reason"], e["tick"])
+            e["role"]: (e["status"], e["reason"], e["tick"])
             for e in self.log
             if e["event"] == "end"
         }
@@ -114,7 +114,7 @@ def run_pair(
     folder: Path,
     link: str,
     options: dict[str, Any] | None = None,
-    touch: Touch = lambda side, link: link,
+    touch: Touch = lambda role, link: link,
     stopped: Callable[[], bool] = lambda: False,
     endpoint: str | None = None,
 ) -> Pair:
@@ -122,26 +122,26 @@ def run_pair(
     the handshake."""
     folder.mkdir(parents=True, exist_ok=True)
     where = endpoint or link_kind(link).fresh(folder)
-    benches = {side: make_bench(scenario) for side in SIDES}
-    parts = {side: Part.create(folder, side, scenario.ticks) for side in SIDES}
-    for side in SIDES:
-        compile_side(side, benches[side], parts[side])
+    benches = {role: make_bench(scenario) for role in ROLES}
+    parts = {role: Part.create(folder, role, scenario.ticks) for role in ROLES}
+    for role in ROLES:
+        compile_role(role, benches[role], parts[role])
     pair = Pair()
 
-    def call(side: Side) -> None:
-        bench, part, impairment = benches[side], parts[side], scenario.link.impairment
-        end = open_link(link, side, where, options)
-        timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
+    def call(role: Role) -> None:
+        bench, part, impairment = benches[role], parts[role], scenario.link.impairment
+        end = open_link(link, role, where, options)
+        timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         used = end
-        if impairment is not None and impairment.hits(side):
-            used = ImpairedLink(end, impairment, side)  # compiles: before START
+        if impairment is not None and impairment.hits(role):
+            used = ImpairedLink(end, impairment, role)  # compiles: before START
         try:
-            t0 = shake_hands(side, end, scenario, lambda: False, lambda text: None).t0_ns
-            reader = run_loop(side, bench, touch(side, used), part, timeline, t0, stopped)
-            pair.faults[side] = dict(reader.faults)
-            pair.counters[side] = dict(getattr(end, "counters", {}))
+            t0 = shake_hands(role, end, scenario, lambda: False, lambda text: None).t0_ns
+            reader = run_loop(role, bench, touch(role, used), part, timeline, t0, stopped)
+            pair.faults[role] = dict(reader.faults)
+            pair.counters[role] = dict(getattr(end, "counters", {}))
             if isinstance(used, ImpairedLink):
-                pair.injected[side] = used.injected
+                pair.injected[role] = used.injected
         finally:
             end.close()
             timeline.close()

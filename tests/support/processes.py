@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.toml_out import toml_text
 
 
 def places(folder: Path) -> set[Path]:
     """What a run in progress has outside its folder: memory, the folder of a socket."""
-    words = Path(f"/proc/{sides_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
+    words = Path(f"/proc/{roles_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
     kind, _, name = words[words.index("--endpoint") + 1].partition("://")
     found = {Path("/dev/shm") / f"gfmhil-link-{name}" if kind == "shm" else Path(name).parent}
     if (folder / "parts").is_symlink():
@@ -53,7 +53,7 @@ def has_run(folder: Path, ticks: int) -> bool:
     return part is not None and int(part.progress[0]) >= ticks
 
 
-def sides_of(folder: Path) -> dict[str, int]:
+def roles_of(folder: Path) -> dict[str, int]:
     """Process ids of the sides that record into ``folder``."""
     found = {}
     for entry in Path("/proc").iterdir():
@@ -64,7 +64,7 @@ def sides_of(folder: Path) -> dict[str, int]:
             except OSError:
                 continue
             if str(folder) in words and state != "Z":
-                found.update({side: int(entry.name) for side in SIDES if side in words})
+                found.update({role: int(entry.name) for role in ROLES if role in words})
     return found
 
 

@@ -56,19 +56,19 @@ def flood(send, receive, handle, mine, n):
 
 
 def main() -> None:
-    side, endpoint, what, n = sys.argv[1:]
-    link = open_link("shm", side, endpoint)
+    role, endpoint, what, n = sys.argv[1:]
+    link = open_link("shm", role, endpoint)
     print("ready", flush=True)
     if what == "hold":
         time.sleep(600)
-    while not (side == "controller" or link.send(b"here")):
+    while not (role == "controller" or link.send(b"here")):
         time.sleep(0.001)
-    while side == "controller" and not link.wait(1):
+    while role == "controller" and not link.wait(1):
         pass
-    if side == "controller":
+    if role == "controller":
         link.receive()
     port = link.port
-    mine = int(side == "plant")
+    mine = int(role == "plant")
     print(*flood(port.send, port.receive, port.handle, mine, int(n)), flush=True)
     link.close()
 

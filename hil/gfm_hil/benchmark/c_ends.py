@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from gfm_hil.benchmark.c_code import load_c
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 
 _SLOTS = 2 * 1024  # bytes, two slot_t
 _WORD = ctypes.c_int64
-_ORDER: dict[Side, int] = {"controller": 1, "plant": -1}
+_ORDER: dict[Role, int] = {"controller": 1, "plant": -1}
 
 
 class CEnd:
@@ -61,28 +61,28 @@ class CEnd:
         self._keep.close()
 
 
-def open_shm(library: Path, side: Side, path: str, size: int) -> CEnd:
+def open_shm(library: Path, role: Role, path: str, size: int) -> CEnd:
     """Shared memory: a file that both sides map."""
-    if side == "controller":
+    if role == "controller":
         Path(path).write_bytes(bytes(_SLOTS))
     slots = np.memmap(path, np.uint8, "r+")
     keep = ExitStack()
     keep.callback(slots.flush)  # keeps the mapping alive with the end
-    first = _WORD(side == "controller")
+    first = _WORD(role == "controller")
     return CEnd(library, "shm", [ctypes.c_void_p(slots.ctypes.data), first], size, keep)
 
 
-def open_udp(library: Path, side: Side, ports: str, size: int) -> CEnd:
+def open_udp(library: Path, role: Role, ports: str, size: int) -> CEnd:
     """UDP on the loopback interface; ``ports`` are those of the controller and the plant."""
     keep = ExitStack()
     end = keep.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    own, other = (("127.0.0.1", int(port)) for port in ports.split(",")[:: _ORDER[side]])
+    own, other = (("127.0.0.1", int(port)) for port in ports.split(",")[:: _ORDER[role]])
     end.bind(own)
     end.connect(other)
     return CEnd(library, "udp", [_WORD(end.fileno())], size, keep)
 
 
-def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
+def open_zmq(library: Path, role: Role, endpoint: str, size: int) -> CEnd:
     """libzmq, the same library as the link's, on a socket with the link's options.
 
     Raises:
@@ -97,7 +97,7 @@ def open_zmq(library: Path, side: Side, endpoint: str, size: int) -> CEnd:
     context = keep.enter_context(zmq.Context())
     end = keep.enter_context(pair_socket(context))
     end.set(zmq.LINGER, 0)
-    if side == "controller":
+    if role == "controller":
         end.bind(endpoint)
     else:
         end.connect(endpoint)

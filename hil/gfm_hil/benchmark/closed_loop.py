@@ -32,7 +32,7 @@ from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, rounds
 from gfm_hil.benchmark.spread import summary
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.results.runner import Progress, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
@@ -277,8 +277,8 @@ def _run(
     with np.load(folder / "timing.npz") as file:
         timing = dict(file)
     log = [json.loads(line) for line in (folder / "events.jsonl").read_text("utf-8").splitlines()]
-    said = [_last_line(folder / f"{side}.log") for side in SIDES]
-    policies = [f"{e['side']}: {e['policy']}" for e in log if e["event"] == "scheduling"]
+    said = [_last_line(folder / f"{role}.log") for role in ROLES]
+    policies = [f"{e['role']}: {e['policy']}" for e in log if e["event"] == "scheduling"]
     shutil.rmtree(folder)
     why = " / ".join(dict.fromkeys(filter(None, said))) or summary["reason"]
     return timing, policies, " ".join(filter(None, (summary["status"], why)))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.peers import Iceoryx2Link, has_iceoryx2
 from gfm_hil.benchmark.pingpong import LONGEST, LinkEnd, Messages, frames, plain
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.signals import NY
@@ -68,28 +68,28 @@ class Contender:
     baseline: str
     library: Path | None = None
 
-    def open(self, side: Side, payload: int) -> End:
+    def open(self, role: Role, payload: int) -> End:
         """Open one end; the controller first.
 
         Raises:
             UserError: as ``open_link``.
         """
-        messages = self.messages(side, payload)
+        messages = self.messages(role, payload)
         if self.peer == "C":
             from gfm_hil.benchmark import c_ends
 
             assert self.library is not None
             how = {"shm": c_ends.open_shm, "udp": c_ends.open_udp, "zmq": c_ends.open_zmq}
-            return how[self.link](self.library, side, self.endpoint, messages.shape[1])
+            return how[self.link](self.library, role, self.endpoint, messages.shape[1])
         if self.peer == "iceoryx2":
-            return LinkEnd(Iceoryx2Link(side, self.endpoint, LONGEST), messages)
-        return LinkEnd(open_link(self.link, side, self.endpoint, self.options), messages)
+            return LinkEnd(Iceoryx2Link(role, self.endpoint, LONGEST), messages)
+        return LinkEnd(open_link(self.link, role, self.endpoint, self.options), messages)
 
     @staticmethod
-    def messages(side: Side, payload: int) -> Messages:
+    def messages(role: Role, payload: int) -> Messages:
         """The messages of a side: the bench's frames if the payload has their size."""
         if payload == FRAME:
-            return frames("y" if side == "plant" else "u")
+            return frames("y" if role == "plant" else "u")
         return plain(payload)
 
 

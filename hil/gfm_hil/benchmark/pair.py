@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.benchmark.contenders import Contender, End
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
 
@@ -30,7 +30,7 @@ _START_S = 120.0
 WARM_NS = 20_000_000
 
 # state in each of the two processes
-_side: Side = "plant"
+_role: Role = "plant"
 _ends: dict[str, End] = {}
 _took = np.zeros(0, np.int64)
 _stop = np.zeros(1, np.int64)
@@ -39,14 +39,14 @@ _stop = np.zeros(1, np.int64)
 class Pair:
     """Handle of the two processes."""
 
-    def __init__(self, pools: dict[Side, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
+    def __init__(self, pools: dict[Role, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
         self._pools, self._stop = pools, stop
 
-    def call(self, side: Side, work: Any, *arguments: Any, timeout: float = 120.0) -> Any:
+    def call(self, role: Role, work: Any, *arguments: Any, timeout: float = 120.0) -> Any:
         """Call a function in one of them and return its result."""
-        return self._wait(self._pools[side].submit(work, *arguments), timeout)
+        return self._wait(self._pools[role].submit(work, *arguments), timeout)
 
-    def both(self, work: Any, *arguments: Any, timeout: float = 120.0) -> dict[Side, Any]:
+    def both(self, work: Any, *arguments: Any, timeout: float = 120.0) -> dict[Role, Any]:
         """Call a function in both at the same time."""
         futures = {s: pool.submit(work, *arguments) for s, pool in self._pools.items()}
         return {s: self._wait(future, timeout) for s, future in futures.items()}
@@ -57,8 +57,8 @@ class Pair:
         Raises:
             UserError: it cannot be opened.
         """
-        for side in SIDES:
-            compiled = self.call(side, _open, contender, payload)
+        for role in ROLES:
+            compiled = self.call(role, _open, contender, payload)
         return bool(compiled)
 
     def round(self, contender: Contender, period_ns: int, seconds: float) -> NDArray[np.int64]:
@@ -86,10 +86,10 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     path.write_bytes(bytes(8))
     context = multiprocessing.get_context("spawn")
     pools = {
-        side: ProcessPoolExecutor(
-            1, mp_context=context, initializer=_set_up, initargs=(side, policy, str(path))
+        role: ProcessPoolExecutor(
+            1, mp_context=context, initializer=_set_up, initargs=(role, policy, str(path))
         )
-        for side in SIDES
+        for role in ROLES
     }
     stop = np.memmap(path, np.int64, "r+")
     two = Pair(pools, stop)
@@ -111,14 +111,14 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
             pool.shutdown(cancel_futures=True)
 
 
-def _set_up(side: Side, policy: Policy, stop: str) -> None:
-    global _side, _took, _stop
+def _set_up(role: Role, policy: Policy, stop: str) -> None:
+    global _role, _took, _stop
     end_with_parent()
     if policy == "fifo":
-        ask_for_real_time(side)
+        ask_for_real_time(role)
     else:
-        own_processor(side)
-    _side, _took = side, np.zeros(CAPACITY, np.int64)
+        own_processor(role)
+    _role, _took = role, np.zeros(CAPACITY, np.int64)
     _took += 1  # touch all pages before a round
     _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
     no_collector_pauses()
@@ -129,7 +129,7 @@ def _started() -> None:
 
 
 def _open(contender: Contender, payload: int) -> bool:
-    end = _ends[contender.name] = contender.open(_side, payload)
+    end = _ends[contender.name] = contender.open(_role, payload)
     return end.compiled
 
 

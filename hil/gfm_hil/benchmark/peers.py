@@ -6,7 +6,7 @@ import ctypes
 from importlib.util import find_spec
 from typing import Any
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
 
 _ROOM = 64  # messages, as in the links
@@ -21,14 +21,14 @@ class Iceoryx2Link:
     """One end of a link over iceoryx2's publish-subscribe: shared memory, driven from Python.
 
     Args:
-        side: of the bench.
+        role: of the bench.
         name: of the two services, unique on this machine.
         longest: bytes of a message.
     """
 
     port: Port | None = None
 
-    def __init__(self, side: Side, name: str, longest: int) -> None:
+    def __init__(self, role: Role, name: str, longest: int) -> None:
         import iceoryx2 as iox2
 
         iox2.set_log_level(iox2.LogLevel.Fatal)
@@ -42,7 +42,7 @@ class Iceoryx2Link:
                 .open_or_create()
             )
 
-        ways = ("u", "y") if side == "controller" else ("y", "u")
+        ways = ("u", "y") if role == "controller" else ("y", "u")
         out, into = (service(way) for way in ways)
         self._publisher = out.publisher_builder().initial_max_slice_len(longest).create()
         self._subscriber = into.subscriber_builder().create()

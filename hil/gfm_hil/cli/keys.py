@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 
 
 def add(commands: Any) -> None:
     """Add the command to the parser."""
     command = commands.add_parser(
         "keys",
-        description="Make a key pair per side, for ZeroMQ between two machines (CURVE).",
+        description="Make a key pair per role, for ZeroMQ between two machines (CURVE).",
     )
     command.add_argument("--out", default="keys", help="folder (%(default)s)")
     command.add_argument("--force", action="store_true", help="replace the keys that are there")
@@ -26,7 +26,7 @@ def call(options: argparse.Namespace) -> int:
 
     folder = Path(options.out)
     write_keys(folder, options.force)
-    for side, other in zip(SIDES, SIDES[::-1], strict=True):
-        print(f"the {side}'s machine: {folder / side}.key_secret {folder / other}.key")
+    for role, other in zip(ROLES, ROLES[::-1], strict=True):
+        print(f"the {role}'s machine: {folder / role}.key_secret {folder / other}.key")
     print(f"on both: link.options.curve = {str(folder)!r}, or --option curve={folder}")
     return 0

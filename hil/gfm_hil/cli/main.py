@@ -36,10 +36,10 @@ COMMANDS = {
     "doctor": ("doctor", "what timing on this machine depends on, and what to do about it"),
     "schema": ("schema", "the JSON schema of a scenario, law or campaign file, for editors"),
     "scenarios": ("scenarios", "list the scenarios that ship"),
-    "keys": ("keys", "make a key pair per side, for ZeroMQ between two machines"),
+    "keys": ("keys", "make a key pair per role, for ZeroMQ between two machines"),
     "deploy": ("deploy", "write service units, container files and the tuning script to a folder"),
-    "controller": ("sides", "start the controller alone; it binds the endpoint"),
-    "plant": ("sides", "start the plant emulator alone; it connects to the endpoint"),
+    "controller": ("roles", "start the controller alone; it binds the endpoint"),
+    "plant": ("roles", "start the plant emulator alone; it connects to the endpoint"),
 }
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.cli.common import exit_code, new_folder, print_summary
-from gfm_hil.results.run_folder import merge_sides
+from gfm_hil.results.run_folder import merge_roles
 
 
 def add(commands: Any) -> None:
@@ -28,6 +28,6 @@ def add(commands: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Make the folder; returns the exit code of the run."""
     folder = new_folder(options.out, "merged")
-    run = merge_sides(options.first, options.second, folder)
+    run = merge_roles(options.first, options.second, folder)
     print_summary(run.summary, folder)
     return exit_code(run.summary)

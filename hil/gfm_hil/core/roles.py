@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-Side = Literal["controller", "plant"]
-SIDES: tuple[Side, ...] = ("controller", "plant")
+Role = Literal["controller", "plant"]
+ROLES: tuple[Role, ...] = ("controller", "plant")
 
 #: what this project's own controller calls itself
 OUR_CONTROLLER = "gfmhil"

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 
 SCHEME = "ipc://"
 LARGEST = 65536  # bytes of a command, and of its answer
@@ -32,18 +32,18 @@ class Announcement(BaseModel):
     laws: list[_Law] = []
 
 
-def announcement(folder: Path, side: Side) -> Path:
+def announcement(folder: Path, role: Role) -> Path:
     """The file in which a role's command server says how to reach it."""
-    return folder / f"commands_{side}.json"
+    return folder / f"commands_{role}.json"
 
 
-def announced(folder: Path, side: Side) -> dict[str, Any] | None:
+def announced(folder: Path, role: Role) -> dict[str, Any] | None:
     """What a role's command server announces, or None if no living process has one.
 
     Raises:
         UserError: the file or process cannot be examined; the run itself may be fine.
     """
-    file = announcement(folder, side)
+    file = announcement(folder, role)
     try:
         found = Announcement.model_validate_json(file.read_text("utf-8"))
         place = Path(found.endpoint.removeprefix(SCHEME)).parent
@@ -56,10 +56,10 @@ def announced(folder: Path, side: Side) -> dict[str, Any] | None:
         raise UserError(f"{file}: not an announcement of a run") from None
 
 
-def present(folder: Path) -> list[Side]:
+def present(folder: Path) -> list[Role]:
     """The roles whose command server is alive.
 
     Raises:
         UserError: a file or process cannot be examined.
     """
-    return [side for side in SIDES if announced(folder, side) is not None]
+    return [role for role in ROLES if announced(folder, role) is not None]

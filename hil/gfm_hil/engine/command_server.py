@@ -4,7 +4,7 @@ A command is an event of a scenario without its time. A thread that the loop nev
 it, puts a good one into the timeline and wakes the loop, which carries it out between two ticks.
 The answer names that tick. ``by`` in the command says who gives
 it (see ``Identity``), and the log of the run records that. The socket is a ZeroMQ REP on a Unix
-path in a folder that only this user can read; ``commands_<side>.json`` in the run folder names it.
+path in a folder that only this user can read; ``commands_<role>.json`` in the run folder names it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.identity import Identity
 from gfm_hil.core.rate import Rate
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.engine.announcement import LARGEST, SCHEME, announcement
 from gfm_hil.engine.retune import retuned
 from gfm_hil.engine.setup import Bench
@@ -54,7 +54,7 @@ class CommandServer:
     """One role's command server; use it as a context manager around the run.
 
     Args:
-        side, bench, timeline: of the run.
+        role, bench, timeline: of the run.
         folder: the run folder, to announce the socket in.
         wake: tells the loop that the timeline has something new.
         stop: ends the run as Ctrl-C would.
@@ -62,15 +62,15 @@ class CommandServer:
 
     def __init__(
         self,
-        side: Side,
+        role: Role,
         bench: Bench,
         timeline: Timeline,
         folder: Path,
         wake: Callable[[], None],
         stop: Callable[[], None],
     ) -> None:
-        self._side, self._bench, self._timeline = side, bench, timeline
-        self._announcement = announcement(folder, side)
+        self._role, self._bench, self._timeline = role, bench, timeline
+        self._announcement = announcement(folder, role)
         self._wake, self._stop = wake, stop
         self._rate = Rate("all operators together", _PER_S, _BURST)
         self._over = threading.Event()
@@ -83,7 +83,7 @@ class CommandServer:
         with contextlib.ExitStack() as stack:
             stack.callback(self._context.destroy, linger=0)
             place = stack.enter_context(scratch.temporary("gfmhil-commands-"))
-            endpoint = f"{SCHEME}{place}/{self._side}"
+            endpoint = f"{SCHEME}{place}/{self._role}"
             try:
                 self._socket.bind(endpoint)
             except zmq.ZMQError as problem:
@@ -141,7 +141,7 @@ class CommandServer:
         except (UserError, ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
         except Exception as problem:  # our own mistake must not end the server
-            _LOG.exception("the %s's command server: %r", self._side, message[:200])
+            _LOG.exception("the %s's command server: %r", self._role, message[:200])
             return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
 
     def _checked(self, content: Any) -> Any:
@@ -152,8 +152,8 @@ class CommandServer:
         """
         event = _EVENT.validate_python(content)
         ours = "controller" if isinstance(event, CONTROLLER_EVENTS) else "plant"
-        if ours != self._side:
-            raise ValueError(f"type = {event.type!r}: for the {ours}, not the {self._side}")
+        if ours != self._role:
+            raise ValueError(f"type = {event.type!r}: for the {ours}, not the {self._role}")
         if isinstance(event, LawChange) and event.law not in self._bench.controller.sets:
             ready = sorted(self._bench.controller.sets)
             known = f"ready are {ready}{meant(event.law, ready)}"

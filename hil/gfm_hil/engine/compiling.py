@@ -11,9 +11,9 @@ from typing import Any
 
 from numba.core import event
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.inproc import buffers, compile_loop
-from gfm_hil.engine.process import compile_side
+from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
@@ -56,14 +56,14 @@ def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
 
 
 def compiled_bench(
-    scenario: Scenario, notice: Callable[[str], None], sides: Iterable[Side] = SIDES
+    scenario: Scenario, notice: Callable[[str], None], roles: Iterable[Role] = ROLES
 ) -> Bench:
     """The bench of a scenario, with everything compiled that a tick calls.
 
     Args:
         scenario: checked.
         notice: told of each set of functions that numba has to compile.
-        sides: the sides to compile for.
+        roles: the sides to compile for.
 
     Raises:
         UserError: as ``make_bench``.
@@ -74,7 +74,7 @@ def compiled_bench(
     if link.type == INPROC:
         sets.append(_both(found))
     else:
-        sets += [_side(side, found) for side in sides]
+        sets += [_role(role, found) for role in roles]
         sets.append(_link(link.type, link.options))
         if link.impairment is not None:
             sets.append(("the link's impairment", impaired.warm_up))
@@ -95,7 +95,7 @@ def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
     sets: list[Set] = [
         ("the operating point", lambda: found.append(make_bench(scenario))),
         _both(found),
-        *(_side(side, found) for side in SIDES),
+        *(_role(role, found) for role in ROLES),
         *(_link(name, {}) for name in link_names()),
         ("a link's impairment", impaired.warm_up),
         _IDLE,
@@ -110,10 +110,10 @@ def _both(found: list[Bench]) -> Set:
     return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1))
 
 
-def _side(side: Side, found: list[Bench]) -> Set:
+def _role(role: Role, found: list[Bench]) -> Set:
     plant, controller = buffers(1)
-    part = plant if side == "plant" else controller
-    return f"the {side}", lambda: compile_side(side, found[0], part)
+    part = plant if role == "plant" else controller
+    return f"the {role}", lambda: compile_role(role, found[0], part)
 
 
 def _link(name: str, options: dict[str, Any]) -> Set:

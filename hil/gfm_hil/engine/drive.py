@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.engine.controller_ticks import controller_ticks
 from gfm_hil.engine.loop_records import (
     FLAGS,
@@ -44,14 +44,14 @@ class _Loop:
     """One side's compiled loop with everything that its calls have in common."""
 
     def __init__(
-        self, side: Side, bench: Bench, link: Any, part: Part, t0_ns: int, flags: NDArray[np.int64]
+        self, role: Role, bench: Bench, link: Any, part: Part, t0_ns: int, flags: NDArray[np.int64]
     ) -> None:
         assert link.port is not None
         scenario, port, c = bench.scenario, link.port, bench.controller
-        plant = side == "plant"
+        plant = role == "plant"
         self.link = link
         self.writer = FrameWriter("y" if plant else "u")
-        self.reader = FrameReader.of(side, scenario)
+        self.reader = FrameReader.of(role, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         self.loop["spin_limit"] = port.spin_limit
         w, r = self.writer, self.reader
@@ -166,10 +166,10 @@ def drive_controller(
     return loop.reader
 
 
-def compile_loops(side: Side, bench: Bench, part: Part) -> None:
+def compile_loops(role: Role, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
-    loop = _Loop(side, bench, _Nowhere(), part, 0, np.ones(FLAGS, np.int64))
-    loop.go(_FAR if side == "controller" else 0)
+    loop = _Loop(role, bench, _Nowhere(), part, 0, np.ones(FLAGS, np.int64))
+    loop.go(_FAR if role == "controller" else 0)
 
 
 @port_function

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import PeerLost, lines
-from gfm_hil.core.roles import OUR_CONTROLLER, Side
+from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.engine.waiting import await_message
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
@@ -67,7 +67,7 @@ class _Greeting(BaseModel):
 
 class _Hello(_Greeting):
     kind: Literal["hello"]
-    side: Side
+    role: Role
     boot: _Text
     version: int = Field(ge=0, lt=2**31)
     table: _Text
@@ -141,7 +141,7 @@ class _Heard:
 
 
 def shake_hands(
-    side: Side, link: Link, scenario: Scenario, stopped: Callable[[], bool], notice: Notice
+    role: Role, link: Link, scenario: Scenario, stopped: Callable[[], bool], notice: Notice
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
 
@@ -153,8 +153,8 @@ def shake_hands(
             something else.
     """
     boot = _boot()
-    mine = {"side": side, "boot": boot, **_what_runs(scenario)}
-    if side == "plant":
+    mine = {"role": role, "boot": boot, **_what_runs(scenario)}
+    if role == "plant":
         mine["run"] = secrets.token_hex(8)
     else:
         mine["name"] = OUR_CONTROLLER
@@ -162,7 +162,7 @@ def shake_hands(
     begin = time.monotonic_ns()
     deadline = begin + int(scenario.link.start_timeout_s * 1e9)
     say_at, again_at = begin + 500_000_000, begin + _AGAIN_NS
-    other = "plant" if side == "controller" else "controller"
+    other = "plant" if role == "controller" else "controller"
     met = one_clock = False
     answered = -_REPEAT_NS
     heard = _Heard(link)
@@ -171,7 +171,7 @@ def shake_hands(
         return Start(t0_ns, one_clock, heard.refused, run, controller)
 
     while not stopped():
-        if side == "plant":
+        if role == "plant":
             link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
         message = await_message(link, min(time.monotonic_ns() + _REPEAT_NS, deadline), stopped)
         now = time.monotonic_ns()
@@ -180,18 +180,18 @@ def shake_hands(
             if isinstance(greeting, _Hello):
                 # Answer before comparing, so that both sides see a misfit, and answer once for
                 # all the greetings that had piled up.
-                if side == "controller" and now - answered >= _REPEAT_NS:
+                if role == "controller" and now - answered >= _REPEAT_NS:
                     answered = now
                     link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
                 _compare(mine, greeting)
                 one_clock = bool(boot) and greeting.boot == boot
-                if side == "plant":
+                if role == "plant":
                     controller = greeting.name
                 else:
                     run = greeting.run
                 if not met:  # from here on silence means that the other side is gone
                     met, deadline = True, now + int(scenario.link.peer_timeout_s * 1e9)
-                if side == "plant":
+                if role == "plant":
                     start = now + _LEAD_NS
                     go: dict[str, Any] = {"kind": "start", "t0": start}
                     link.send(_PREFIX + json.dumps(go).encode())
@@ -288,10 +288,10 @@ def _check_time(t0: int, begin: int, now: int) -> None:
 
 
 def _compare(mine: dict[str, Any], theirs: _Hello) -> None:
-    if theirs.side == mine["side"]:
-        raise PeerLost(f"the other side is a {theirs.side} too")
+    if theirs.role == mine["role"]:
+        raise PeerLost(f"the other side is a {theirs.role} too")
     for what, name in _MUST_FIT.items():
         value = getattr(theirs, what)
         if value != mine[what]:
             values = f"{value!a}, ours is {mine[what]!a}"
-            raise PeerLost(f"the {theirs.side} runs another {name} ({values})")
+            raise PeerLost(f"the {theirs.role} runs another {name} ({values})")

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.engine.drive import drive_controller, drive_plant
 from gfm_hil.engine.loop_records import FLAGS, STOP
 from gfm_hil.engine.setup import Bench
@@ -24,7 +24,7 @@ _LOOK_S = 0.05
 
 
 def run_loop(
-    side: Side,
+    role: Role,
     bench: Bench,
     link: Link,
     part: Part,
@@ -53,13 +53,13 @@ def run_loop(
 
     def work() -> None:
         try:
-            drive = drive_plant if side == "plant" else drive_controller
+            drive = drive_plant if role == "plant" else drive_controller
             found.append(drive(bench, link, part, timeline, t0_ns, flags))
         except BaseException as problem:  # the caller's thread raises it
             failed.append(problem)
 
     timeline.put_off = True
-    thread = threading.Thread(target=work, name=f"{side}-loop", daemon=True)
+    thread = threading.Thread(target=work, name=f"{role}-loop", daemon=True)
     thread.start()
     stand_back()
     try:

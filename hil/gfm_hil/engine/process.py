@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.files import write_text
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.drive import compile_loops
@@ -39,13 +39,13 @@ from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import names
 
 
-def run_side(
-    side: Side, scenario: Scenario, folder: Path, notice: Callable[[str], None] = print
+def run_role(
+    role: Role, scenario: Scenario, folder: Path, notice: Callable[[str], None] = print
 ) -> Outcome:
     """Run one side of a scenario at ``scenario.link.endpoint``, which is set; record to ``folder``.
 
     Returns:
-        How it ended; the parts of the recording, ``events_<side>.jsonl`` and ``link_<side>.json``
+        How it ended; the parts of the recording, ``events_<role>.jsonl`` and ``link_<role>.json``
         (frame counters) are in ``folder``.
 
     Raises:
@@ -53,11 +53,11 @@ def run_side(
     """
     assert scenario.link.endpoint is not None
     with Interrupt() as interrupt:
-        return _run(side, scenario, scenario.link.endpoint, folder, notice, interrupt)
+        return _run(role, scenario, scenario.link.endpoint, folder, notice, interrupt)
 
 
 def _run(
-    side: Side,
+    role: Role,
     scenario: Scenario,
     endpoint: str,
     folder: Path,
@@ -70,20 +70,20 @@ def _run(
         write_text(folder / "scenario.toml", scenario_toml(scenario))
     if scenario.mode == "realtime":
         keep_in_memory(folder, scenario.ticks, notice)
-    part = Part.create(folder, side, scenario.ticks)
-    compile_side(side, bench, part)
-    timeline = Timeline(bench, folder / f"events_{side}.jsonl", (side,))
+    part = Part.create(folder, role, scenario.ticks)
+    compile_role(role, bench, part)
+    timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
     flags = np.zeros(FLAGS, np.int64)
 
     def wake() -> None:
         flags[WAKE] += 1
 
     # the command server first: its threads must not inherit the loop's priority
-    with CommandServer(side, bench, timeline, folder, wake, interrupt.ask):
+    with CommandServer(role, bench, timeline, folder, wake, interrupt.ask):
         try:
-            seen = _meet_and_run(side, bench, endpoint, part, timeline, flags, interrupt, notice)
+            seen = _meet_and_run(role, bench, endpoint, part, timeline, flags, interrupt, notice)
             with contextlib.suppress(OSError):  # a full disk costs these counts and nothing else
-                write_text(folder / f"link_{side}.json", json.dumps({"side": side, **seen}))
+                write_text(folder / f"link_{role}.json", json.dumps({"role": role, **seen}))
         except PeerLost as problem:
             timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
         finally:
@@ -93,7 +93,7 @@ def _run(
 
 
 def _meet_and_run(
-    side: Side,
+    role: Role,
     bench: Bench,
     endpoint: str,
     part: Part,
@@ -109,8 +109,8 @@ def _meet_and_run(
         UserError: the endpoint cannot be opened.
     """
     scenario = bench.scenario
-    rights = ask_for_real_time(side) if scenario.mode == "realtime" else None
-    good: Link = open_link(scenario.link.type, side, endpoint, scenario.link.options)
+    rights = ask_for_real_time(role) if scenario.mode == "realtime" else None
+    good: Link = open_link(scenario.link.type, role, endpoint, scenario.link.options)
     link = good
 
     def stopped() -> bool:
@@ -118,20 +118,20 @@ def _meet_and_run(
 
     resources = ExitStack()
     try:
-        if scenario.link.impairment is not None and scenario.link.impairment.hits(side):
-            link = ImpairedLink(good, scenario.link.impairment, side)  # compiles: before START
+        if scenario.link.impairment is not None and scenario.link.impairment.hits(role):
+            link = ImpairedLink(good, scenario.link.impairment, role)  # compiles: before START
         if rights is not None:
             if good.port is None:  # a thread in Python pumps its messages, and hardly ever sleeps
                 rights["policy"] = ordinary_priority()
             else:
                 awake = kept_awake(rights["processor"], scenario.keep_awake)
                 rights["kept_awake"] = resources.enter_context(awake)
-            timeline.write(0, "scheduling", side=side, **rights)
+            timeline.write(0, "scheduling", role=role, **rights)
         no_collector_pauses()
         notify(f"STATUS=waiting for the other side at {endpoint}")
-        start = shake_hands(side, good, scenario, stopped, notice)
+        start = shake_hands(role, good, scenario, stopped, notice)
         with Watched(scenario, part.progress):
-            reader = run_loop(side, bench, link, part, timeline, start.t0_ns, stopped, flags)
+            reader = run_loop(role, bench, link, part, timeline, start.t0_ns, stopped, flags)
     finally:
         resources.close()
         link.close()
@@ -142,7 +142,7 @@ def _meet_and_run(
     return {"faults": faults, "e2e": reader.e2e, **met, **injected}
 
 
-def compile_side(side: Side, bench: Bench, part: Part) -> None:
+def compile_role(role: Role, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
     par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
     plant_sample(par, st, y)
@@ -154,9 +154,9 @@ def compile_side(side: Side, bench: Bench, part: Part) -> None:
         reader = FrameReader(group)
         reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
         reader.judge(False, False)
-    compile_loops(side, bench, part)
+    compile_loops(role, bench, part)
     pump.warm_up()
-    if side == "plant":
+    if role == "plant":
         record_sample(part.signals[0].copy(), y, par, st)
         record_command(part.signals[0].copy(), u)
     else:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
 from gfm_hil.recording.log import Outcome
@@ -67,12 +67,12 @@ class Processes:
             if self.scenario.mode == "realtime":
                 keep_in_memory(self.folder, self.scenario.ticks, self.notice)
             self.notice("starting controller and plant …")
-            self._told: set[Side] = set()  # by a signal of ours to end
-            self._sides = {side: self._start(side, endpoint) for side in SIDES}
+            self._told: set[Role] = set()  # by a signal of ours to end
+            self._roles = {role: self._start(role, endpoint) for role in ROLES}
             try:
                 began = self._watch()
             finally:
-                for process in self._sides.values():
+                for process in self._roles.values():
                     if process.poll() is None:
                         process.kill()
                         process.wait()
@@ -82,27 +82,27 @@ class Processes:
     def _interrupted(self) -> Outcome:
         return Outcome("interrupted", "stopped by the operator", 0)
 
-    def _start(self, side: Side, endpoint: str) -> subprocess.Popen[bytes]:
+    def _start(self, role: Role, endpoint: str) -> subprocess.Popen[bytes]:
         folder = self.folder.absolute()  # a name such as "--" must not look like an option
         scenario = str(folder / "scenario.toml")
         # -P: a file of the operator's folder must not stand in for a module
-        command = [sys.executable, "-P", "-m", "gfm_hil", side, scenario]
+        command = [sys.executable, "-P", "-m", "gfm_hil", role, scenario]
         command += ["--endpoint", endpoint, "--out", str(folder), "--quiet"]
         command += ["--part", str(os.getpid())]
-        if side == "controller" and self.controller_command:
+        if role == "controller" and self.controller_command:
             command = [
                 argument.replace("{endpoint}", endpoint).replace("{scenario}", scenario)
                 for argument in self.controller_command
             ]
-        with self._log(side).open("wb") as log:
+        with self._log(role).open("wb") as log:
             try:
                 # a session of its own: Ctrl-C reaches the process through us, once
                 return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
             except OSError as problem:
                 raise UserError(f"{command[0]}: cannot be started: {problem.strerror}") from None
 
-    def _log(self, side: Side) -> Path:
-        return self.folder / f"{side}.log"
+    def _log(self, role: Role) -> Path:
+        return self.folder / f"{role}.log"
 
     def _watch(self) -> float:
         """Wait until both have ended; stop and then kill a side that takes too long.
@@ -112,9 +112,9 @@ class Processes:
         """
         part, began = None, time.monotonic()
         stop_at = kill_at = float("inf")
-        ended: list[Side] = []
+        ended: list[Role] = []
         told = False
-        while len(ended) < len(self._sides):
+        while len(ended) < len(self._roles):
             time.sleep(_LOOK_S)
             now = time.monotonic()
             part = part or Part.open(self.folder, "plant")
@@ -122,11 +122,11 @@ class Processes:
                 if int(part.progress[0]) == 0:
                     began = now
                 self.progress(int(part.progress[0]), int(part.progress[1]))
-            for side, process in self._sides.items():
-                if side not in ended and process.poll() is not None:
-                    ended.append(side)
-                    if self._crash(side) and not self.interrupt.came:
-                        self.notice(self._crash(side))
+            for role, process in self._roles.items():
+                if role not in ended and process.poll() is not None:
+                    ended.append(role)
+                    if self._crash(role) and not self.interrupt.came:
+                        self.notice(self._crash(role))
                     wait = self.scenario.link.peer_timeout_s + _GRACE_S
                     stop_at = min(stop_at, now + wait if process.returncode <= 0 else now)
             if not told and (self.interrupt.came or now >= stop_at):
@@ -137,29 +137,29 @@ class Processes:
         return began
 
     def _send(self, number: signal.Signals) -> None:
-        for side, process in self._sides.items():
+        for role, process in self._roles.items():
             if process.poll() is None:
-                self._told.add(side)
+                self._told.add(role)
                 process.send_signal(number)
 
-    def _crash(self, side: Side) -> str:
+    def _crash(self, role: Role) -> str:
         """How a side ended that did not end by itself."""
-        code = self._sides[side].returncode
+        code = self._roles[role].returncode
         if code < 0:
-            return f"the {side} was ended by {signal.Signals(-code).name}"
-        return f"the {side} failed, see {self._log(side)}" if code not in (0, 2) else ""
+            return f"the {role} was ended by {signal.Signals(-code).name}"
+        return f"the {role} failed, see {self._log(role)}" if code not in (0, 2) else ""
 
     def _judge(self) -> Outcome | None:
-        said = {side: self._log(side).read_text("utf-8").strip() for side in SIDES}
-        refused = [said[s] for s, process in self._sides.items() if process.returncode == 2]
+        said = {role: self._log(role).read_text("utf-8").strip() for role in ROLES}
+        refused = [said[s] for s, process in self._roles.items() if process.returncode == 2]
         if refused:
             raise UserError("\n".join(text.removeprefix("gfmhil: ") for text in refused))
-        for side, text in said.items():
+        for role, text in said.items():
             if not text:
-                self._log(side).unlink()
-        crashed = [side for side in SIDES if self._crash(side)]
-        first = [side for side in crashed if side not in self._told]  # not by our own signal
-        crashes = [self._crash(side) for side in first or crashed]
+                self._log(role).unlink()
+        crashed = [role for role in ROLES if self._crash(role)]
+        first = [role for role in crashed if role not in self._told]  # not by our own signal
+        crashes = [self._crash(role) for role in first or crashed]
         if crashes and self.interrupt.came:
             return self._interrupted
         return Outcome("safe", "; ".join(crashes), 0) if crashes else None

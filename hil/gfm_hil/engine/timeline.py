@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.retune import change_gains
 from gfm_hil.engine.setup import Bench
 from gfm_hil.recording.log import Outcome, Status
@@ -57,14 +57,14 @@ class Timeline:
     Args:
         bench: the records that events act on.
         log: file to append to.
-        sides: which events are ours.
+        roles: which events are ours.
 
     Raises:
         UserError: the disk is full.
     """
 
-    def __init__(self, bench: Bench, log: Path, sides: tuple[Side, ...]) -> None:
-        self._bench, self._sides = bench, sides
+    def __init__(self, bench: Bench, log: Path, roles: tuple[Role, ...]) -> None:
+        self._bench, self._roles = bench, roles
         self._path, self._room = log, log.with_suffix(".room")
         try:
             self._log = log.open("ab", buffering=0)
@@ -79,7 +79,7 @@ class Timeline:
         self._todo = [
             (e.at(scenario.T_s), e)
             for e in scenario.sorted_events()
-            if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in sides
+            if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in roles
         ]
         self._inbox: deque[tuple[Any, Ticket]] = deque()
         self._changes = 0
@@ -146,7 +146,7 @@ class Timeline:
     def look(self, tick: int) -> None:
         """Log what the last tick brought: a change of law, a safe state, a trip."""
         ctl, st = self._bench.controller.ctl, self._bench.st
-        if "controller" in self._sides and int(ctl["changes"][0]) != self._changes:
+        if "controller" in self._roles and int(ctl["changes"][0]) != self._changes:
             self._changes = int(ctl["changes"][0])
             self.write(
                 tick,
@@ -159,17 +159,17 @@ class Timeline:
             if self._bench.scenario.after_trip == "end":
                 self.end(*found, tick)
                 return
-            self.write(tick, found[0], reason=found[1], side="+".join(self._sides))
+            self.write(tick, found[0], reason=found[1], role="+".join(self._roles))
         elif found is None and self._fault is not None:
-            self.write(tick, "recovered", side="+".join(self._sides))
+            self.write(tick, "recovered", role="+".join(self._roles))
         self._fault = found
 
     def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
         """The fault that keeps our side from running, if any; the cause before its consequences."""
-        trip = int(st["trip"][0]) if "plant" in self._sides else 0
+        trip = int(st["trip"][0]) if "plant" in self._roles else 0
         if trip not in (0, CONTROLLER):
             return "tripped", trip_reason(st, self._bench.par)
-        if "controller" in self._sides and int(ctl["state"][0]) == SAFE:
+        if "controller" in self._roles and int(ctl["state"][0]) == SAFE:
             heard = int(ctl["reason"][0]) == PLANT_TRIP
             return "tripped" if heard else "safe", safe_reason(ctl)
         return ("safe", trip_reason(st, self._bench.par)) if trip else None
@@ -184,11 +184,11 @@ class Timeline:
             if self.failed and status == "interrupted":
                 status, reason = "safe", self.failed
             self.outcome = Outcome(status, reason, tick)
-            side, now = "+".join(self._sides), time.monotonic_ns()  # the clock of timing.npz
+            role, now = "+".join(self._roles), time.monotonic_ns()  # the clock of timing.npz
             more: dict[str, Any] = {}
             if status == "interrupted" and self.stopped_by is not None:
                 more = {"operator": self.stopped_by}
-            self.write(tick, "end", status=status, reason=reason, side=side, clock_ns=now, **more)
+            self.write(tick, "end", status=status, reason=reason, role=role, clock_ns=now, **more)
 
     def write(self, tick: int, kind: str, **more: Any) -> None:
         """Add a line to the log; on disk at once, or at the next ``flush`` if ``put_off``."""
@@ -227,7 +227,7 @@ class TimelineInMemory(Timeline):
     """The events of a run in process, whose log stays in ``lines``."""
 
     def __init__(self, bench: Bench) -> None:
-        super().__init__(bench, Path(os.devnull), SIDES)
+        super().__init__(bench, Path(os.devnull), ROLES)
         self.lines: list[dict[str, Any]] = []
 
     def write(self, tick: int, kind: str, **more: Any) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
 
 LONGEST = 504  # bytes: every link carries a message, frame or greeting, up to this length
@@ -87,7 +87,7 @@ class LinkKind:
     pattern: str
     form: str
     fresh: Callable[[Path], str]
-    open: Callable[[Side, str, Any], Link]
+    open: Callable[[Role, str, Any], Link]
     options: type[LinkOptions] = LinkOptions
     check: Callable[[Any, float], None] = _fits
     check_both: Callable[[str | None, Any], None] = _may

@@ -201,7 +201,7 @@ def judge(reader, overdue, latched):
 
 
 if TYPE_CHECKING:
-    from gfm_hil.core.roles import Side
+    from gfm_hil.core.roles import Role
     from gfm_hil.scenario.model import Scenario
 
 LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
@@ -254,19 +254,19 @@ class FrameReader:
     """
 
     @classmethod
-    def of(cls, side: Side, scenario: Scenario) -> FrameReader:
+    def of(cls, role: Role, scenario: Scenario) -> FrameReader:
         """The reader of one side, with the limits that its scenario sets.
 
         A gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone. The
         plant's loop writes its own tick into ``newest`` at every tick.
         """
-        reader, link = cls("u" if side == "plant" else "y"), scenario.link
+        reader, link = cls("u" if role == "plant" else "y"), scenario.link
         lockstep, r = scenario.mode == "lockstep", reader.record
         r["delta"] = math.ceil(link.peer_timeout_s / scenario.T_s) + 1
         asked = math.ceil(min(link.peer_timeout_s / link.repeat_s, LONGEST_JUMP))
         r["jump"] = min(int(r["delta"][0]) + asked + LAST_TIMES, LONGEST_JUMP)
         r["again"] = asked if lockstep else 0
-        if side == "controller":
+        if role == "controller":
             r["newest"] = scenario.ticks - 1
         elif not lockstep:
             r["behind"] = scenario.late_policy.hold

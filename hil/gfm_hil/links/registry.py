@@ -12,7 +12,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.base import Link, LinkKind
 
 GROUP = "gfmhil.links"
@@ -45,7 +45,7 @@ def link_kind(name: str) -> LinkKind:
     raise ValueError(f"link.type = {name!r}: must be one of {link_names()}")
 
 
-def open_link(name: str, side: Side, endpoint: str, options: dict[str, Any] | None = None) -> Link:
+def open_link(name: str, role: Role, endpoint: str, options: dict[str, Any] | None = None) -> Link:
     """Open one end of the link of that name.
 
     Raises:
@@ -58,4 +58,4 @@ def open_link(name: str, side: Side, endpoint: str, options: dict[str, Any] | No
         kind.check_both(endpoint, checked)
     except ValueError as problem:
         raise UserError(f"link: {problem}") from None
-    return kind.open(side, endpoint, checked)
+    return kind.open(role, endpoint, checked)

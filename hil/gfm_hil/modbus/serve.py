@@ -20,7 +20,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.core.supervised import supervised
 from gfm_hil.engine.announcement import present
 from gfm_hil.modbus.connection import CLIENT, UNIT, Server
@@ -201,7 +201,7 @@ async def _rest(over: asyncio.Event, seconds: float) -> None:
 
 def begun(folder: Path) -> bool:
     """Whether both sides of a run have started."""
-    return len(present(folder)) == len(SIDES)
+    return len(present(folder)) == len(ROLES)
 
 
 def _going(folder: Path) -> bool:

@@ -10,7 +10,7 @@ import zmq
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity, local
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.engine.announcement import LARGEST, announced, present
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.scenario.events import CONTROLLER_EVENTS
@@ -77,8 +77,8 @@ class Operator:
         Raises:
             UserError: the run does not answer.
         """
-        for side in present(self._folder):
-            self._ask(side, {"type": "stop"}, by)
+        for role in present(self._folder):
+            self._ask(role, {"type": "stop"}, by)
             return
 
     def snapshot(self) -> dict[str, Any]:
@@ -109,26 +109,26 @@ class Operator:
                 found["laws"], found["T_s"] = server["names"], server["T_s"]
         return found
 
-    def _ask(self, side: Side, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
-        server = announced(self._folder, side)
+    def _ask(self, role: Role, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
+        server = announced(self._folder, role)
         if server is None:
-            raise UserError(f"{self._folder}: the {side} is not running")
+            raise UserError(f"{self._folder}: the {role} is not running")
         content = {**event, "by": (by or self._local).plain()}
         try:
-            answer = self._exchange(side, server["endpoint"], content)
+            answer = self._exchange(role, server["endpoint"], content)
         except zmq.ZMQError as problem:  # for example no descriptor for a socket
-            raise UserError(f"{self._folder}: the {side} cannot be asked: {problem}") from None
+            raise UserError(f"{self._folder}: the {role} cannot be asked: {problem}") from None
         if not answer["ok"]:
             raise UserError(str(answer["error"]))
         return {key: value for key, value in answer.items() if key != "ok"}
 
-    def _exchange(self, side: Side, endpoint: str, content: dict[str, Any]) -> dict[str, Any]:
+    def _exchange(self, role: Role, endpoint: str, content: dict[str, Any]) -> dict[str, Any]:
         with self._context.socket(zmq.REQ) as socket:
             socket.set(zmq.LINGER, 0)
             socket.set(zmq.MAXMSGSIZE, LARGEST)
             socket.connect(endpoint)
             socket.send_json(content)
             if not socket.poll(_ANSWER_MS):
-                raise UserError(f"{self._folder}: the {side} does not answer")
+                raise UserError(f"{self._folder}: the {role} does not answer")
             answer: Any = socket.recv_json()
         return dict(answer)

@@ -7,7 +7,7 @@ import gc
 import os
 from typing import Any
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 
 PRIORITY = 50  # of SCHED_FIFO: above desktop programs, below the kernel's threads
 _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
@@ -16,7 +16,7 @@ _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 _before: set[int] = set()  # processors that this process could use before it chose one
 
 
-def ask_for_real_time(side: Side) -> dict[str, Any]:
+def ask_for_real_time(role: Role) -> dict[str, Any]:
     """Request a processor, a real-time priority and locked memory for this thread.
 
     Threads that it starts later inherit processor and priority, so call this before the link is
@@ -29,12 +29,12 @@ def ask_for_real_time(side: Side) -> dict[str, Any]:
     """
     return {
         "policy": _fifo() or ordinary_priority(),
-        "processor": own_processor(side),
+        "processor": own_processor(role),
         "memory_locked": _lock_memory(),
     }
 
 
-def own_processor(side: Side) -> int | None:
+def own_processor(role: Role) -> int | None:
     """The controller takes the last processor that it may use, the plant the first.
 
     A link's I/O thread shares the processor, so that a round trip does not wait for a migration.
@@ -43,7 +43,7 @@ def own_processor(side: Side) -> int | None:
         return None
     allowed = sorted(os.sched_getaffinity(0))
     _before.update(allowed)
-    mine = allowed[-1] if side == "controller" else allowed[0]
+    mine = allowed[-1] if role == "controller" else allowed[0]
     os.sched_setaffinity(0, {mine})
     return mine
 

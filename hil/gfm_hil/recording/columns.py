@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_plant import TRUTH
 from gfm_plant.names import TRIP_REASONS
 from gfm_runtime.signals import REF_NAMES, SIGNALS, U_NAMES, Y_NAMES
@@ -33,11 +33,11 @@ CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
 PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
 CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
-SIGNALS_OF: dict[Side, tuple[str, ...]] = {
+SIGNALS_OF: dict[Role, tuple[str, ...]] = {
     "plant": PLANT_COLUMNS,
     "controller": CONTROLLER_COLUMNS,
 }
-TIMES_OF: dict[Side, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
+TIMES_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
 BYTES_PER_TICK = 8 * sum(map(len, [*SIGNALS_OF.values(), *TIMES_OF.values()]))
 
 PIECE = 1 << 18  # ticks of a column that a reader holds in memory at a time
@@ -126,9 +126,9 @@ def _signals(prefix: str, groups: tuple[str, ...], origin: str) -> list[Describe
     ]
 
 
-def _time(side: Side, name: str) -> Described:
-    clock = "" if name == "stall" else f"CLOCK_MONOTONIC of the {side}, -1: never; "
-    return Described(f"{side}_{name}", "", "ns", f"{clock}{_TIMES[name]}")
+def _time(role: Role, name: str) -> Described:
+    clock = "" if name == "stall" else f"CLOCK_MONOTONIC of the {role}, -1: never; "
+    return Described(f"{role}_{name}", "", "ns", f"{clock}{_TIMES[name]}")
 
 
 def _table() -> dict[str, Described]:
@@ -156,10 +156,10 @@ def _table() -> dict[str, Described]:
         Described(
             "X_est", "X_{est}", "p.u. (Z_b)", "grid reactance as a scheduled law estimates it"
         ),
-        *(_time(side, name) for side, times in TIMES_OF.items() for name in times),
+        *(_time(role, name) for role, times in TIMES_OF.items() for name in times),
     ]  # fmt: skip
     found = {row.name: row for row in rows}
-    times = [f"{side}_{name}" for side, names in TIMES_OF.items() for name in names]
+    times = [f"{role}_{name}" for role, names in TIMES_OF.items() for name in names]
     return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *times)}
 
 
@@ -196,10 +196,10 @@ def unit_of(name: str) -> str:
 
 
 def named(
-    side: Side, signals: NDArray[Any], times: NDArray[Any] | None = None
+    role: Role, signals: NDArray[Any], times: NDArray[Any] | None = None
 ) -> dict[str, NDArray[Any]]:
     """A side's arrays, shape (ticks, columns) each, as views of shape (ticks,) by column name."""
-    found = {name: signals[:, j] for j, name in enumerate(SIGNALS_OF[side])}
+    found = {name: signals[:, j] for j, name in enumerate(SIGNALS_OF[role])}
     if times is not None:
-        found |= {f"{side}_{name}": times[:, j] for j, name in enumerate(TIMES_OF[side])}
+        found |= {f"{role}_{name}": times[:, j] for j, name in enumerate(TIMES_OF[role])}
     return found

@@ -13,7 +13,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import SIGNALS_OF, Columns, named
 from gfm_hil.recording.parts import Part
 from gfm_runtime.toml_file import read_toml
@@ -29,7 +29,7 @@ class LiveRun:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._parts: dict[Side, Part] = {}
+        self._parts: dict[Role, Part] = {}
         self._columns: dict[str, NDArray[Any]] = {}
 
     @cached_property
@@ -48,12 +48,12 @@ class LiveRun:
         return T_s
 
     @property
-    def parts(self) -> dict[Side, Part]:
+    def parts(self) -> dict[Role, Part]:
         """The arrays of the sides that have begun to record."""
-        for side in SIDES:
-            if side not in self._parts and (part := Part.open(self.folder, side)) is not None:
-                self._parts[side] = part
-                self._columns = {**self._columns, **named(side, part.signals, part.times)}
+        for role in ROLES:
+            if role not in self._parts and (part := Part.open(self.folder, role)) is not None:
+                self._parts[role] = part
+                self._columns = {**self._columns, **named(role, part.signals, part.times)}
         return self._parts
 
     @property
@@ -62,14 +62,14 @@ class LiveRun:
         timing.npz; only rows of ticks that are done have a meaning."""
         return self._columns if self.parts else {}
 
-    def done(self, side: Side) -> int:
+    def done(self, role: Role) -> int:
         """How many ticks a side has recorded."""
-        part = self.parts.get(side)
+        part = self.parts.get(role)
         return 0 if part is None else int(part.progress[0])
 
-    def row(self, side: Side, tick: int) -> dict[str, float]:
+    def row(self, role: Role, tick: int) -> dict[str, float]:
         """What a side recorded in a tick that is done, by column, without its times."""
-        return dict(zip(SIGNALS_OF[side], self.parts[side].signals[tick].tolist(), strict=True))
+        return dict(zip(SIGNALS_OF[role], self.parts[role].signals[tick].tolist(), strict=True))
 
     @property
     def misses(self) -> int:
@@ -84,5 +84,5 @@ class LiveRun:
 
 def begun(folder: Path) -> bool:
     """Whether a side of a run has begun to record there, and it is known what."""
-    recorded = any((folder / f"parts/{side}_progress.npy").is_file() for side in SIDES)
+    recorded = any((folder / f"parts/{role}_progress.npy").is_file() for role in ROLES)
     return recorded and (folder / "scenario.toml").is_file()

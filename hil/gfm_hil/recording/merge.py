@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, SIGNALS_OF, TIMES_OF
 from gfm_hil.recording.npz import BLOCK, Table, write_npz
 from gfm_hil.recording.parts import Part
@@ -45,15 +45,15 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> None:
     Raises:
         OSError: a file cannot be written; it is then not there.
     """
-    parts = {side: part for side in SIDES if (part := Part.open(folder, side)) is not None}
-    files = {side: folder / "parts" / f"{side}_signals.npy" for side in parts}
-    counts = {side: _recorded(files[side], len(part.signals)) for side, part in parts.items()}
+    parts = {role: part for role in ROLES if (part := Part.open(folder, role)) is not None}
+    files = {role: folder / "parts" / f"{role}_signals.npy" for role in parts}
+    counts = {role: _recorded(files[role], len(part.signals)) for role, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
     write_npz(folder / "signals.npz", _signals(files, done, T_s, laws))
     write_npz(folder / "timing.npz", _timing(folder / "parts", [*parts], done))
 
 
-def _signals(files: dict[Side, Path], done: int, T_s: float, laws: list[str]) -> Iterator[Table]:
+def _signals(files: dict[Role, Path], done: int, T_s: float, laws: list[str]) -> Iterator[Table]:
     kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
 
     def clock(first: int, last: int) -> list[NDArray[Any]]:
@@ -82,12 +82,12 @@ def _signals(files: dict[Side, Path], done: int, T_s: float, laws: list[str]) ->
     yield Table.of(laws=np.array(known_laws(laws, used)))
 
 
-def _timing(parts: Path, sides: list[Side], done: int) -> Iterator[Table]:
+def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[Table]:
     """The times of each side that recorded some."""
-    for side, names in TIMES_OF.items():
-        file = parts / f"{side}_times.npy"
-        if side in sides and any((_rows(file, a, b) >= 0).any() for a, b in _blocks(done)):
-            kinds = {f"{side}_{name}": np.dtype(np.int64) for name in names}
+    for role, names in TIMES_OF.items():
+        file = parts / f"{role}_times.npy"
+        if role in roles and any((_rows(file, a, b) >= 0).any() for a, b in _blocks(done)):
+            kinds = {f"{role}_{name}": np.dtype(np.int64) for name in names}
             yield Table(kinds, done, partial(_rows, file))
 
 

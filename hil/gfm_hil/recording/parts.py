@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import BYTES_PER_TICK, SIGNALS_OF, TIMES_OF
 
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
-_FILES = frozenset(f"{s}_{what}.npy" for s in SIDES for what in ("signals", "times", "progress"))
+_FILES = frozenset(f"{s}_{what}.npy" for s in ROLES for what in ("signals", "times", "progress"))
 _HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
 _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
 
@@ -41,14 +41,14 @@ class Part:
     progress: NDArray[np.int64]
 
     @staticmethod
-    def create(folder: Path, side: Side, ticks: int) -> Part:
+    def create(folder: Path, role: Role, ticks: int) -> Part:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop."""
-        columns, times = SIGNALS_OF[side], TIMES_OF[side]
+        columns, times = SIGNALS_OF[role], TIMES_OF[role]
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
         def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
-            path = parts / f"{side}_{what}.npy"
+            path = parts / f"{role}_{what}.npy"
             try:
                 array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
                 with path.open("r+b") as file:  # a page that is not to be had would end the process
@@ -65,18 +65,18 @@ class Part:
         )
 
     @staticmethod
-    def open(folder: Path, side: Side) -> Part | None:
+    def open(folder: Path, role: Role) -> Part | None:
         """The files of a side as they are, or None if that side never came so far, or one of them
         is damaged."""
         try:
             arrays: list[NDArray[Any]] = [
-                np.asarray(np.load(folder / "parts" / f"{side}_{what}.npy", mmap_mode="r"))
+                np.asarray(np.load(folder / "parts" / f"{role}_{what}.npy", mmap_mode="r"))
                 for what in ("signals", "times", "progress")
             ]
         except Exception:  # not there, or just being made; numpy has no common base for its errors
             return None
         signals, times, progress = arrays
-        columns, names = SIGNALS_OF[side], TIMES_OF[side]
+        columns, names = SIGNALS_OF[role], TIMES_OF[role]
         kinds = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
         widths = (signals.shape[1:], times.shape[1:]) == ((len(columns),), (len(names),))
         whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)

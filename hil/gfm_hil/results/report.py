@@ -114,7 +114,7 @@ def write_report(
     if any(summary["faults"].values()):
         facts.append(("frames refused or lost", str(summary["faults"])))
     if summary["e2e"]:
-        states = ", ".join(f"{side} {state}" for side, state in summary["e2e"].items())
+        states = ", ".join(f"{role} {state}" for role, state in summary["e2e"].items())
         facts.append(("end-to-end protection", states))
     rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
     images = "".join(f'<img alt="{p.stem}" src="{_inline(p)}">' for p in pictures)

@@ -1,7 +1,7 @@
 """The folder of a run: whether it may be used, and how its files are made.
 
 ``summary.json`` is written last. While it is missing, the folder still holds all that the other
-files are made of, and ``recover`` can make them again. ``merge_sides`` makes one folder of the two
+files are made of, and ``recover`` can make them again. ``merge_roles`` makes one folder of the two
 that the sides of a run leave if they were started apart.
 """
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import BYTES_PER_TICK, Columns
 from gfm_hil.recording.log import Outcome, read_events, read_log, worst
@@ -199,15 +199,15 @@ def _complete(
     return run
 
 
-def _link_ends(folder: Path) -> dict[Side, dict[str, Any]]:
+def _link_ends(folder: Path) -> dict[Role, dict[str, Any]]:
     """What each side wrote about its end of the link: the faults that it counted, the state of the
     end-to-end protection, whether both sides share a clock, the number of the run, what the
     controller calls itself, and the faults injected on purpose."""
     ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
-    return {end["side"]: end for end in ends}
+    return {end["role"]: end for end in ends}
 
 
-def merge_sides(first: Path, second: Path, folder: Path) -> Run:
+def merge_roles(first: Path, second: Path, folder: Path) -> Run:
     """Put what the two sides of a run left, each in a folder of its own, into one run folder.
 
     Rows end where the plant's recording does, as in a run whose sides were started together.
@@ -220,27 +220,27 @@ def merge_sides(first: Path, second: Path, folder: Path) -> Run:
         UserError: a folder is not that of one side, they are not of the same run, or ``folder``
             is in use or cannot be written.
     """
-    sides: dict[Side, Run] = {}
+    roles: dict[Role, Run] = {}
     for run in (Run.load(first), Run.load(second)):
-        recorded = [s for s, one in zip(SIDES, ("ref_P_ref", "true_p"), strict=True)
+        recorded = [s for s, one in zip(ROLES, ("ref_P_ref", "true_p"), strict=True)
                     if one in run.columns]  # fmt: skip
         if len(recorded) != 1:
             said = " and ".join(recorded) or "neither side"
             raise UserError(f"{run.folder}: holds the recording of {said}, not of one side alone")
-        if recorded[0] in sides:
+        if recorded[0] in roles:
             raise UserError(f"{first}, {second}: both are of the {recorded[0]}")
-        sides[recorded[0]] = run
-    plant, controller = sides["plant"], sides["controller"]
+        roles[recorded[0]] = run
+    plant, controller = roles["plant"], roles["controller"]
     ids = [run.summary.get("run") for run in (plant, controller)]
     if ids[0] is None or ids[0] != ids[1]:
         raise UserError(f"{first}, {second}: are not of the same run: run = {ids[0]!r}, {ids[1]!r}")
     done = plant.summary["ticks"]
     check_free(folder, done)
-    log = read_log(*(run.file("events.jsonl") for run in sides.values()))
+    log = read_log(*(run.file("events.jsonl") for run in roles.values()))
     links = {
-        side: _link_end(side, sides[side].summary)
-        for side in SIDES
-        if side in sides[side].summary["faults"]
+        role: _link_end(role, roles[role].summary)
+        for role in ROLES
+        if role in roles[role].summary["faults"]
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -265,10 +265,10 @@ def merge_sides(first: Path, second: Path, folder: Path) -> Run:
     return whole
 
 
-def _link_end(side: Side, summary: dict[str, Any]) -> dict[str, Any]:
+def _link_end(role: Role, summary: dict[str, Any]) -> dict[str, Any]:
     """What ``_link_ends`` gives of a side, from the summary of that side alone."""
     keys = ("faults", "e2e", "injected")
-    kept = {key: summary[key][side] for key in keys if side in summary.get(key, {})}
+    kept = {key: summary[key][role] for key in keys if role in summary.get(key, {})}
     one_clock = "clock_drift_ppm" not in summary
     return {**kept, "one_clock": one_clock, "controller": summary["controller"]}
 

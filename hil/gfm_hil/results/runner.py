@@ -11,7 +11,7 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.roles import SIDES
+from gfm_hil.core.roles import ROLES
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compiled_bench
 from gfm_hil.engine.inproc import buffers, run_inproc
@@ -58,7 +58,7 @@ def run_scenario(
     """
     check_free(folder, scenario.ticks)
     # here, so that two processes do not compile the same at a time
-    bench = compiled_bench(scenario, notice, ("plant",) if controller_command else SIDES)
+    bench = compiled_bench(scenario, notice, ("plant",) if controller_command else ROLES)
     folder.mkdir(parents=True, exist_ok=True)
     with in_use(folder):
         outside = None
@@ -84,8 +84,8 @@ def run_scenario(
 
 def _run_here(bench: Bench, folder: Path, progress: Progress, interrupt: Interrupt) -> float:
     """Run both sides in this process; returns when the first tick was run."""
-    parts = {side: Part.create(folder, side, bench.scenario.ticks) for side in SIDES}
-    timeline = Timeline(bench, folder / "events_both.jsonl", SIDES)
+    parts = {role: Part.create(folder, role, bench.scenario.ticks) for role in ROLES}
+    timeline = Timeline(bench, folder / "events_both.jsonl", ROLES)
     began = time.monotonic()
 
     def go_on(ticks: int) -> bool:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.core.roles import OUR_CONTROLLER, Side
+from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.log import Outcome, cause
 from gfm_hil.recording.run import nominal_frequency
@@ -50,7 +50,7 @@ def summarise(
     timing: Columns,
     log: list[dict[str, Any]],
     outcome: Outcome,
-    links: Mapping[Side, dict[str, Any]],
+    links: Mapping[Role, dict[str, Any]],
     wall_s: float,
 ) -> dict[str, Any]:
     """The summary of one run as plain data; None where the recording does not say.
@@ -59,7 +59,7 @@ def summarise(
         scenario, outcome, log: of the run.
         signals, timing: the columns of the files of these names, read piece by piece. A side that
             recorded nothing has no columns.
-        links: what each side wrote about its end of the link (``link_<side>.json``), by side;
+        links: what each side wrote about its end of the link (``link_<role>.json``), by role;
             empty for a run in one process.
         wall_s: how long the run took, s.
     """
@@ -73,7 +73,7 @@ def summarise(
     happened = [e for e in log if "label" in e]
     bumps = {e["tick"]: e["bump_pu"] for e in changes}
     starts = np.array([e["tick"] for e in happened])  # in order, as the log is
-    ends = [*np.searchsorted(starts, starts, side="right").tolist()]
+    ends = [*np.searchsorted(starts, starts, role="right").tolist()]
     f_n = nominal_frequency(scenario)
     laws = [scenario.law, *[e["law"] for e in changes]]
     events = []
@@ -111,14 +111,14 @@ def summarise(
         "misses": count_misses(timing, done) if plant else None,
         "round_trip_us": _round_trip(timing, scenario.T_s),
         "faults": {
-            side: {k: n for k, n in end["faults"].items() if n} for side, end in links.items()
+            role: {k: n for k, n in end["faults"].items() if n} for role, end in links.items()
         },
-        "e2e": {side: end["e2e"] for side, end in links.items()},
+        "e2e": {role: end["e2e"] for role, end in links.items()},
         "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
         "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
         "events": events,
     }
-    injected = {side: end["injected"] for side, end in links.items() if "injected" in end}
+    injected = {role: end["injected"] for role, end in links.items() if "injected" in end}
     if injected:
         summary["injected"] = injected
     one_clock = all(end["one_clock"] for end in links.values())
@@ -140,21 +140,21 @@ def _trips(
     """Every trip and safe state of a run: tick, t in s, reason, and the tick ``until`` which it
     lasted. The reason is that of the side to which it happened."""
     found: list[dict[str, Any]] = []
-    open_sides: set[str] = set()
+    open_roles: set[str] = set()
     for e in log:
         begins = e["event"] in _FAULTS or (e["event"] == "end" and e["status"] in _FAULTS)
-        if begins and open_sides:
+        if begins and open_roles:
             found[-1]["reason"] = cause([found[-1]["reason"], e["reason"]])
         elif begins:
             found.append({"tick": e["tick"], "reason": e["reason"], "until": math.inf})
         if begins:
-            open_sides.add(e.get("side", ""))
+            open_roles.add(e.get("role", ""))
         elif e["event"] == "recovered":
-            open_sides.discard(e.get("side", ""))
-            if not open_sides:
+            open_roles.discard(e.get("role", ""))
+            if not open_roles:
                 found[-1]["until"] = e["tick"]
     if outcome.status in _FAULTS:
-        if not open_sides:  # no side lived to write it down
+        if not open_roles:  # no side lived to write it down
             found.append({"tick": done, "until": math.inf})
         found[-1]["reason"] = outcome.reason
     for trip in found:

@@ -59,7 +59,7 @@ class Record:
         if not self.live:
             return self._done
         self.columns = self._run.columns
-        counts = [self._run.done(side) for side in self._run.parts]
+        counts = [self._run.done(role) for role in self._run.parts]
         if counts:  # rows of both sides, unless one has none or has stopped recording
             least, most = min(counts), max(counts)
             self._done = max(self._done, least if most - least < _BEHIND else most - _BEHIND)
@@ -68,7 +68,7 @@ class Record:
     def finish(self) -> None:
         """Note that the run is over: nothing is appended any more."""
         self.columns = self._run.columns
-        self._done = max([self._done, *(self._run.done(side) for side in self._run.parts)])
+        self._done = max([self._done, *(self._run.done(role) for role in self._run.parts)])
         self.live = False
 
     def look_up_laws(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF
 from gfm_hil.telemetry.follow import Rows
 
@@ -32,17 +32,17 @@ class Block:
     """Rows of one side.
 
     Attributes:
-        side: ``"plant"`` or ``"controller"``.
+        role: ``"plant"`` or ``"controller"``.
         rows: record array, shape (n,); ``rows["tick"]`` shows gaps.
     """
 
-    side: str
+    role: str
     rows: NDArray[np.void]
 
 
-def block_dtype(side: Side) -> np.dtype:
+def block_dtype(role: Role) -> np.dtype:
     """The dtype of one row of a side."""
-    signals, times = SIGNALS_OF[side], TIMES_OF[side]
+    signals, times = SIGNALS_OF[role], TIMES_OF[role]
     return np.dtype(
         [("tick", "<i8"), *((n, "<f8") for n in signals), *((f"{n}_ns", "<i8") for n in times)]
     )
@@ -50,17 +50,17 @@ def block_dtype(side: Side) -> np.dtype:
 
 def messages(rows: Rows) -> list[list[bytes]]:
     """The messages that carry some rows."""
-    whole = np.empty(len(rows.signals), block_dtype(rows.side))
+    whole = np.empty(len(rows.signals), block_dtype(rows.role))
     whole["tick"] = np.arange(rows.first, rows.first + len(whole))
-    for j, name in enumerate(SIGNALS_OF[rows.side]):
+    for j, name in enumerate(SIGNALS_OF[rows.role]):
         whole[name] = rows.signals[:, j]
-    for j, name in enumerate(TIMES_OF[rows.side]):
+    for j, name in enumerate(TIMES_OF[rows.role]):
         whole[f"{name}_ns"] = rows.times[:, j]
     out = []
     for first in range(0, len(whole), _MOST):
         file = io.BytesIO()
         np.save(file, whole[first : first + _MOST], allow_pickle=False)
-        out.append([f"{_TOPIC}{rows.side}".encode(), file.getvalue()])
+        out.append([f"{_TOPIC}{rows.role}".encode(), file.getvalue()])
     return out
 
 
@@ -69,17 +69,17 @@ class BlockReader:
 
     Args:
         endpoint: the endpoint of blocks that ``gfmhil stream`` prints.
-        side: ``"plant"`` or ``"controller"``; both if empty.
+        role: ``"plant"`` or ``"controller"``; both if empty.
     """
 
-    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, side: str = "") -> None:
+    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, role: str = "") -> None:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.set(zmq.RCVHWM, ROOM)
         self._socket.set(
-            zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s).itemsize for s in SIDES)
+            zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s).itemsize for s in ROLES)
         )
-        self._socket.subscribe(f"{_TOPIC}{side}")
+        self._socket.subscribe(f"{_TOPIC}{role}")
         self._socket.connect(endpoint)
 
     def __enter__(self) -> BlockReader:

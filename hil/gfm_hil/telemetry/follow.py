@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import Columns, named
 from gfm_hil.recording.live import LiveRun, begun
 from gfm_hil.recording.timing import count_misses
@@ -22,13 +22,13 @@ class Rows:
     """Rows of one side, as in ``recording.parts.Part``.
 
     Attributes:
-        side: ``"plant"`` or ``"controller"``.
+        role: ``"plant"`` or ``"controller"``.
         first: tick of the first row.
         signals: shape (n, columns), the units of the recording; NaN in ticks never recorded.
         times: shape (n, columns), int64, ns.
     """
 
-    side: Side
+    role: Role
     first: int
     signals: NDArray[np.float64]
     times: NDArray[np.int64]
@@ -36,7 +36,7 @@ class Rows:
     @property
     def columns(self) -> Columns:
         """The same by the names of the columns in a run folder."""
-        return named(self.side, self.signals, self.times)
+        return named(self.role, self.signals, self.times)
 
 
 class Follower:
@@ -60,7 +60,7 @@ class Follower:
             raise UserError(f"{folder}: no run is going on there; --wait waits for one")
         self.folder, self.run = folder, LiveRun(folder)
         self.T_s = self.run.T_s
-        self._next = {side: self.run.done(side) for side in SIDES}
+        self._next = {role: self.run.done(role) for role in ROLES}
         self.over = False
 
     def news(self) -> list[Rows]:
@@ -72,12 +72,12 @@ class Follower:
         """
         over = not (self.folder / "parts").is_dir()  # the parts were merged and removed
         found = []
-        for side, part in self.run.parts.items():
-            first, done = self._next[side], self.run.done(side) - (0 if over else _LAST)
+        for role, part in self.run.parts.items():
+            first, done = self._next[role], self.run.done(role) - (0 if over else _LAST)
             if done > first:
-                found.append(Rows(side, first, part.signals[first:done], part.times[first:done]))
+                found.append(Rows(role, first, part.signals[first:done], part.times[first:done]))
         self.over = over
-        self._next |= {rows.side: rows.first + len(rows.signals) for rows in found}
+        self._next |= {rows.role: rows.first + len(rows.signals) for rows in found}
         return found
 
     def misses_before(self) -> int:

@@ -16,7 +16,7 @@ class About:
 
 
 METRICS = {
-    "gfmhil_ticks_total": About("side", "ticks recorded"),
+    "gfmhil_ticks_total": About("role", "ticks recorded"),
     "gfmhil_misses_total": About("", "ticks without a fresh u at the plant"),
     "gfmhil_slack_seconds": About("quantile", f"{SLACK.meaning}; in real time"),
     "gfmhil_round_trip_seconds": About("quantile", ROUND_TRIP.meaning),

@@ -47,9 +47,9 @@ class RunCollector(Collector):
 
     def _counts(self, follower: Follower) -> Iterator[Metric]:
         ticks, misses = _metric("gfmhil_ticks_total"), _metric("gfmhil_misses_total")
-        for side in follower.run.parts:
-            ticks.add_metric([side], float(follower.run.done(side)))
-            if side == "plant":
+        for role in follower.run.parts:
+            ticks.add_metric([role], float(follower.run.done(role)))
+            if role == "plant":
                 misses.add_metric([], float(follower.run.misses))
         yield ticks
         yield misses

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import zmq
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.supervised import attempt
 from gfm_hil.telemetry import blocks
 from gfm_hil.telemetry.follow import Follower
@@ -70,14 +70,14 @@ class Publisher:
             How many ticks of the plant (without a plant: of the controller) were sent.
         """
         sampler = Sampler(follower.T_s, rate, follower.misses_before())
-        count: dict[Side, int] = dict.fromkeys(SIDES, 0)
+        count: dict[Role, int] = dict.fromkeys(ROLES, 0)
         looked = time.monotonic()
 
         def look() -> None:
             nonlocal looked
             before, looked = looked, time.monotonic()
             for rows in follower.news():
-                count[rows.side] += len(rows.signals)
+                count[rows.role] += len(rows.signals)
                 for message in sampler.messages(rows, looked - before):
                     self._samples.send_multipart(message)
                 for message in blocks.messages(rows):

@@ -27,7 +27,7 @@ def _place(column: str) -> tuple[str, str]:
     return (group, rest) if group in _GROUPS else ("", column)
 
 
-_PLACES = {side: [_place(name) for name in names] for side, names in SIGNALS_OF.items()}
+_PLACES = {role: [_place(name) for name in names] for role, names in SIGNALS_OF.items()}
 
 
 class Sampler:
@@ -55,7 +55,7 @@ class Sampler:
         """
         faster = round(len(rows.signals) * self.T_s / seconds)  # factor against real time
         every = self._every * max(1, faster)
-        plant, out, begin = rows.side == "plant", [], 0
+        plant, out, begin = rows.role == "plant", [], 0
         if plant:
             misses = self._misses + np.cumsum(missed(rows.columns))
             self._misses = int(misses[-1])
@@ -71,7 +71,7 @@ class Sampler:
                 if math.isfinite(least):
                     sample["slack_us"] = round(least, 3)
                 self._least, begin = math.nan, k + 1
-            out.append([f"gfmhil/{rows.side}".encode(), json.dumps(sample).encode()])
+            out.append([f"gfmhil/{rows.role}".encode(), json.dumps(sample).encode()])
         if plant:
             self._least = float(np.fmin.reduce(slack[begin:], initial=self._least))
         return out
@@ -80,7 +80,7 @@ class Sampler:
         """One tick's numbers; JSON cannot hold NaN or infinity."""
         tick = rows.first + k
         sample: dict[str, Any] = {"timestamp": round(tick * self.T_s, 9), "tick": tick}
-        for (group, name), value in zip(_PLACES[rows.side], values, strict=True):
+        for (group, name), value in zip(_PLACES[rows.role], values, strict=True):
             if math.isfinite(value):
                 (sample.setdefault(group, {}) if group else sample)[name] = value
         return sample

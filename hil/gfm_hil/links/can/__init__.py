@@ -7,17 +7,17 @@ import socket
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.base import Link, LinkKind
 from gfm_hil.links.can.options import LOOPBACK, CanOptions
 
 _PLACES = 4  # places of a loopback bus: consecutive UDP ports
 
 
-def _open(side: Side, endpoint: str, options: CanOptions) -> Link:
+def _open(role: Role, endpoint: str, options: CanOptions) -> Link:
     from gfm_hil.links.can.link import CanLink
 
-    return CanLink(side, endpoint, options)
+    return CanLink(role, endpoint, options)
 
 
 def _warm_up(options: CanOptions) -> None:

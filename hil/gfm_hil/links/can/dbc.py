@@ -18,18 +18,18 @@ from cantools.database.can.formats.dbc.dbc_attribute_definition import DbcAttrib
 from cantools.database.can.formats.dbc.dbc_specifics import DbcSpecifics
 from cantools.database.conversion import BaseConversion
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_runtime.signals import Group, group, table_hash
 from gfm_runtime.signals import Signal as Row
 from gfm_runtime.states import REASONS, STATES
 
 INT16 = 32767  # largest count; the range is symmetric
 INVALID = -32768
-SENDERS: dict[Group, Side] = {"y": "plant", "u": "controller"}
+SENDERS: dict[Group, Role] = {"y": "plant", "u": "controller"}
 #: frame name of each vector; if a vector needs several frames, they append _1, _2 …
 VECTORS: dict[Group, str] = {"y": "Measurements", "u": "Commands"}
-STATUS: dict[Side, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
-SEGMENT: dict[Side, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
+STATUS: dict[Role, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
+SEGMENT: dict[Role, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
 CRC, COUNTER = "Crc", "Counter"
 
 _HEADER = 2  # bytes of end-to-end protection
@@ -115,19 +115,19 @@ def _segment(fd: bool) -> list[Signal]:
 
 def write_dbc(fd: bool) -> str:
     """The text of the DBC file for CAN FD, or for classic CAN."""
-    frames: list[tuple[str, int, int, list[Signal], Side]] = []
-    for side in ("plant", "controller"):
-        frames.append((STATUS[side], _IDS[STATUS[side]], 8, _status(), side))
+    frames: list[tuple[str, int, int, list[Signal], Role]] = []
+    for role in ("plant", "controller"):
+        frames.append((STATUS[role], _IDS[STATUS[role]], 8, _status(), role))
         signals = _segment(fd)
-        frames.append((SEGMENT[side], _IDS[SEGMENT[side]], 64 if fd else 8, signals, side))
-    for name, side in SENDERS.items():
-        frames += [(*frame, side) for frame in _vector(name, fd)]
+        frames.append((SEGMENT[role], _IDS[SEGMENT[role]], 64 if fd else 8, signals, role))
+    for name, role in SENDERS.items():
+        frames += [(*frame, role) for frame in _vector(name, fd)]
     other = {"plant": "Controller", "controller": "Plant"}
     messages = []
-    for title, number, length, signals, side in sorted(frames, key=lambda f: f[1]):
+    for title, number, length, signals, role in sorted(frames, key=lambda f: f[1]):
         for signal in signals:
-            signal.receivers = [other[side]]
-        messages.append(Message(number, title, length, signals, senders=[_NODES[side]], is_fd=fd))
+            signal.receivers = [other[role]]
+        messages.append(Message(number, title, length, signals, senders=[_NODES[role]], is_fd=fd))
     database = Database(
         messages,
         nodes=[Node(name) for name in _NODES.values()],

@@ -15,7 +15,7 @@ import numpy as np
 from cantools.database.can import Database, Message
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links.can.dbc import (
     COUNTER,
     CRC,
@@ -69,8 +69,8 @@ class Plan:
     """
 
     vectors: dict[Group, list[Layout]]
-    status: dict[Side, Layout]
-    segment: dict[Side, Layout]
+    status: dict[Role, Layout]
+    segment: dict[Role, Layout]
     digest: int
     fd: bool
 
@@ -147,8 +147,8 @@ def plan_of(database: Database) -> Plan:
             raise ValueError(f"frames {title}…: must carry each of {list(names(group))} once")
     plan = Plan(
         vectors,
-        {side: _layout(messages[STATUS[side]]) for side in SIDES},
-        {side: _layout(messages[SEGMENT[side]]) for side in SIDES},
+        {role: _layout(messages[STATUS[role]]) for role in ROLES},
+        {role: _layout(messages[SEGMENT[role]]) for role in ROLES},
         _digest("".join(sorted(map(_definition, database.messages))), 4),
         any(m.is_fd for m in database.messages),
     )

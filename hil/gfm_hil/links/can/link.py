@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import PeerLost, UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links.can.emulation import busy, has_room
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
@@ -56,7 +56,7 @@ class CanLink:
     """One end of the link; implements ``gfm_hil.links.Link``.
 
     Args:
-        side: which side's frames to send.
+        role: which side's frames to send.
         endpoint: ``can://channel`` or ``can+udp://127.0.0.1:port``.
         options: checked.
 
@@ -69,18 +69,18 @@ class CanLink:
 
     port: Port | None = None
 
-    def __init__(self, side: Side, endpoint: str, options: CanOptions) -> None:
+    def __init__(self, role: Role, endpoint: str, options: CanOptions) -> None:
         try:
             plan = load_plan(options)
         except ValueError as problem:
             raise UserError(f"link.options.{problem}") from None
-        self._other, self._digest = SIDES[1 - SIDES.index(side)], plan.digest
+        self._other, self._digest = ROLES[1 - ROLES.index(role)], plan.digest
         self._flags, self._where = options.fd * (FD | BRS), endpoint.partition("://")[2]
-        self._node = Node(plan, side, options)
-        self._cut = SegmentSender(plan, side)
+        self._node = Node(plan, role, options)
+        self._cut = SegmentSender(plan, role)
         self._message, self._frame = np.zeros(LONGEST, np.uint8), np.zeros(1, frame_dtype)
         warm_up(plan)
-        self._bus = _open_bus(side, endpoint, options)
+        self._bus = _open_bus(role, endpoint, options)
         if not options.portable:
             self._reach(self._bus, options)
 
@@ -217,26 +217,26 @@ class CanLink:
 
 def warm_up(plan: Plan) -> None:
     """Compile (or load from the cache) what a tick calls, before the other side waits for it."""
-    ends = {side: Node(plan, side, CanOptions(fd=plan.fd)) for side in SIDES}
+    ends = {role: Node(plan, role, CanOptions(fd=plan.fd)) for role in ROLES}
     message = np.zeros(LONGEST, np.uint8)
-    groups: tuple[tuple[Side, Group], ...] = (("plant", "y"), ("controller", "u"))
-    for side, group in groups:
-        mine, theirs = ends[side].handle, ends[SIDES[1 - SIDES.index(side)]].handle
+    groups: tuple[tuple[Role, Group], ...] = (("plant", "y"), ("controller", "u"))
+    for role, group in groups:
+        mine, theirs = ends[role].handle, ends[ROLES[1 - ROLES.index(role)]].handle
         words = FrameWriter(group).pack(0, 0, 0, np.zeros(len(names(group))))
         for k in range(compose(mine, np.frombuffer(words, np.uint8))):
-            account(mine, ends[side].out[k : k + 1])
-            bring(theirs, ends[side].out[k : k + 1])
+            account(mine, ends[role].out[k : k + 1])
+            bring(theirs, ends[role].out[k : k + 1])
         fetch(theirs)
         receive(theirs, message)
         room_to_send(mine)
-        can_port(ends[side])
+        can_port(ends[role])
 
 
-def _open_bus(side: Side, endpoint: str, options: CanOptions) -> can.BusABC:
+def _open_bus(role: Role, endpoint: str, options: CanOptions) -> can.BusABC:
     scheme, _, channel = endpoint.partition("://")
     try:
         if scheme == LOOPBACK:
-            return LoopbackBus(channel, place=SIDES.index(side))
+            return LoopbackBus(channel, place=ROLES.index(role))
         if options.interface == "socketcan":
             _check_mtu(channel, options.fd)
         rates: dict[str, Any] = {"bitrate": options.bitrate, "fd": options.fd}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.can.emulation import (
     PLACES,
     arrive,
@@ -90,11 +90,11 @@ class Node:
 
     Args:
         plan: of the DBC.
-        side: our side.
+        role: our side.
         options: of the link.
     """
 
-    def __init__(self, plan: Plan, side: Side, options: CanOptions) -> None:
+    def __init__(self, plan: Plan, role: Role, options: CanOptions) -> None:
         self.handle: NDArray[np.int64] = np.zeros(_END, np.int64)
         parts = np.split(self.handle, _ENDS[:-1])
         views = {
@@ -105,11 +105,11 @@ class Node:
         self.sender, self.receiver = views["sender"], views["receiver"]
         self.bus, self.places, self.out = views["bus"], views["places"], views["out"]
         self.state["open"] = 1
-        plant = side == "plant"
+        plant = role == "plant"
         set_sender(self.sender, plan, "y" if plant else "u", options.heartbeat)
         set_receiver(self.receiver, plan, "u" if plant else "y")
-        set_joiner(self.joiner, plan, side)
-        set_subrate(views["subrate"], side, options.every)
+        set_joiner(self.joiner, plan, role)
+        set_subrate(views["subrate"], role, options.every)
         if options.emulate:
             set_bus(self.bus, options.fd, options.bitrate, options.data_bitrate)
 

@@ -13,7 +13,7 @@ import zlib
 
 import numpy as np
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.wire import number
 from gfm_hil.links.crc import crc32
@@ -48,11 +48,11 @@ class SegmentSender:
 
     Args:
         plan: of the DBC.
-        side: the sender's.
+        role: the sender's.
     """
 
-    def __init__(self, plan: Plan, side: Side) -> None:
-        self._layout, self._digest, self._number = plan.segment[side], plan.digest, 0
+    def __init__(self, plan: Plan, role: Role) -> None:
+        self._layout, self._digest, self._number = plan.segment[role], plan.digest, 0
         self._room = self._layout.length - _DATA
         self.most = _MOST * self._room - _HEAD.size  # bytes of the longest message
 
@@ -77,9 +77,9 @@ class SegmentSender:
         return out
 
 
-def set_joiner(joiner: np.ndarray, plan: Plan, side: Side) -> None:
+def set_joiner(joiner: np.ndarray, plan: Plan, role: Role) -> None:
     """Initialise one record of ``joiner_dtype`` for the segments that the other side sends."""
-    layout, j = plan.segment[SIDES[1 - SIDES.index(side)]], joiner[0]
+    layout, j = plan.segment[ROLES[1 - ROLES.index(role)]], joiner[0]
     fields = layout.dtype.fields
     assert fields is not None
     j["number"], j["length"], j["digest"] = layout.number, layout.length, plan.digest

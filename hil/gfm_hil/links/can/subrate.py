@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.can.wire import (
     MOST,
     SEQUENCE,
@@ -60,9 +60,9 @@ subrate_dtype = np.dtype(
 )
 
 
-def set_subrate(subrate: np.ndarray, side: Side, every: int) -> None:
+def set_subrate(subrate: np.ndarray, role: Role, every: int) -> None:
     """Initialise one record of ``subrate_dtype`` for a side that exchanges every n-th tick."""
-    s, plant = subrate[0], side == "plant"
+    s, plant = subrate[0], role == "plant"
     groups: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
     s["every"], s["plant"] = every, plant
     for k, group in enumerate(groups):

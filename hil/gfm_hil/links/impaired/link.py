@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba import carray, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links.base import Link
 from gfm_hil.links.impaired.settings import Impairment
 from gfm_hil.links.impaired.stage import (
@@ -34,12 +34,12 @@ class ImpairedLink:
     Args:
         link: the wrapped end, which this one closes too.
         settings: the faults to inject.
-        side: whose end this is.
+        role: whose end this is.
     """
 
-    def __init__(self, link: Link, settings: Impairment, side: Side) -> None:
+    def __init__(self, link: Link, settings: Impairment, role: Role) -> None:
         self._link = ported(link)
-        self._stage = make_stage(settings, SIDES.index(side))
+        self._stage = make_stage(settings, ROLES.index(role))
         self._message = np.zeros(LONGEST, np.uint8)
         assert self._link.port is not None
         self.port = _port(self._link.port, self._stage)

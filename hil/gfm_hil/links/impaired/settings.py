@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.base import LinkOptions
 
 
@@ -47,6 +47,6 @@ class Impairment(LinkOptions):
             )
         return self
 
-    def hits(self, side: Side) -> bool:
+    def hits(self, role: Role) -> bool:
         """Whether the faults apply to this side's incoming frames."""
-        return self.towards in ("both", side)
+        return self.towards in ("both", role)

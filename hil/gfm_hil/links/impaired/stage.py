@@ -32,10 +32,10 @@ _ONE = 1 << 32  # probability 1
 _LONG = 1_000_000_000  # ns: longest time that a frame waits for the next one to overtake it
 
 
-def make_stage(settings: Impairment, side_number: int) -> NDArray[np.int64]:
+def make_stage(settings: Impairment, role_number: int) -> NDArray[np.int64]:
     """A stage with an empty queue; each side draws its own random sequence."""
     h = np.zeros(_QUEUE + PLACES * _PLACE, np.int64)
-    seed = (settings.seed * 2 + side_number + 1) * 0x9E3779B97F4A7C15  # spreads a small seed's bits
+    seed = (settings.seed * 2 + role_number + 1) * 0x9E3779B97F4A7C15  # spreads a small seed's bits
     h[_RANDOM] = np.uint64(seed % 2**64).astype(np.int64)
     loss, more = settings.loss, max(1 - 1 / settings.burst, settings.loss)
     for index, value in (

@@ -5,14 +5,14 @@ from __future__ import annotations
 import secrets
 from pathlib import Path
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.base import Link, LinkKind, LinkOptions
 
 
-def _open(side: Side, endpoint: str, options: LinkOptions) -> Link:
+def _open(role: Role, endpoint: str, options: LinkOptions) -> Link:
     from gfm_hil.links.shm.link import ShmLink
 
-    return ShmLink(side, endpoint)
+    return ShmLink(role, endpoint)
 
 
 def _warm_up(options: LinkOptions) -> None:

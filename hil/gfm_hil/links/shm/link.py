@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links import ring
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
@@ -21,7 +21,7 @@ class ShmLink:
     """One end of the link; implements ``gfm_hil.links.Link``.
 
     Args:
-        side: the controller creates the memory, the plant joins it; either may start first.
+        role: the controller creates the memory, the plant joins it; either may start first.
         endpoint: ``shm://name``.
 
     Raises:
@@ -31,8 +31,8 @@ class ShmLink:
 
     port: Port
 
-    def __init__(self, side: Side, endpoint: str) -> None:
-        self._side, self._endpoint = side, endpoint
+    def __init__(self, role: Role, endpoint: str) -> None:
+        self._role, self._endpoint = role, endpoint
         self._segment: segment.Segment | None = None
         self._handle = np.zeros(ring.HANDLE, np.int64)
         self._message = np.empty(LONGEST, np.uint8)
@@ -73,11 +73,11 @@ class ShmLink:
         self._handle[:] = 0
         mine, self._segment = self._segment, None
         if mine is not None:
-            (segment.remove if self._side == "controller" else segment.leave)(mine)
+            (segment.remove if self._role == "controller" else segment.leave)(mine)
 
     def connected(self) -> bool:
         """Whether the other side has its end of the memory open."""
-        if self._side == "controller":
+        if self._role == "controller":
             return self._segment is not None and segment.has_plant(self._segment)
         return self._there()
 
@@ -88,7 +88,7 @@ class ShmLink:
 
     def _open(self) -> None:
         name = self._endpoint.removeprefix("shm://")
-        owner = self._side == "controller"
+        owner = self._role == "controller"
         try:
             found = segment.create(name) if owner else segment.join(name)
         except segment.Refused as problem:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.base import Link, LinkKind
 from gfm_hil.links.zeromq.options import ZmqOptions, refuse_open
 
 
-def _open(side: Side, endpoint: str, options: ZmqOptions) -> Link:
+def _open(role: Role, endpoint: str, options: ZmqOptions) -> Link:
     from gfm_hil.links.zeromq.link import ZmqLink
 
-    return ZmqLink(side, endpoint, options)
+    return ZmqLink(role, endpoint, options)
 
 
 def _warm_up(options: ZmqOptions) -> None:

@@ -1,6 +1,6 @@
 """CURVE: keys for both sides, encrypted and authenticated frames, and access for one plant only.
 
-A folder of keys holds ``<side>.key``, the public key, and ``<side>.key_secret`` in pyzmq's format.
+A folder of keys holds ``<role>.key``, the public key, and ``<role>.key_secret`` in pyzmq's format.
 A side needs its own secret key and the other side's public key.
 """
 
@@ -16,7 +16,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 
 _KEY_BYTES = 32
 _DOMAIN = "gfmhil"
@@ -24,7 +24,7 @@ _DOMAIN = "gfmhil"
 
 def key_files(folder: Path) -> list[Path]:
     """All files of a folder of keys."""
-    return [folder / f"{side}.{kind}" for side in SIDES for kind in ("key", "key_secret")]
+    return [folder / f"{role}.{kind}" for role in ROLES for kind in ("key", "key_secret")]
 
 
 def write_keys(folder: Path, force: bool = False) -> list[Path]:
@@ -43,8 +43,8 @@ def write_keys(folder: Path, force: bool = False) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         for file in files:
             file.unlink(missing_ok=True)  # an existing file would keep its mode
-        for side in SIDES:
-            zmq.auth.create_certificates(folder, side)
+        for role in ROLES:
+            zmq.auth.create_certificates(folder, role)
     except OSError as problem:
         raise UserError(f"{folder}: {problem.strerror}") from None
     finally:
@@ -57,20 +57,20 @@ class Curve:
 
     Args:
         socket: not yet bound or connected.
-        side, folder: whose keys, and where they are.
+        role, folder: whose keys, and where they are.
 
     Raises:
         UserError: a key is missing or invalid.
     """
 
-    def __init__(self, socket: zmq.Socket[bytes], side: Side, folder: Path) -> None:
+    def __init__(self, socket: zmq.Socket[bytes], role: Role, folder: Path) -> None:
         _need_curve()
-        public, secret = _key(folder / f"{side}.key_secret")
-        other = "plant" if side == "controller" else "controller"
+        public, secret = _key(folder / f"{role}.key_secret")
+        other = "plant" if role == "controller" else "controller"
         self._peer, _ = _key(folder / f"{other}.key")
         self._door: ThreadAuthenticator | None = None
         socket.curve_publickey, socket.curve_secretkey = public, secret
-        if side == "controller":
+        if role == "controller":
             socket.curve_server = True
             # without an authenticator libzmq accepts every peer that knows our public key, unless
             # authentication is enforced, which requires a domain

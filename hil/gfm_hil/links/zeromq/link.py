@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import zmq
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Side
+from gfm_hil.core.roles import Role
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port
 from gfm_hil.links.zeromq.native import native_port
@@ -63,7 +63,7 @@ class ZmqLink:
     """One end of the link; implements ``gfm_hil.links.Link``.
 
     Args:
-        side: the controller binds, the plant connects; either may start first.
+        role: the controller binds, the plant connects; either may start first.
         endpoint: ``ipc:///path`` or ``tcp://host:port``.
         options: of the link.
 
@@ -79,9 +79,9 @@ class ZmqLink:
 
     port: Port | None = None
 
-    def __init__(self, side: Side, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
-        self._side, self._endpoint, self._ipc = side, endpoint, endpoint.startswith(SCHEME)
-        if side == "controller" and self._ipc and is_served(endpoint):
+    def __init__(self, role: Role, endpoint: str, options: ZmqOptions = _DEFAULT) -> None:
+        self._role, self._endpoint, self._ipc = role, endpoint, endpoint.startswith(SCHEME)
+        if role == "controller" and self._ipc and is_served(endpoint):
             # libzmq would replace the file, and the other run would receive nothing more
             raise UserError(
                 f"link.endpoint = {endpoint!r}: cannot be bound: occupied by another run"
@@ -94,8 +94,8 @@ class ZmqLink:
             if options.curve is not None:
                 from gfm_hil.links.zeromq.curve import Curve  # takes 0.1 s, few runs need it
 
-                self._curve = Curve(self._socket, side, Path(options.curve))
-            if side == "controller":
+                self._curve = Curve(self._socket, role, Path(options.curve))
+            if role == "controller":
                 self._bind()
             else:
                 if self._ipc:  # only ``_there`` reconnects: it checks who owns the socket
@@ -106,7 +106,7 @@ class ZmqLink:
             raise
         except zmq.ZMQError as problem:
             self.close()
-            verb = "bound" if side == "controller" else "connected to"
+            verb = "bound" if role == "controller" else "connected to"
             why = zmq.strerror(problem.errno or 0)
             raise UserError(f"link.endpoint = {endpoint!r}: cannot be {verb}: {why}") from None
         if not options.portable:
@@ -132,7 +132,7 @@ class ZmqLink:
 
     def connected(self) -> bool | None:
         """Whether a peer is at the other end; None for a plant on tcp, which cannot know."""
-        if self._side == "plant" and not self._ipc:
+        if self._role == "plant" and not self._ipc:
             return None
         return self._open and bool(self._socket.poll(0, zmq.POLLOUT))
 
@@ -167,7 +167,7 @@ class ZmqLink:
     def again(self) -> None:
         """Reconnect: libzmq refuses a second plant for good, even if the first one, of a previous
         run, is about to leave."""
-        if self._side == "plant" and self._open:
+        if self._role == "plant" and self._open:
             self._socket.disconnect(self._endpoint)
             self._socket.poll(_FAREWELL)  # a PAIR accepts no new peer while it disconnects
             self._open = False

@@ -75,8 +75,8 @@ def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
         plan = load_plan(options)
     except ValueError as problem:
         raise UserError(f"link.options.{problem}") from None
-    sides = _measurements(run, options, plan), _commands(run, options, plan)
-    return heapq.merge(*sides, key=lambda timed: timed[0])
+    roles = _measurements(run, options, plan), _commands(run, options, plan)
+    return heapq.merge(*roles, key=lambda timed: timed[0])
 
 
 class _Sender:
@@ -159,10 +159,10 @@ def _taken(run: RecordedRun, first: int, last: int) -> NDArray[np.bool_]:
 class _Clock:
     """When a side sent its frame of each tick, s from tick 0."""
 
-    def __init__(self, run: RecordedRun, side: str) -> None:
+    def __init__(self, run: RecordedRun, role: str) -> None:
         self._t = run.recorded["t"] if run.summary["mode"] == "lockstep" else None
         if self._t is None:
-            self._sent, due = run.recorded[f"{side}_sent"], run.recorded[f"{side}_scheduled"]
+            self._sent, due = run.recorded[f"{role}_sent"], run.recorded[f"{role}_scheduled"]
             for first, last in _pieces(run):
                 known = np.flatnonzero(due[first:last] >= 0)
                 if len(known):
@@ -182,7 +182,7 @@ class _SafeReasons:
 
     def __init__(self, run: RecordedRun) -> None:
         said = [
-            line for line in run.events if "controller" in line.get("side", "") and "reason" in line
+            line for line in run.events if "controller" in line.get("role", "") and "reason" in line
         ]
         self._ticks = [line["tick"] for line in said]
         self._codes = [0, *(self._code(line["reason"]) for line in said)]

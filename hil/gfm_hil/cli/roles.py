@@ -9,10 +9,10 @@ from typing import Any
 
 from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import SIDES, Side
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench
-from gfm_hil.engine.process import run_side
+from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import INPROC
@@ -20,29 +20,29 @@ from gfm_hil.scenario.model import INPROC
 
 def add(commands: Any) -> None:
     """Add both commands to the parser."""
-    for side in SIDES:
-        command = commands.add_parser(side)
+    for role in ROLES:
+        command = commands.add_parser(role)
         add_scenario_options(command)
         command.add_argument("--law", help="override law: catalogue name or law file")
-        command.add_argument("--out", help="run folder; runs/<side>-<time> by default")
+        command.add_argument("--out", help="run folder; runs/<role>-<time> by default")
         command.add_argument("--quiet", action="store_true", help="say nothing but errors")
         command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
-        command.set_defaults(call=call, side=side)
+        command.set_defaults(call=call, role=role)
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry one side out; returns the exit code."""
-    side: Side = options.side
+    role: Role = options.role
     scenario = resolve(options, law=options.law)
     if scenario.link.type == INPROC:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     if scenario.link.endpoint is None:
         raise UserError("link.endpoint: not set; a side started alone needs one (--endpoint)")
-    folder = new_folder(options.out, side)
+    folder = new_folder(options.out, role)
     if options.part is not None:  # of `gfmhil run`, which puts the parts together
         end_with_parent(options.part)
         with in_use(folder):
-            run_side(side, scenario, folder, notice=lambda text: None)
+            run_role(role, scenario, folder, notice=lambda text: None)
         return 0
     check_free(folder, scenario.ticks)
 
@@ -50,11 +50,11 @@ def call(options: argparse.Namespace) -> int:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
-    labels = compiled_bench(scenario, notice, (side,)).controller.labels
+    labels = compiled_bench(scenario, notice, (role,)).controller.labels
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     with in_use(folder):
-        run_side(side, scenario, folder, notice)
+        run_role(role, scenario, folder, notice)
         wall_s = time.monotonic() - began
         run = finish(scenario, folder, labels, wall_s)
     if not options.quiet:
