@@ -99,7 +99,7 @@ def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> N
         return away
     back = heard[taken]  # ascending: frames arrive in order
     since = np.concatenate([[0], back[:-1]])
-    first = np.searchsorted(back, begin, role="right")
+    first = np.searchsorted(back, begin, side="right")
     for wait in (first, first + 1):  # the wait during which y came, and the next one
         k = np.minimum(wait, len(back) - 1)
         fits = np.minimum(back[k], end) - np.maximum(since[k], begin)

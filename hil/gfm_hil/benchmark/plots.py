@@ -51,10 +51,10 @@ def _plain(axes: Axes, heading: str) -> None:
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8.5, color=_GREY)
-    for role in ("top", "right"):
-        axes.spines[role].set_visible(False)
-    for role in ("left", "bottom"):
-        axes.spines[role].set_color(_GREY)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(_GREY)
 
 
 def _curve(row: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

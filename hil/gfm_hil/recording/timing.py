@@ -48,7 +48,7 @@ class Spread:
         """The percentile of all durations as ``np.percentile`` has it, ns."""
         behind = np.cumsum(self.count)
         at = q / 100 * (behind[-1] - 1)
-        low, high = self.ns[np.searchsorted(behind, [np.floor(at), np.ceil(at)], role="right")]
+        low, high = self.ns[np.searchsorted(behind, [np.floor(at), np.ceil(at)], side="right")]
         return float(low + (high - low) * (at - np.floor(at)))
 
     def percentiles_us(self) -> dict[str, float]:

@@ -63,10 +63,10 @@ def dress(axes: Axes, title: str = "") -> None:
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.tick_params(labelsize=8.5, color=_GREY)
-    for role in ("top", "right"):
-        axes.spines[role].set_visible(False)
-    for role in ("left", "bottom"):
-        axes.spines[role].set_color(_GREY)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(_GREY)
 
 
 def draw_panel(

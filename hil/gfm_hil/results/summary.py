@@ -73,7 +73,7 @@ def summarise(
     happened = [e for e in log if "label" in e]
     bumps = {e["tick"]: e["bump_pu"] for e in changes}
     starts = np.array([e["tick"] for e in happened])  # in order, as the log is
-    ends = [*np.searchsorted(starts, starts, role="right").tolist()]
+    ends = [*np.searchsorted(starts, starts, side="right").tolist()]
     f_n = nominal_frequency(scenario)
     laws = [scenario.law, *[e["law"] for e in changes]]
     events = []

@@ -116,10 +116,10 @@ def envelope(w: Window, low: Vector, high: Vector) -> Finding | None:
     if not beyond.any():
         return None
     first, worst = int(np.flatnonzero(beyond)[0]), int(np.argmax(beyond))
-    role, limit = ("below", low) if w.x[worst] < low[worst] else ("above", high)
+    side, limit = ("below", low) if w.x[worst] < low[worst] else ("above", high)
     text = (
         f"{w.name} should stay within its envelope, but it left it at t = {w.t[first]:.4f} s and "
-        f"was {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, {beyond[worst]:.3g} {role} the limit "
+        f"was {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, {beyond[worst]:.3g} {side} the limit "
         f"of {limit[worst]:.4g}."
     )
     return Finding(text, float(w.t[worst]), w.t, low, high)

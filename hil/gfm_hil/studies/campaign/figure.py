@@ -152,8 +152,8 @@ def _tidy(axes: Axes, x: Axis, y: Axis | None) -> None:
             drawn.set_major_formatter(plain)
             drawn.set_minor_formatter(NullFormatter())
     axes.tick_params(labelsize=8.5, color=_GREY)
-    for role in ("top", "right"):
-        axes.spines[role].set_visible(False)
-    for role in ("left", "bottom"):
-        axes.spines[role].set_color(_GREY)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(_GREY)
     axes.margins(0.02)

@@ -47,8 +47,8 @@ def _figure(width: float, height: float) -> tuple[Figure, Any]:
     axes = figure.subplots()
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.set_axisbelow(True)
-    for role in ("top", "right"):
-        axes.spines[role].set_visible(False)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
     return figure, axes
 
 
