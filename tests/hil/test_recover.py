@@ -115,6 +115,7 @@ def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsy
     assert main(["recover", str(folder), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found == summary(folder) and found["status"] == "safe" and found["reason"]
+    assert found["run"] and found["controller"] == "gfmhil"  # as agreed at the handshake
     recorded = signals(folder)
     assert len(recorded["t"]) == found["ticks"] >= 300
     assert np.isfinite(recorded["true_p"]).all()
