@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,8 +48,8 @@ def run(
     with _law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
-        here = {"mode": "lockstep", "link__type": "inproc", **changes}
-        return run_in_memory(load_scenario(scenario, **here))
+        made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
+    return replace(made, law_text=law.to_toml()) if isinstance(law, Law) else made
 
 
 @contextmanager
