@@ -233,7 +233,6 @@ class Plant(Options):
     ] = Field(DigitalToAnalog(), description='"DS2101" (12 bit) or a table; ideal if none')
     delay: Delay = Field(Delay(), description="of the loop")
     protection: Protection = Field(Protection(), description="trips of the converter")
-    substeps: int = Field(10, ge=1, le=1000, description="RK4 steps in one sampling period")
 
     @model_validator(mode="after")
     def _elements_stay_physical(self) -> Plant:

@@ -14,22 +14,24 @@ PlantRecord = NDArray[np.void]
 """Shape (1,) of `plant_par_dtype` or `plant_state_dtype`."""
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
+N_W = 4  # states of the circuit: currents of filter, line and load, voltage of the filter
+N_SOURCES = 2  # the bridge and the grid
+N_CIRCUITS = 2
+OPERATING, BLOCKED = 0, 1
+"""The circuits: with the bridge in operation, and without the filter inductor."""
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 
 plant_par_dtype = np.dtype(
     [
         ("omega_b", "f8"),  # rad/s
-        # the elements of Eq. (1)-(8); L_g, R_g are what i_o flows through: the line, and behind
-        # an open grid breaker the local load as well
+        # the elements of Eq. (1)-(8)
         ("L_f", "f8"),
         ("R_f", "f8"),
         ("C_f", "f8"),
         ("L_g", "f8"),
         ("R_g", "f8"),
         ("C_dc", "f8"),
-        # the line alone, now and nominally, and the local load (L_load = 0: none)
-        ("L_line", "f8"),
-        ("R_line", "f8"),
+        # the line as the converter file has it, and the local load (L_load = 0: none)
         ("L_line_n", "f8"),
         ("R_line_n", "f8"),
         ("L_load", "f8"),
@@ -53,14 +55,23 @@ plant_par_dtype = np.dtype(
         ("dac_lo", "f8", (3,)),
         ("dac_hi", "f8", (3,)),
         ("dac_lsb", "f8", (3,)),
-        # one sampling period: `steps_old` RK4 steps of `h_old` under u[k - delay - 1], then
-        # `steps_new` of `h_new` under u[k - delay]
+        # one sampling period: a stretch under u[k - delay - 1], which has no length without a
+        # fraction of delay, then one under u[k - delay]; each is cut into pieces for Simpson's
+        # rule, and each piece in halves
         ("T_s", "f8"),
         ("delay", "i8"),
-        ("steps_old", "i8"),
-        ("h_old", "f8"),
-        ("steps_new", "i8"),
-        ("h_new", "f8"),
+        ("stretch", "f8", (2,)),  # s
+        ("pieces", "i8", (2,)),
+        ("half_h", "f8", (2,)),  # s
+        ("dc_steps", "i8"),  # of RK4 for the DC link in each half
+        ("sensor_weights", "f8", (2, 4)),  # of the last reading, and of a piece's parabola
+        # the modes of each circuit: in operation, and with the bridge blocked
+        ("n_modes", "i8", (N_CIRCUITS,)),
+        ("rate", "f8", (N_CIRCUITS, N_W, 2)),  # real and imaginary part, also below; 1/s
+        ("decay", "f8", (N_CIRCUITS, 2, N_W, 2)),  # in half a piece of each stretch
+        ("drive", "f8", (N_CIRCUITS, N_W, N_SOURCES, 2)),
+        ("states", "f8", (N_CIRCUITS, N_W, N_W, 2)),
+        ("modes", "f8", (N_CIRCUITS, N_W, N_W, 2)),
         # protection: threshold, and ticks it may stay crossed (-1: disabled)
         ("trip_limit", "f8", (N_TRIPS,)),
         ("trip_ticks", "i8", (N_TRIPS,)),
@@ -71,9 +82,14 @@ plant_par_dtype = np.dtype(
 plant_state_dtype = np.dtype(
     [
         ("tick", "i8"),
-        ("x", "f8", (8,)),  # the state of Eq. (1)-(8)
+        # in the common frame, real and imaginary parts: modes, what drives them in the present
+        # stretch (in its first and its second half), states, and the sources' unit phasors
+        ("z", "f8", (N_W, 2)),
+        ("forced", "f8", (N_W, 4)),
+        ("w", "f8", (N_W, 2)),
+        ("unit", "f8", (N_SOURCES, 2)),
+        ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
-        ("i_load", "f8", (2,)),  # d and q current of the local load while the breaker is closed
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, 3)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (3,)),  # the command that acts at this instant
