@@ -117,7 +117,11 @@ def _pack_circuit(par: PlantRecord, options: Plant) -> None:
         par["R_load"] = bases.to_pu(options.grid.load_R, "R")
         par["L_load"] = bases.to_pu(options.grid.load_L, "L")
 
+    per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
+    par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
+
     source = options.dc_source
+    par["tau_dc"] = source.tau_s or 0.0
     par["i_max"] = math.inf if source.i_max is None else source.i_max
     if source.mode == "controlled":
         par["i_u_gain"] = 1.0
@@ -172,9 +176,11 @@ def _pack_pieces(par: PlantRecord, fastest: float) -> None:
     par["pieces"], par["half_h"] = pieces, r["stretch"] / pieces / 2
     per_C = r["omega_b"] / r["C_dc"]
     rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
+    if r["tau_dc"] > 0.0:
+        rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
     if rate * longest > 2 * _DC_STEP * _MOST:
         raise ValueError(
-            f"plant.dc_source.k_p, plant.dc_source.k_i: with C_dc they are as fast as {rate:.6g}"
+            f"plant.dc_source k_p, k_i, tau_s: with C_dc they are as fast as {rate:.6g}"
             f" rad/s; allowed are {2 * _DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
         )
     par["dc_steps"] = max(1, math.ceil(rate * max(par["half_h"][0]) / _DC_STEP))

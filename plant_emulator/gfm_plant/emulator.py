@@ -68,6 +68,7 @@ def plant_init(
     s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[V_DC], p, q, v
     if r.i_u_gain == 0.0:
         s.i_reg = u0[0] - r.k_p * (1.0 - x0[V_DC])
+    s.i_source, s.E = u0[0], u0[2]
 
 
 @compiled
@@ -114,8 +115,9 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     r, s = par[0], st[0]
     newest = max(r.delay - 1, 0)  # place in the line: u[k] itself is not in it yet, if delayed
     before = (
-        s.x[DELTA], s.x[V_DC], s.i_reg, s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0],
-        s.unit[GRID, 1], s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
+        s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
+        s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
+        s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
     )  # fmt: skip
     if r.stretch[0] > 0.0:
         _stretch(r, s, newest + 1, 0)
@@ -128,15 +130,16 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         size = _larger(size, abs(s.z[m, 0]) + abs(s.z[m, 1]))
     for j in range(4):
         size = _larger(size, abs(s.sensed[j]))
-    size = _larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg))
+    size = _larger(_larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg)), abs(s.i_source))
     if size < _FAR and s.x[V_DC] > 0.0:
         read_states(r, s, c)
         _write_x(s)
         protect(r, s)
     else:  # the last good state stays
         (
-            s.x[DELTA], s.x[V_DC], s.i_reg, s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0],
-            s.unit[GRID, 1], s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
+            s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
+            s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
+            s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
         ) = before  # fmt: skip
         trip(r, s, DIVERGED, size)
     advance_grid(r, s)
@@ -154,9 +157,12 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[7] = s.omega_g
     out[8] = s.V_g
     out[9] = s.trip
-    i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
-    i_max = r.i_max if s.trip == 0 else 0.0
-    out[10] = min(max(i_dc, -i_max), i_max)
+    if r.tau_dc > 0.0:
+        out[10] = s.i_source
+    else:
+        i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
+        i_max = r.i_max if s.trip == 0 else 0.0
+        out[10] = min(max(i_dc, -i_max), i_max)
 
 
 @compiled
@@ -168,6 +174,9 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
             s.u_now[j] = s.u[age, j]
     else:
         s.u_now[1] = s.omega_g  # see `trip`
+    # the modulator divides by the v_dc that it has at the beginning of its period
+    most = r.m_max * s.x[V_DC]
+    s.E = min(max(s.u_now[2], -most), most)
     c = OPERATING if running else BLOCKED
     for _ in range(r.pieces[part]):
         _piece(r, s, c, part)
@@ -176,7 +185,7 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
 @compiled
 def _piece(r: Any, s: Any, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the command that acts."""
-    omega_u, E_u = s.u_now[1], s.u_now[2]
+    omega_u, E = s.u_now[1], s.E
     for m in range(r.n_modes[c]):
         s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
 
@@ -184,21 +193,21 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     i_r, i_i = state(r, s, c, I_F)
     v_r, v_i = state(r, s, c, V)
     o_r, o_i = state(r, s, c, I_O)
-    p_0 = E_u * (u_r * i_r + u_i * i_i)
+    p_0 = E * (u_r * i_r + u_i * i_i)
     a_0 = terminal(v_r, v_i, o_r, o_i)
 
-    m_r, m_i = drive(r, s, c, part, BRIDGE, E_u, omega_u)
+    m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
     drive(r, s, c, part, GRID, s.V_g, s.omega_g)
     half_step(r, s, c, part, 0)
     i_r, i_i = state(r, s, c, I_F)
-    p_1 = E_u * (m_r * i_r + m_i * i_i)
+    p_1 = E * (m_r * i_r + m_i * i_i)
     v_r, v_i = state(r, s, c, V)
     o_r, o_i = state(r, s, c, I_O)
     a_1 = terminal(v_r, v_i, o_r, o_i)
 
     half_step(r, s, c, part, 2)
     i_r, i_i = state(r, s, c, I_F)
-    p_2 = E_u * (s.unit[BRIDGE, 0] * i_r + s.unit[BRIDGE, 1] * i_i)
+    p_2 = E * (s.unit[BRIDGE, 0] * i_r + s.unit[BRIDGE, 1] * i_i)
     v_0 = s.x[V_DC]
     v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
     if r.filtered:

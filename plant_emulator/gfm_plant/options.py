@@ -42,6 +42,11 @@ class DcSource(Options):
     k_p: NonNegative = Field(90.0, description="PI of the regulated source, p.u./p.u.")
     k_i: NonNegative = Field(400.0, description="PI of the regulated source, p.u./(p.u. s)")
     i_max: Positive | None = Field(None, description="limit of |i_dc|, p.u.; unlimited if none")
+    tau_s: Positive | None = Field(
+        None,
+        description="lag between the current that is asked for, within i_max, and the current that "
+        "flows, s; none if not given",
+    )
 
 
 class Grid(Options):
@@ -221,6 +226,11 @@ class Plant(Options):
     converter: str = Field("paper", description="name of a shipped converter, or a .toml file")
     factors: dict[Element, float] = Field({}, description="real over nominal value of an element")
     dc_source: DcSource = Field(DcSource(), description="the source that feeds C_dc")
+    modulation: Literal["unlimited", "space-vector", "sine"] = Field(
+        "unlimited",
+        description="limit of the bridge's voltage by v_dc: line-to-line RMS at most "
+        "v_dc / sqrt(2) (space-vector) or v_dc sqrt(3/8) (sine-triangle)",
+    )
     grid: Grid = Field(Grid(), description="grid simulator at the start")
     sensors: Sensors = Field(
         Sensors(), description="what stands between the true quantities and the A/D"

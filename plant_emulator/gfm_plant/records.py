@@ -41,6 +41,9 @@ plant_par_dtype = np.dtype(
         ("k_p", "f8"),
         ("k_i", "f8"),
         ("i_max", "f8"),
+        ("tau_dc", "f8"),  # its lag, s (0: none)
+        # the bridge: |E| <= m_max v_dc
+        ("m_max", "f8"),
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
@@ -90,6 +93,8 @@ plant_state_dtype = np.dtype(
         ("unit", "f8", (N_SOURCES, 2)),
         ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
+        ("i_source", "f8"),  # current of a DC source with a lag
+        ("E", "f8"),  # the bridge's voltage at this instant
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, 3)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (3,)),  # the command that acts at this instant

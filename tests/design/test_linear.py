@@ -111,6 +111,8 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         ("mimo-gfm", {**RIG, "delay": {"samples": 1, "fraction": 0.37}}),
         ("droop-5", {**RIG, "delay": {"samples": 2, "fraction": 0.5}}),
         ("vsg-5", {**RIG, "sensors": {"bandwidth_hz": 300.0, "gain": {"p": 1.05, "V": 0.98}}}),
+        ("vsg-2", {"dc_source": {"tau_s": 0.005}, "modulation": "space-vector"}),
+        ("vsg-2", {"dc_source": {"mode": "regulated", "tau_s": 0.001}}),
         ("hybrid-angle", {}),
         ("psc-dc", {"factors": {"L_g": 10.0, "R_g": 10.0}}),
         ("dvoc", {"factors": {"L_g": 10.0, "R_g": 10.0}, "delay": {"samples": 1}}),

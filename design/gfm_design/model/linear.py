@@ -40,9 +40,10 @@ class LinearPlant:
 
     x' is dx/dt, or the x of the next tick. Shapes: A (n,n), B (n,3), B_d (n,2), C and C_true (5,n);
     several plants have one leading axis more. The first eight states are those of
-    ``gfm_plant.model``; a regulated DC source adds its integral, band-limited sensors add four, and
-    a sampled plant ends with its delay lines. C gives what the controller reads and C_true what
-    the sensors measure. The omega_u row of both is 0, since a law is fed its own omega_u.
+    ``gfm_plant.model``; a regulated DC source adds its integral, one with a lag its current,
+    band-limited sensors add four, and a sampled plant ends with its delay lines. C gives what the
+    controller reads and C_true what the sensors measure. The omega_u row of both is 0, since a law
+    is fed its own omega_u.
     """
 
     A: Matrix
@@ -120,17 +121,26 @@ def linearise_plant(
         z[j] += 1j * _STEP
         x, u, d = np.split(z, [N_X, N_X + NU])
         slopes[:, j] = np.concatenate([f(x, u, d, par), g(x, u)]).imag / _STEP
-    regulated, sensors = int(r["i_u_gain"] == 0.0), 4 * int(r["filtered"])
-    n, s = N_X + regulated, slice(N_X + regulated, N_X + regulated + sensors)
+    regulated, lags = int(r["i_u_gain"] == 0.0), int(r["tau_dc"] > 0.0)
+    sensors = 4 * int(r["filtered"])
+    n = N_X + regulated + lags
+    s = slice(n, n + sensors)
     A, C = np.zeros((n + sensors, n + sensors)), np.zeros((NY, n + sensors))
     B, B_d = np.zeros((n + sensors, NU)), np.zeros((n + sensors, 2))
     A[:N_X, :N_X], B[:N_X], B_d[:N_X] = np.split(slopes[:N_X], [N_X, N_X + NU], axis=1)
     C[_MEASURED, :N_X] = slopes[N_X:][_MEASURED, :N_X]
     C_true = C.copy()
-    if regulated:  # i_dc = k_p (1 - v_dc) + its integral, in place of i_u
-        A[V_DC, V_DC] -= r["k_p"] * B[V_DC, 0]
-        A[V_DC, N_X], A[N_X, V_DC] = B[V_DC, 0], -r["k_i"]
-        B[:, 0] = 0.0
+    per_i_dc, asked = B[V_DC, 0], np.zeros(n + sensors)  # the current asked of the DC source, by x
+    B[V_DC, 0] = 0.0
+    if regulated:
+        asked[V_DC], asked[N_X], A[N_X, V_DC] = -r["k_p"], 1.0, -r["k_i"]
+    if lags:
+        A[n - 1], B[n - 1, 0] = asked / r["tau_dc"], (1 - regulated) / r["tau_dc"]
+        A[n - 1, n - 1] -= 1 / r["tau_dc"]
+        A[V_DC, n - 1] = per_i_dc
+    else:
+        A[V_DC] += per_i_dc * asked
+        B[V_DC, 0] = per_i_dc * (1 - regulated)
     if sensors:
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
         C = np.zeros_like(C)
