@@ -25,6 +25,7 @@ from gfm_plant.records import (
 from gfm_plant.solution import SOURCES, STATES
 
 _DC_STEP = 0.05  # largest rate of the DC source's control times a step of the DC link's RK4
+_SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 _PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
 _MOST = 500  # steps, or pieces, in a period
 
@@ -45,7 +46,7 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     par = np.zeros(1, plant_par_dtype)
-    _pack_circuit(par, options)
+    _pack_circuit(par, options, T_s)
     _pack_measurement(par, options)
     _pack_timing(par, options, T_s)
     for k, (name, *_) in enumerate(TRIPS):
@@ -105,7 +106,7 @@ def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:
     field[..., 0], field[..., 1] = values.real, values.imag
 
 
-def _pack_circuit(par: PlantRecord, options: Plant) -> None:
+def _pack_circuit(par: PlantRecord, options: Plant, T_s: float) -> None:
     converter = load_converter(options.converter)
     bases = converter.bases
     par["omega_b"] = bases.omega_b
@@ -119,6 +120,19 @@ def _pack_circuit(par: PlantRecord, options: Plant) -> None:
 
     per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
+
+    if grid := options.grid.finite:
+        par["H_grid"], par["D_grid"], par["droop_grid"] = grid.H, grid.D, grid.droop
+        par["T_gov"], par["S_grid"] = grid.T_gov, grid.S
+        r = par[0]
+        swing = math.sqrt(r["omega_b"] / (2 * grid.H * grid.S * (r["L_f"] + r["L_g"])))
+        governor = math.sqrt(1 / (2 * grid.H * grid.droop * grid.T_gov))
+        rate = max(swing, governor, grid.D / (2 * grid.H), 1 / grid.T_gov)
+        if rate * T_s > _SWING_STEP:
+            raise ValueError(
+                f"plant.grid.finite: it swings at {rate:.6g} rad/s; allowed are"
+                f" {_SWING_STEP / T_s:.6g} rad/s at this T_s; raise S, H, T_gov or droop"
+            )
 
     source = options.dc_source
     par["tau_dc"] = source.tau_s or 0.0

@@ -17,7 +17,7 @@ from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.ramps import advance_grid
+from gfm_plant.ramps import advance_grid, brought, settle_grid
 from gfm_plant.records import BLOCKED, MAX_DELAY, OPERATING, PlantRecord
 from gfm_plant.solution import (
     BRIDGE,
@@ -69,6 +69,8 @@ def plant_init(
     if r.i_u_gain == 0.0:
         s.i_reg = u0[0] - r.k_p * (1.0 - x0[V_DC])
     s.i_source, s.E = u0[0], u0[2]
+    if r.H_grid > 0.0:
+        settle_grid(r, s, OPERATING)
 
 
 @compiled
@@ -142,7 +144,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
             s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
         ) = before  # fmt: skip
         trip(r, s, DIVERGED, size)
-    advance_grid(r, s)
+    advance_grid(r, s, BLOCKED if s.trip else OPERATING)
 
 
 @compiled
@@ -173,7 +175,7 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
         for j in range(3):
             s.u_now[j] = s.u[age, j]
     else:
-        s.u_now[1] = s.omega_g  # see `trip`
+        s.u_now[1] = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # see `trip`
     # the modulator divides by the v_dc that it has at the beginning of its period
     most = r.m_max * s.x[V_DC]
     s.E = min(max(s.u_now[2], -most), most)
@@ -186,6 +188,8 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
 def _piece(r: Any, s: Any, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the command that acts."""
     omega_u, E = s.u_now[1], s.E
+    omega_g = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # in the middle of the tick
+    g_0 = brought(r, s, c, s.unit[GRID, 0], s.unit[GRID, 1]) if r.H_grid > 0.0 else 0.0
     for m in range(r.n_modes[c]):
         s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
 
@@ -197,8 +201,9 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     a_0 = terminal(v_r, v_i, o_r, o_i)
 
     m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
-    drive(r, s, c, part, GRID, s.V_g, s.omega_g)
+    n_r, n_i = drive(r, s, c, part, GRID, s.V_g, omega_g)
     half_step(r, s, c, part, 0)
+    g_1 = brought(r, s, c, n_r, n_i) if r.H_grid > 0.0 else 0.0
     i_r, i_i = state(r, s, c, I_F)
     p_1 = E * (m_r * i_r + m_i * i_i)
     v_r, v_i = state(r, s, c, V)
@@ -208,6 +213,9 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     half_step(r, s, c, part, 2)
     i_r, i_i = state(r, s, c, I_F)
     p_2 = E * (s.unit[BRIDGE, 0] * i_r + s.unit[BRIDGE, 1] * i_i)
+    if r.H_grid > 0.0:
+        g_2 = brought(r, s, c, s.unit[GRID, 0], s.unit[GRID, 1])
+        s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
     v_0 = s.x[V_DC]
     v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
     if r.filtered:
@@ -217,7 +225,7 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
         _sense(r, s, 0, part, v_0, v_1, v_2)
         for j in range(3):
             _sense(r, s, 1 + j, part, a_0[j], a_1[j], a_2[j])
-    s.x[DELTA] += 2.0 * r.half_h[part] * r.omega_b * (omega_u - s.omega_g)
+    s.x[DELTA] += 2.0 * r.half_h[part] * r.omega_b * (omega_u - omega_g)
 
 
 @compiled

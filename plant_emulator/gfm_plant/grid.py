@@ -53,6 +53,18 @@ def grid_voltage(
         st["V_g"] = V_g
 
 
+def grid_load(par: PlantRecord, st: PlantRecord, change: float) -> None:
+    """Add `change` to the load of a finite grid, p.u. of the grid's rating.
+
+    Raises:
+        ValueError: If the grid is ideal, or `change` is not finite.
+    """
+    _require("change", change, True, "finite")
+    if par[0]["H_grid"] == 0:
+        raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
+    st["P_load"] += change
+
+
 def phase_jump(st: PlantRecord, degrees: float) -> None:
     """Advance the grid's angle by `degrees`, so that delta falls by as much."""
     _require("degrees", degrees, True, "finite")

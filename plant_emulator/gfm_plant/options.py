@@ -49,6 +49,16 @@ class DcSource(Options):
     )
 
 
+class FiniteGrid(Options):
+    """A grid that reacts: the swing equation of all its machines as one, with a governor."""
+
+    S: Positive = Field(description="rating of the grid over that of the converter")
+    H: Positive = Field(description="inertia constant, s")
+    D: NonNegative = Field(0.0, description="power of the loads by frequency, p.u./p.u.")
+    droop: Positive = Field(0.05, description="frequency by power of the governors, p.u./p.u.")
+    T_gov: Positive = Field(0.5, description="lag of governors and turbines, s")
+
+
 class Grid(Options):
     """The grid simulator at the start, and the local load that its breaker can leave behind.
 
@@ -66,6 +76,9 @@ class Grid(Options):
     )
     x_over_r: Positive | None = Field(
         None, description="X/R of the line at nominal frequency; goes with scr"
+    )
+    finite: FiniteGrid | None = Field(
+        None, description="a grid whose frequency follows its balance of power; ideal if none"
     )
     load_R: NonNegative | None = Field(None, description="local series RL load, ohm")
     load_L: Positive | None = Field(None, description="local series RL load, H")

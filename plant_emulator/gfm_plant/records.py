@@ -58,6 +58,12 @@ plant_par_dtype = np.dtype(
         ("dac_lo", "f8", (3,)),
         ("dac_hi", "f8", (3,)),
         ("dac_lsb", "f8", (3,)),
+        # a finite grid on its own rating (H_grid = 0: ideal); its rating over the converter's
+        ("H_grid", "f8"),
+        ("D_grid", "f8"),
+        ("droop_grid", "f8"),
+        ("T_gov", "f8"),
+        ("S_grid", "f8"),
         # one sampling period: a stretch under u[k - delay - 1], which has no length without a
         # fraction of delay, then one under u[k - delay]; each is cut into pieces for Simpson's
         # rule, and each piece in halves
@@ -108,6 +114,13 @@ plant_state_dtype = np.dtype(
         ("V_g_rate", "f8"),
         ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
         ("V_g_after", "f8"),  # voltage it recovers to
+        # a finite grid, p.u. of its rating: power of turbines, set point of governors, load; its
+        # d/dt omega_g, 1/s; energy that the line has brought since the last tick, p.u. of S_n s
+        ("P_turbine", "f8"),
+        ("P_set", "f8"),
+        ("P_load", "f8"),
+        ("omega_g_slope", "f8"),
+        ("brought", "f8"),
         # protection: ticks in a row that each threshold was crossed, and the latched trip
         ("crossed", "i8", (N_TRIPS,)),
         ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
