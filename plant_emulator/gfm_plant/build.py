@@ -150,6 +150,7 @@ def _pack_measurement(par: PlantRecord, options: Plant) -> None:
     par["gain"] = [sensors.gain.get(name, 1.0) for name in MEASURED]
     par["offset"] = [sensors.offset.get(name, 0.0) for name in MEASURED]
     par["noise_std"] = [sensors.noise_std.get(name, 0.0) for name in MEASURED]
+    par["noisy"] = any(par["noise_std"][0] > 0.0)
     par["seed"] = sensors.seed
     _pack_converter(par, "adc", options.adc.bits, options.adc.range, MEASURED)
     _pack_converter(par, "dac", options.dac.bits, options.dac.range, COMMANDS)

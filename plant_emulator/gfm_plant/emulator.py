@@ -18,7 +18,7 @@ from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid, brought, settle_grid
-from gfm_plant.records import BLOCKED, MAX_DELAY, OPERATING, PlantRecord
+from gfm_plant.records import BLOCKED, MAX_DELAY, N_W, OPERATING, PlantRecord
 from gfm_plant.solution import (
     BRIDGE,
     GRID,
@@ -70,7 +70,7 @@ def plant_init(
         s.i_reg = u0[0] - r.k_p * (1.0 - x0[V_DC])
     s.i_source, s.E = u0[0], u0[2]
     if r.H_grid > 0.0:
-        settle_grid(r, s, OPERATING)
+        settle_grid(r, s)
 
 
 @compiled
@@ -121,20 +121,20 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
     )  # fmt: skip
+    for i in range(N_W):
+        s.w_before[i, 0], s.w_before[i, 1] = s.w[i, 0], s.w[i, 1]
     if r.stretch[0] > 0.0:
         _stretch(r, s, newest + 1, 0)
     _stretch(r, s, newest, 1)
     s.tick += 1
 
-    c = BLOCKED if s.trip else OPERATING
     size = abs(s.x[DELTA]) / _FAR  # the angle of an island may grow without limit
-    for m in range(r.n_modes[c]):
-        size = _larger(size, abs(s.z[m, 0]) + abs(s.z[m, 1]))
+    for i in range(N_W):
+        size = _larger(size, abs(s.w[i, 0]) + abs(s.w[i, 1]))
     for j in range(4):
         size = _larger(size, abs(s.sensed[j]))
     size = _larger(_larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg)), abs(s.i_source))
     if size < _FAR and s.x[V_DC] > 0.0:
-        read_states(r, s, c)
         _write_x(s)
         protect(r, s)
     else:  # the last good state stays
@@ -143,8 +143,10 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
             s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
             s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
         ) = before  # fmt: skip
+        for i in range(N_W):
+            s.w[i, 0], s.w[i, 1] = s.w_before[i, 0], s.w_before[i, 1]
         trip(r, s, DIVERGED, size)
-    advance_grid(r, s, BLOCKED if s.trip else OPERATING)
+    advance_grid(r, s)
 
 
 @compiled
@@ -189,39 +191,34 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the command that acts."""
     omega_u, E = s.u_now[1], s.E
     omega_g = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # in the middle of the tick
-    g_0 = brought(r, s, c, s.unit[GRID, 0], s.unit[GRID, 1]) if r.H_grid > 0.0 else 0.0
     for m in range(r.n_modes[c]):
         s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
 
-    u_r, u_i = s.unit[BRIDGE, 0], s.unit[BRIDGE, 1]
-    i_r, i_i = state(r, s, c, I_F)
-    v_r, v_i = state(r, s, c, V)
-    o_r, o_i = state(r, s, c, I_O)
-    p_0 = E * (u_r * i_r + u_i * i_i)
-    a_0 = terminal(v_r, v_i, o_r, o_i)
+    p_0 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
+    a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    g_0 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
 
     m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
     n_r, n_i = drive(r, s, c, part, GRID, s.V_g, omega_g)
     half_step(r, s, c, part, 0)
-    g_1 = brought(r, s, c, n_r, n_i) if r.H_grid > 0.0 else 0.0
-    i_r, i_i = state(r, s, c, I_F)
-    p_1 = E * (m_r * i_r + m_i * i_i)
-    v_r, v_i = state(r, s, c, V)
-    o_r, o_i = state(r, s, c, I_O)
-    a_1 = terminal(v_r, v_i, o_r, o_i)
+    if r.filtered or r.H_grid > 0.0:
+        read_states(r, s, c)
+    else:
+        s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
+    p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
+    a_1 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    g_1 = brought(s, n_r, n_i)
 
     half_step(r, s, c, part, 2)
-    i_r, i_i = state(r, s, c, I_F)
-    p_2 = E * (s.unit[BRIDGE, 0] * i_r + s.unit[BRIDGE, 1] * i_i)
-    if r.H_grid > 0.0:
-        g_2 = brought(r, s, c, s.unit[GRID, 0], s.unit[GRID, 1])
-        s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
+    read_states(r, s, c)
+    p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
+    a_2 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    g_2 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
+
+    s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
     v_0 = s.x[V_DC]
     v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
     if r.filtered:
-        v_r, v_i = state(r, s, c, V)
-        o_r, o_i = state(r, s, c, I_O)
-        a_2 = terminal(v_r, v_i, o_r, o_i)
         _sense(r, s, 0, part, v_0, v_1, v_2)
         for j in range(3):
             _sense(r, s, 1 + j, part, a_0[j], a_1[j], a_2[j])

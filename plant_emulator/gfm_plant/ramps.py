@@ -13,25 +13,25 @@ from __future__ import annotations
 
 from typing import Any
 
-from gfm_plant.solution import GRID, I_LOAD, I_O, state
+from gfm_plant.solution import GRID, I_LOAD, I_O
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def brought(r: Any, s: Any, c: int, unit_r: float, unit_i: float) -> float:
+def brought(s: Any, unit_r: float, unit_i: float) -> float:
     """Return the power that reaches the grid, p.u. of the converter; ``unit`` is its phasor."""
     if s.closed == 0:
         return 0.0
-    o_r, o_i = state(r, s, c, I_O)
-    l_r, l_i = state(r, s, c, I_LOAD)
-    return s.V_g * (unit_r * (o_r - l_r) + unit_i * (o_i - l_i))
+    return s.V_g * (
+        unit_r * (s.w[I_O, 0] - s.w[I_LOAD, 0]) + unit_i * (s.w[I_O, 1] - s.w[I_LOAD, 1])
+    )
 
 
 @compiled
-def settle_grid(r: Any, s: Any, c: int) -> None:
+def settle_grid(r: Any, s: Any) -> None:
     """Put a finite grid at rest at the frequency and the power that it has."""
     off = s.omega_g - 1.0
-    p_g = brought(r, s, c, s.unit[GRID, 0], s.unit[GRID, 1])
+    p_g = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
     s.P_load = 1.0
     s.P_turbine = s.P_load + r.D_grid * off - p_g / r.S_grid
     s.P_set = s.P_turbine + off / r.droop_grid
@@ -39,13 +39,14 @@ def settle_grid(r: Any, s: Any, c: int) -> None:
 
 
 @compiled
-def advance_grid(r: Any, s: Any, c: int) -> None:
+def advance_grid(r: Any, s: Any) -> None:
     """Move ramps, sags and a finite grid on by one tick."""
     T_s = r.T_s
     if r.H_grid > 0.0:
-        _swing(r, s, c)
+        _swing(r, s)
     else:
         s.omega_g = _towards(s.omega_g, s.omega_g_to, s.omega_g_rate * T_s)
+    s.brought = 0.0
     s.V_g = _towards(s.V_g, s.V_g_to, s.V_g_rate * T_s)
     if s.sag_left > 0.0:
         s.sag_left -= T_s
@@ -55,7 +56,7 @@ def advance_grid(r: Any, s: Any, c: int) -> None:
 
 
 @compiled
-def _swing(r: Any, s: Any, c: int) -> None:
+def _swing(r: Any, s: Any) -> None:
     """Integrate the swing equation over a tick by RK4 under the mean power of that tick."""
     h = r.T_s
     power = s.brought / (h * r.S_grid) - s.P_load
@@ -66,8 +67,8 @@ def _swing(r: Any, s: Any, c: int) -> None:
     w_4, P_4 = _slopes(r, s, w + h * w_3, P + h * P_3, power)
     w += h / 6.0 * (w_1 + 2.0 * (w_2 + w_3) + w_4)
     P += h / 6.0 * (P_1 + 2.0 * (P_2 + P_3) + P_4)
-    s.omega_g, s.P_turbine, s.brought = 1.0 + w, P, 0.0
-    now = brought(r, s, c, s.unit[GRID, 0], s.unit[GRID, 1]) / r.S_grid - s.P_load
+    s.omega_g, s.P_turbine = 1.0 + w, P
+    now = brought(s, s.unit[GRID, 0], s.unit[GRID, 1]) / r.S_grid - s.P_load
     s.omega_g_slope, _ = _slopes(r, s, w, P, now)
 
 

@@ -49,6 +49,7 @@ plant_par_dtype = np.dtype(
         ("omega_s", "f8"),  # bandwidth, rad/s
         ("gain", "f8", (4,)),
         ("offset", "f8", (4,)),
+        ("noisy", "i8"),
         ("noise_std", "f8", (4,)),
         ("seed", "u8"),
         ("adc_lo", "f8", (4,)),
@@ -97,6 +98,7 @@ plant_state_dtype = np.dtype(
         ("forced", "f8", (N_W, 4)),
         ("w", "f8", (N_W, 2)),
         ("unit", "f8", (N_SOURCES, 2)),
+        ("w_before", "f8", (N_W, 2)),  # w at the last tick
         ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
         ("i_source", "f8"),  # current of a DC source with a lag
