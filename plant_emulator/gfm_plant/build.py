@@ -24,7 +24,7 @@ from gfm_plant.records import (
 )
 from gfm_plant.solution import SOURCES, STATES
 
-_DC_STEP = 0.05  # largest rate of the DC source's control times a step of the DC link's RK4
+_DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 _PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
 _MOST = 500  # steps, or pieces, in a period
@@ -73,6 +73,7 @@ def connect(par: PlantRecord, closed: bool) -> None:
         ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast for
             the DC link.
     """
+    par["n_states"] = len(STATES) if par[0]["L_load"] > 0 else len(STATES) - 1
     found = {c: _modes(par[0], closed, c) for c in (OPERATING, BLOCKED)}
     _pack_pieces(par, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     for circuit, (modes, sources) in found.items():

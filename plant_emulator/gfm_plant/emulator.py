@@ -18,7 +18,7 @@ from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid, brought, settle_grid
-from gfm_plant.records import BLOCKED, MAX_DELAY, N_W, OPERATING, PlantRecord
+from gfm_plant.records import BLOCKED, MAX_DELAY, OPERATING, PlantRecord
 from gfm_plant.solution import (
     BRIDGE,
     GRID,
@@ -121,7 +121,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
     )  # fmt: skip
-    for i in range(N_W):
+    for i in range(r.n_states):
         s.w_before[i, 0], s.w_before[i, 1] = s.w[i, 0], s.w[i, 1]
     if r.stretch[0] > 0.0:
         _stretch(r, s, newest + 1, 0)
@@ -129,7 +129,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     s.tick += 1
 
     size = abs(s.x[DELTA]) / _FAR  # the angle of an island may grow without limit
-    for i in range(N_W):
+    for i in range(r.n_states):
         size = _larger(size, abs(s.w[i, 0]) + abs(s.w[i, 1]))
     for j in range(4):
         size = _larger(size, abs(s.sensed[j]))
@@ -143,7 +143,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
             s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
             s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
         ) = before  # fmt: skip
-        for i in range(N_W):
+        for i in range(r.n_states):
             s.w[i, 0], s.w[i, 1] = s.w_before[i, 0], s.w_before[i, 1]
         trip(r, s, DIVERGED, size)
     advance_grid(r, s)
@@ -156,7 +156,7 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
     out[2] = s.u_now[1]
-    out[5] = math.hypot(s.x[0], s.x[1])
+    out[5] = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
     out[6] = s.x[DELTA]
     out[7] = s.omega_g
     out[8] = s.V_g
@@ -195,7 +195,9 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
         s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
 
     p_0 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
-    a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
+    if r.filtered:
+        a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
     g_0 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
 
     m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
@@ -203,22 +205,22 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     half_step(r, s, c, part, 0)
     if r.filtered or r.H_grid > 0.0:
         read_states(r, s, c)
+        a_1 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
     else:
         s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
     p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
-    a_1 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
     g_1 = brought(s, n_r, n_i)
 
     half_step(r, s, c, part, 2)
     read_states(r, s, c)
     p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
-    a_2 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
     g_2 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
 
     s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
     v_0 = s.x[V_DC]
     v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
     if r.filtered:
+        a_2 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
         _sense(r, s, 0, part, v_0, v_1, v_2)
         for j in range(3):
             _sense(r, s, 1 + j, part, a_0[j], a_1[j], a_2[j])

@@ -39,8 +39,8 @@ def trip(r: Any, s: Any, reason: int, value: float) -> None:
 @compiled
 def protect(r: Any, s: Any) -> None:
     """Check every threshold on the true values of this tick."""
-    i = math.hypot(s.x[0], s.x[1])
-    V = math.hypot(s.x[2], s.x[3])
+    i = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
+    V = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
     v_dc = s.x[7]
     omega_u = s.u_now[1]
     _watch(r, s, 0, i, 1.0)

@@ -76,6 +76,7 @@ plant_par_dtype = np.dtype(
         ("dc_steps", "i8"),  # of RK4 for the DC link in each half
         ("sensor_weights", "f8", (2, 4)),  # of the last reading, and of a piece's parabola
         # the modes of each circuit: in operation, and with the bridge blocked
+        ("n_states", "i8"),  # of w: without a local load the last one is missing
         ("n_modes", "i8", (N_CIRCUITS,)),
         ("rate", "f8", (N_CIRCUITS, N_W, 2)),  # real and imaginary part, also below; 1/s
         ("decay", "f8", (N_CIRCUITS, 2, N_W, 2)),  # in half a piece of each stretch

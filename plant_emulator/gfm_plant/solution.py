@@ -97,7 +97,7 @@ def state(r: Any, s: Any, c: int, i: int) -> tuple[float, float]:
 @compiled
 def read_states(r: Any, s: Any, c: int) -> None:
     """Write all states of w by the modes."""
-    for i in range(len(s.w)):
+    for i in range(r.n_states):
         s.w[i, 0], s.w[i, 1] = state(r, s, c, i)
 
 
@@ -106,7 +106,7 @@ def enter(r: Any, s: Any, c: int) -> None:
     """Start the modes of circuit c from w, which is projected onto what that circuit can hold."""
     for m in range(r.n_modes[c]):
         z_r = z_i = 0.0
-        for i in range(len(s.w)):
+        for i in range(r.n_states):
             z_r += r.modes[c, m, i, 0] * s.w[i, 0] - r.modes[c, m, i, 1] * s.w[i, 1]
             z_i += r.modes[c, m, i, 0] * s.w[i, 1] + r.modes[c, m, i, 1] * s.w[i, 0]
         s.z[m, 0], s.z[m, 1] = z_r, z_i
