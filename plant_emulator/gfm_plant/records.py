@@ -97,6 +97,11 @@ plant_state_dtype = np.dtype(
         # stretch (in its first and its second half), states, and the sources' unit phasors
         ("z", "f8", (N_W, 2)),
         ("forced", "f8", (N_W, 4)),
+        # each source's gain on the modes, for which speed and stretch, and turn in half a piece
+        ("gain", "f8", (N_SOURCES, N_W, 2)),
+        ("gain_omega", "f8", (N_SOURCES,)),
+        ("gain_part", "i8", (N_SOURCES,)),
+        ("turn", "f8", (N_SOURCES, 2)),
         ("w", "f8", (N_W, 2)),
         ("unit", "f8", (N_SOURCES, 2)),
         ("w_before", "f8", (N_W, 2)),  # w at the last tick

@@ -48,20 +48,13 @@ def drive(r: Any, s: Any, c: int, part: int, k: int, E: float, omega: float) -> 
         part: which stretch of the period, in which a piece lasts twice ``half_h[part]``.
         E, omega: length and speed of the source's voltage, p.u.
     """
-    speed = r.omega_b * (omega - 1.0)
-    cos, sin = turned(speed * r.half_h[part])
+    if s.gain_omega[k] != omega or s.gain_part[k] != part:
+        _find_gains(r, s, c, part, k, omega)
+    cos, sin = s.turn[k, 0], s.turn[k, 1]
     s_r, s_i = E * s.unit[k, 0], E * s.unit[k, 1]
     for m in range(r.n_modes[c]):
-        d_r, d_i = -r.rate[c, m, 0], speed - r.rate[c, m, 1]
-        n_r, n_i = cos - r.decay[c, part, m, 0], sin - r.decay[c, part, m, 1]
-        size = d_r * d_r + d_i * d_i
-        if size * r.half_h[part] ** 2 > 1e-16:
-            g_r, g_i = (n_r * d_r + n_i * d_i) / size, (n_i * d_r - n_r * d_i) / size
-        else:  # a mode without losses, driven at its own frequency
-            g_r, g_i = r.half_h[part] * cos, r.half_h[part] * sin
-        b_r, b_i = r.drive[c, m, k, 0], r.drive[c, m, k, 1]
-        t_r, t_i = b_r * s_r - b_i * s_i, b_r * s_i + b_i * s_r
-        f_r, f_i = g_r * t_r - g_i * t_i, g_r * t_i + g_i * t_r
+        g_r, g_i = s.gain[k, m, 0], s.gain[k, m, 1]
+        f_r, f_i = g_r * s_r - g_i * s_i, g_r * s_i + g_i * s_r
         s.forced[m, 0] += f_r
         s.forced[m, 1] += f_i
         s.forced[m, 2] += f_r * cos - f_i * sin
@@ -72,6 +65,26 @@ def drive(r: Any, s: Any, c: int, part: int, k: int, E: float, omega: float) -> 
     length = 1.5 - 0.5 * (u_r * u_r + u_i * u_i)  # takes the rounding out of it
     s.unit[k, 0], s.unit[k, 1] = u_r * length, u_i * length
     return h_r, h_i
+
+
+@compiled
+def _find_gains(r: Any, s: Any, c: int, part: int, k: int, omega: float) -> None:
+    """Find what source k does to each mode in half a piece, per unit of its voltage; this stays
+    the same while its speed does, as that of an ideal grid."""
+    speed = r.omega_b * (omega - 1.0)
+    cos, sin = turned(speed * r.half_h[part])
+    for m in range(r.n_modes[c]):
+        d_r, d_i = -r.rate[c, m, 0], speed - r.rate[c, m, 1]
+        n_r, n_i = cos - r.decay[c, part, m, 0], sin - r.decay[c, part, m, 1]
+        size = d_r * d_r + d_i * d_i
+        if size * r.half_h[part] ** 2 > 1e-16:
+            g_r, g_i = (n_r * d_r + n_i * d_i) / size, (n_i * d_r - n_r * d_i) / size
+        else:  # a mode without losses, driven at its own frequency
+            g_r, g_i = r.half_h[part] * cos, r.half_h[part] * sin
+        b_r, b_i = r.drive[c, m, k, 0], r.drive[c, m, k, 1]
+        s.gain[k, m, 0], s.gain[k, m, 1] = g_r * b_r - g_i * b_i, g_r * b_i + g_i * b_r
+    s.turn[k, 0], s.turn[k, 1] = cos, sin
+    s.gain_omega[k], s.gain_part[k] = omega, part
 
 
 @compiled
@@ -104,6 +117,8 @@ def read_states(r: Any, s: Any, c: int) -> None:
 @compiled
 def enter(r: Any, s: Any, c: int) -> None:
     """Start the modes of circuit c from w, which is projected onto what that circuit can hold."""
+    for k in range(len(s.gain_part)):
+        s.gain_part[k] = -1
     for m in range(r.n_modes[c]):
         z_r = z_i = 0.0
         for i in range(r.n_states):
