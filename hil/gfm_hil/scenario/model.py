@@ -325,7 +325,7 @@ def load_scenario(
         except ValueError as problem:
             raise UserError(f"{where}: {problem}") from None
         if "phi" in content:
-            raise UserError(f"{where}: is a law file; name a scenario, and this file as its law")
+            raise UserError(f"{where}: is a law file; give it to a scenario as its law")
     elif isinstance(given, Scenario):
         content = given.model_dump(mode="json", exclude_none=True)
     else:
