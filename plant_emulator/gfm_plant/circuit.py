@@ -134,8 +134,8 @@ def find_modes(
             M -= through[node] * np.outer(row, row)
             del meets[node]
         elif np.count_nonzero(row) < 2:
-            (only,) = np.flatnonzero(row)
-            raise ValueError(f"node {node}: only {branches[only].name} ends there")
+            only = branches[int(np.flatnonzero(row)[0])]
+            raise ValueError(f"node {node}: only {only.name} ends there")
 
     root = np.sqrt(list(stored.values()))
     K = null_space(np.array(list(meets.values())) / root) if meets else np.eye(n_b + n_c)
@@ -148,8 +148,9 @@ def find_modes(
     modes = np.zeros((len(rates), len(order)), complex)
     states[at] = (K @ X) / root[:, None]
     modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
-    drive = np.linalg.solve(X, (K.T @ (B / root[:, None])).astype(complex))
-    return Modes(rates, states, modes, omega_b * drive)
+    drive = np.zeros((len(rates), n_s), complex)
+    drive[:] = omega_b * np.linalg.solve(X, K.T @ (B / root[:, None]))
+    return Modes(rates, states, modes, drive)
 
 
 def _places(kind: str, parts: Sequence[Source | Capacitor]) -> dict[str, int]:
