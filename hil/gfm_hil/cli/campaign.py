@@ -30,9 +30,8 @@ from gfm_hil.studies.campaign.worker import Record, compile_once
 _PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("campaign")
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
     command.add_argument("file", help="campaign file, or the name of a shipped one")
     command.add_argument("--out", help="folder; runs/<campaign>-<time> by default")
     command.add_argument("--resume", action="store_true", help="run what --out has not got yet")
@@ -43,7 +42,6 @@ def add(commands: Any) -> None:
     command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
     command.add_argument("--json", action="store_true", help="print campaign.json, nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -29,19 +29,17 @@ from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import INPROC, find_scenario
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "compare",
-        description="In one process and in lockstep, unless --link, --endpoint, --option or "
-        "--mode realtime asks for two.",
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    command.description = (
+        "In one process and in lockstep, unless --link, --endpoint, --option or "
+        "--mode realtime asks for two."
     )
     add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
     command.add_argument("--out", help="folder; runs/<scenario>-compare-<time> by default")
     command.add_argument("--json", action="store_true", help="print the summaries as JSON")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
@@ -18,14 +17,12 @@ _RATES = {
 }  # fmt: skip
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("dbc")
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
     command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -18,14 +18,12 @@ from gfm_runtime.signals import U_NAMES, Y_NAMES
 MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
 
 
-def add(commands: Any) -> None:
-    """Add the command and its sub-command to the parser."""
-    command = commands.add_parser("laws")
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
     command.add_argument("--json", action="store_true", help="as JSON")
     command.add_argument(
         "--tuned", action="store_true", help="those with the gains of the law comparison"
     )
-    command.set_defaults(call=call_list)
     show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
     show.add_argument("name", help="catalogue name or law file")
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
@@ -33,7 +31,7 @@ def add(commands: Any) -> None:
     show.set_defaults(call=call_show)
 
 
-def call_list(options: argparse.Namespace) -> int:
+def call(options: argparse.Namespace) -> int:
     """List the catalogue, or its tuned laws."""
     rows = []
     for name in tuned_names() if options.tuned else law_names():

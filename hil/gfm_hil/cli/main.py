@@ -64,7 +64,10 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     top.add_argument("--version", action=_Version, help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     if command in COMMANDS:
-        import_module(f"gfm_hil.cli.{COMMANDS[command][0]}").add(commands)
+        module = import_module(f"gfm_hil.cli.{COMMANDS[command][0]}")
+        chosen = commands.add_parser(command)
+        chosen.set_defaults(call=getattr(module, "call", None))  # some have only sub-commands
+        module.add(chosen)
     else:
         for name, (_, text) in COMMANDS.items():
             commands.add_parser(name, help=text)

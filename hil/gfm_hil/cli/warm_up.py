@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import Any
 
 from gfm_hil.core.terminal import terminal
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "warm-up",
-        description="Compiles the kernel, the loops and every link into numba's cache. The cache "
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    command.description = (
+        "Compiles the kernel, the loops and every link into numba's cache. The cache "
         "lies beside the installed modules, or where NUMBA_CACHE_DIR says; another version of "
-        "gfmhil, numba or Python, or another kind of processor, needs another warm-up.",
+        "gfmhil, numba or Python, or another kind of processor, needs another warm-up."
     )
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
