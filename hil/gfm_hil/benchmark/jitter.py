@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.attribution import bursts
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.cpu_load import Load, cpu_load
+from gfm_hil.benchmark.histogram import summary
 from gfm_hil.benchmark.pair import Pair, Policy, pair
-from gfm_hil.benchmark.rounds import rounds
-from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.benchmark.rounds import REST, rounds
 from gfm_hil.realtime.clock import now_ns, sleep_until, wait_until
 from gfm_runtime.compiled import cached
 

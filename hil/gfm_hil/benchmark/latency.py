@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.c_code import NoCompiler, compile_c
 from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
 from gfm_hil.benchmark.cpu_load import Load, cpu_load
+from gfm_hil.benchmark.histogram import summary
 from gfm_hil.benchmark.pair import Policy, pair
-from gfm_hil.benchmark.rounds import rounds
-from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.benchmark.rounds import REST, rounds
 from gfm_hil.core.errors import UserError
 
 Mode = Literal["lockstep", "realtime"]
