@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from _figures.common import FIGURES, GREY, LAWS, RIG, modes, number, signed, within, write_table
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_hil.results.figures import COLOURS
@@ -58,7 +57,6 @@ def resistance_figure() -> None:
         ("MIMO-GFM, LC resonance at 1075 Hz", sweep("mimo-gfm", 900, 1300), COLOURS[0], "-"),
     )
     figure = Figure(figsize=(8.6, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.axhspan(0, 30, color="#b34500", alpha=0.07, lw=0)
     axes.axhline(0, color="#444444", lw=0.8)

@@ -17,7 +17,6 @@ from _figures.common import (
     write_table,
 )
 from _figures.steps import window
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import ClosedLoop
@@ -61,7 +60,6 @@ def limit_cycles() -> None:
     head = ["chokes", "$\\kappa$", "$\\varphi$", "least $N$", "E_u predicted", "E_u measured"]
     write_table("relay", head, theory)
     figure = Figure(figsize=(8.6, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 1, sharex=True)
     panels = (("R_g × 0.5", 0.06), ("R_f × 0.5, R_g × 0.5", 0.6))
     for a, (name, span) in zip(axes, panels, strict=True):

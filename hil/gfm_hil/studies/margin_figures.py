@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -21,7 +20,6 @@ _DELAYS = 300
 def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> None:
     """sigma in colour, its zero as a line, the printed and the scenario's line as points."""
     figure = Figure(figsize=(6.6, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_facecolor("#dddddd")
     # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
@@ -60,7 +58,6 @@ def draw_delay(path: Path, loop: ClosedLoop, label: str, margin: float) -> None:
     delays = np.linspace(0.0, end, _DELAYS)
     sigma = [loop.later(float(d)).sigma() for d in delays]
     figure = Figure(figsize=(6.6, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.plot(1e6 * delays, sigma, color=COLOURS[0], lw=1.4)
     axes.axhline(0.0, color=_GREY, lw=0.8)

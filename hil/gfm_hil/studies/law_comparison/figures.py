@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import T_S
@@ -43,7 +42,6 @@ def _spread(rows: Sequence[Row]) -> list[Row]:
 
 def _figure(width: float, height: float) -> tuple[Figure, Any]:
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.set_axisbelow(True)
