@@ -9,6 +9,7 @@ from typing import Any
 
 from gfm_hil.benchmark import tables
 from gfm_hil.benchmark.plots import figures
+from gfm_hil.results.report import html_table
 
 _STYLE = """
 body{font:15px/1.55 system-ui,sans-serif;max-width:76rem;margin:2rem auto;padding:0 1.2rem;
@@ -81,7 +82,7 @@ def write_page(content: dict[str, Any], path: Path) -> None:
         path.with_name(f"{name}.svg").write_bytes(svg)
     by_section: dict[str, list[str]] = {name: [] for name in _SECTIONS}
     for section, table in tables.tables(content):
-        by_section[section].append(_table(table))
+        by_section[section].append(html_table(table.columns, table.rows, table.heading))
     parts = []
     for name, (heading, text) in _SECTIONS.items():
         if not by_section[name]:
@@ -168,12 +169,3 @@ def _cards(content: dict[str, Any]) -> str:
 def _compared(row: dict[str, Any]) -> str:
     ratio = row["ratio_to_baseline_p50"]
     return f"{row['name']}: round trip" + (f", {tables.times(ratio)} the limit" if ratio else "")
-
-
-def _table(table: tables.Table) -> str:
-    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in table.rows
-    )
-    caption = f"<caption>{html.escape(table.heading)}</caption>"
-    return f'<div class="scroll"><table>{caption}<tr>{head}</tr>{body}</table></div>'

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-from rich.table import Table
+from rich.progress import BarColumn, TaskProgressColumn
 
-from gfm_hil.cli.common import new_folder
-from gfm_hil.core.terminal import terminal
+from gfm_hil.cli.common import new_folder, progress
+from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.links import link_names
 from gfm_hil.results.run_folder import check_free
 
@@ -163,9 +162,7 @@ def _print(tables: Iterable[Any], remarks: Iterable[str]) -> None:
     console = terminal()
     console.width = max(console.width, _WIDTH)
     for table in tables:
-        drawn = Table(title=escape(table.heading), title_justify="left", box=None, pad_edge=False)
-        for k, column in enumerate(table.columns):
-            drawn.add_column(escape(column), justify="right" if k else "left")
+        drawn = numbers(*map(escape, table.columns), title=escape(table.heading))
         for row in table.rows:
             drawn.add_row(*map(escape, row))
         console.print(drawn, end="\n\n")
@@ -175,15 +172,6 @@ def _print(tables: Iterable[Any], remarks: Iterable[str]) -> None:
 
 @contextmanager
 def _bar(quiet: bool) -> Iterator[Tell]:
-    console = terminal(stderr=True, quiet=quiet)
-    with Progress(
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.description}"),
-        console=console,
-        disable=not console.is_terminal,
-        transient=True,
-        refresh_per_second=4,
-    ) as bar:
+    with progress(BarColumn(), TaskProgressColumn(), "{task.description}", quiet=quiet) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda text, share: bar.update(task, description=escape(text), completed=share)

@@ -20,7 +20,7 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
@@ -76,10 +76,7 @@ def call(options: argparse.Namespace) -> int:
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
     def table_of(names: Sequence[str]) -> Table:
-        table = Table(box=None, pad_edge=False)
-        table.add_column("")
-        for name in names:
-            table.add_column(escape(name), justify="right")
+        table = numbers("", *map(escape, names))
         some = [summaries[name] for name in names]
         table.add_row("status", *[s["status"] for s in some])
         for k, event in enumerate(events):

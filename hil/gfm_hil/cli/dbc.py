@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.table import Table
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
+from gfm_hil.core.terminal import numbers, terminal
 
 _RATES = {
     False: [(500_000, 0), (1_000_000, 0)],
@@ -51,11 +51,12 @@ def _budgets(T_s: float) -> Table:
     from gfm_hil.links.can.layout import load_plan
     from gfm_hil.links.can.options import CanOptions
 
-    table = Table(box=None, pad_edge=False, caption_justify="left")
+    heads = ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load")
+    table = numbers("bus [Mbit/s]", *heads)
     table.caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"
-    table.add_column("bus [Mbit/s]", no_wrap=True)
-    for title in ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load"):
-        table.add_column(title, justify="right", no_wrap=True)
+    table.caption_justify = "left"
+    for column in table.columns:
+        column.no_wrap = True
     for fd, rates in _RATES.items():
         plan = load_plan(CanOptions(fd=fd))
         for bitrate, data in rates:

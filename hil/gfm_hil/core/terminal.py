@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 _ANY = 100_000  # columns; more than any table takes
 
@@ -38,6 +38,12 @@ def fitting(
             count -= 1
         yield table_of(left[:count])
         left = left[count:]
+
+
+def numbers(first: str, *others: str, title: str = "") -> Table:
+    """An empty table without lines: the first column is text, the others are numbers."""
+    columns = (Column(head, justify="right") for head in others)
+    return Table(first, *columns, title=title, title_justify="left", box=None, pad_edge=False)
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

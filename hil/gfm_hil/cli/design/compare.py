@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
 from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, progress, split_laws
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
@@ -116,15 +116,8 @@ def _make(folder: Path) -> None:
 @contextlib.contextmanager
 def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     """A bar of laws and one of each search; yields what tells them of evaluations and of rows."""
-    console = terminal(stderr=True, quiet=options.quiet, highlight=False)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[best]}"),
-        console=console,
-        transient=True,
-    ) as bar:
+    columns = BarColumn(), MofNCompleteColumn(), "{task.fields[best]}"
+    with progress("{task.description}", *columns, quiet=options.quiet) as bar:
         laws = bar.add_task("laws", total=len(jobs), best="")
         searches: dict[str, Any] = {}
 

@@ -164,10 +164,9 @@ def markdown(name: str, rows: Sequence[Row]) -> str:
     wanted = [r for r in rows if (r["gamma"] is None) == (name == "law_comparison_unstable")]
     columns = _WITH_GAMMA.get(name, _WITHOUT)
     heads = [head.replace("W_", "W") for head, _ in columns]
-    rows = [
-        [text(row).replace("W_", "W").replace("|", "\\|") for _, text in columns] for row in wanted
-    ]
-    return table(heads, rows) + "\n"
+    lines = [[text(row) for _, text in columns] for row in wanted]
+    cells = [[cell.replace("W_", "W").replace("|", "\\|") for cell in line] for line in lines]
+    return table(heads, cells) + "\n"
 
 
 def print_comparison(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
