@@ -12,7 +12,7 @@ import tempfile
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,25 +31,6 @@ _WORD = ctypes.c_int64
 _ORDER: dict[Role, int] = {"controller": 1, "plant": -1}
 
 FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
-
-
-class End(Protocol):
-    """One end of a contender; see ``gfm_hil.benchmark.pingpong``."""
-
-    @property
-    def compiled(self) -> bool:
-        """Whether its loop runs without Python."""
-
-    def ping(
-        self, stop: NDArray[np.int64], period_ns: int, duration_ns: int, took: NDArray[np.int64]
-    ) -> int:
-        """Send requests."""
-
-    def pong(self, stop: NDArray[np.int64]) -> None:
-        """Answer requests."""
-
-    def close(self) -> None:
-        """Free its resources."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +55,7 @@ class Contender:
     baseline: str
     library: Path | None = None
 
-    def open(self, role: Role, payload: int) -> End:
+    def open(self, role: Role, payload: int) -> LinkEnd | CEnd:
         """Open one end; the controller first.
 
         Raises:
