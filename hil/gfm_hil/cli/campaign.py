@@ -30,7 +30,6 @@ _PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.add_argument("file", help="campaign file, or the name of a shipped one")
     command.add_argument("--out", help="folder; runs/<campaign>-<time> by default")
     command.add_argument("--resume", action="store_true", help="run what --out has not got yet")

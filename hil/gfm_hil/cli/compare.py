@@ -30,7 +30,6 @@ from gfm_hil.scenario.model import INPROC, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "In one process and in lockstep, unless --link, --endpoint, --option or "
         "--mode realtime asks for two."

@@ -18,7 +18,6 @@ _RATES = {
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
     command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")

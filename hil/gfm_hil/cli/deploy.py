@@ -17,7 +17,6 @@ FILES = ("can/*", "container/Containerfile", "container/compose.yaml", "systemd/
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Write what is in deploy/: units of systemd, container files, units of CAN "
         "interfaces and the script that tunes a machine for real time."

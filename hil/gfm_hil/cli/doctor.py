@@ -14,14 +14,12 @@ from gfm_hil.results.doctor import examine, worst
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = "Judge this machine for real time; it only looks, for about a second."
     command.add_argument("--json", action="store_true", help="all facts and findings as JSON")
     command.add_argument("--strict", action="store_true", help="exit code 3 if a line is red")
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     facts, findings = examine()
     level = worst(findings)
     if options.json:

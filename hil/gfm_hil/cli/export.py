@@ -10,7 +10,6 @@ from gfm_hil.results.export import FORMATS, export_run
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = "; ".join(f"{name}: {form.text}" for name, form in FORMATS.items())
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument(

@@ -19,7 +19,6 @@ MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.add_argument("--json", action="store_true", help="as JSON")
     command.add_argument(
         "--tuned", action="store_true", help="those with the gains of the law comparison"

@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-#: each command's module and what it does. Only the module of the command that is called is
-#: imported, so that the help and the light commands load neither numba nor the design tools.
+#: each command's module and what it does. A module's ``add`` gives the command's parser its
+#: options, ``call`` carries the command out and returns the exit code. Only the module of the
+#: command that is called is imported, so that the light commands load no numba.
 COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
     "tell": ("tell", "have a run that is going on do something, or show where it is"),

@@ -10,7 +10,6 @@ from gfm_hil.results.run_folder import merge_roles
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Put the folders that gfmhil controller and gfmhil plant have left of one run together "
         "into one folder with all signals, metrics, figures and the report. Both stay."

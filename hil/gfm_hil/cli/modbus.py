@@ -14,7 +14,6 @@ _LOOK_S = 0.1
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end."
     )
@@ -48,7 +47,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     from gfm_hil.modbus.image import vendor_model
     from gfm_hil.modbus.serve import LOCAL, Address, begun, serve
 

@@ -11,7 +11,6 @@ from gfm_hil.results.run_folder import recover
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Complete the folder of a run that a kill, a power failure or a full disk cut off: "
         "signals, times, events, summary, figures and report of all that was recorded. "

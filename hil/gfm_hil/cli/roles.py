@@ -18,7 +18,6 @@ from gfm_hil.scenario.model import INPROC
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--out", help="run folder; runs/<role>-<time> by default")

@@ -25,7 +25,6 @@ from gfm_hil.scenario.model import INPROC, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--out", help="run folder; runs/<scenario>-<time> by default")
@@ -47,7 +46,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     scenario = resolve(options, law=options.law)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
     with contextlib.ExitStack() as stack:

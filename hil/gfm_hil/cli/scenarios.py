@@ -12,12 +12,10 @@ from gfm_hil.scenario.model import load_scenario, shipped_scenarios
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.add_argument("--json", action="store_true", help="as JSON")
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     found = {name: load_scenario(name) for name in shipped_scenarios()}
     if options.json:
         rows = [{"name": n, "title": s.title, "mode": s.mode, "law": s.law, "duration": s.duration}

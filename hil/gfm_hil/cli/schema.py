@@ -21,7 +21,6 @@ MODELS: dict[str, type[BaseModel]] = {
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Prints the JSON Schema (draft 2020-12) of a kind of file. It describes every "
         "key; what keys must be like together, only gfmhil itself checks."

@@ -20,7 +20,6 @@ _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Serves a page with the run's signals. Who opens it with the token that is "
         "printed can also control the run; others can look."
@@ -47,7 +46,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     encryption, ports = check(options)
     need_websockets()
     from gfm_hil.scope.access import Access

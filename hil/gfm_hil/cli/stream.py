@@ -20,7 +20,6 @@ _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Samples for PlotJuggler's ZeroMQ subscriber (JSON) and, at the next port, "
         "every tick in blocks for gfm_hil.telemetry.BlockReader. Ends with the run."
@@ -46,7 +45,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     _check(options)
     from gfm_hil.recording.live import begun
     from gfm_hil.telemetry.follow import Follower

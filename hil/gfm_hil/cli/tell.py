@@ -15,7 +15,6 @@ from gfm_runtime.signals import REF_NAMES
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = "Without anything to tell: the newest tick as JSON."
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument(
@@ -35,7 +34,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     events = _events(options)
     operator = Operator(options.folder, through="tell")
     try:

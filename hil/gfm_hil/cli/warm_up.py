@@ -9,7 +9,6 @@ from gfm_hil.core.terminal import terminal
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
     command.description = (
         "Compiles the kernel, the loops and every link into numba's cache. The cache "
         "lies beside the installed modules, or where NUMBA_CACHE_DIR says; another version of "
@@ -19,7 +18,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     from gfm_hil.engine.compiling import compile_everything
 
     console = terminal(stderr=True, quiet=options.quiet)

@@ -8,7 +8,6 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn
@@ -28,7 +27,6 @@ from gfm_runtime import law_names
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("compare", help="every law tuned for the same problem, in a table")
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
@@ -49,7 +47,7 @@ def call(options: argparse.Namespace) -> int:
     """Compare the laws; a law that the folder --out has already is not tuned again."""
     jobs = _jobs(options)
     folder = new_folder(options.out, "law-comparison")
-    _make(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     rows = {job.law: row for job in jobs if (row := kept(folder, job))}
     missing = [job for job in jobs if job.law not in rows]
     lost = None
@@ -104,13 +102,6 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         Job(name, options.seed, options.evaluations, options.starts)
         for name in dict.fromkeys(names)
     ]
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise UserError(f"--out {folder}: {problem.strerror}") from None
 
 
 @contextlib.contextmanager

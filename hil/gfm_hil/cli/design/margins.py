@@ -13,7 +13,6 @@ from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
 from gfm_hil.cli.common import progress
 from gfm_hil.cli.design.margin_report import as_json, no_margins, print_margins
-from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.loop_delay import loop_delay
@@ -24,7 +23,6 @@ from gfm_hil.studies.margin_figures import draw_delay, draw_region
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser(
         "margins", help="gain, phase, delay and disk margins, parameter ranges, stable grids"
     )
@@ -72,10 +70,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _draw(folder: Path, loop: Loop, label: str, margin: float) -> Region:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise UserError(f"--figures {folder}: {problem.strerror}") from None
+    folder.mkdir(parents=True, exist_ok=True)
     with progress("{task.description}", BarColumn()) as bar:
         task = bar.add_task("stable region", total=POINTS)
         region = stable_region(loop, POINTS, lambda rows: bar.update(task, completed=rows))

@@ -26,7 +26,6 @@ from gfm_hil.studies.tuned_law import write_law
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("tune", help="choose the free gains for the least gamma")
     add_law_options(command)
     command.add_argument("--seed", type=int, default=0, help="of the search")
