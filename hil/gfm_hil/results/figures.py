@@ -214,7 +214,7 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict
         scenario.T_s * 1e6, 0.98, f" T_s = {scenario.T_s * 1e6:g} µs", fontsize=8, va="top",
         color="#444444", transform=left.get_xaxis_transform(),
     )  # fmt: skip
-    left.set_title("share of ticks beyond a latency [µs]", loc="left", fontsize=9.5)
+    dress(left, "share of ticks beyond a latency [µs]")
     left.legend(fontsize=8, frameon=False, loc="lower left")
     edges, counts = np.linspace(0, summary["duration_s"], _BINS + 1), np.zeros(_BINS)
     ticks = len(timing["plant_received"])
@@ -222,15 +222,8 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict
         missing = np.flatnonzero(missed(timing, first, first + PIECE))
         counts += np.histogram((first + missing) * scenario.T_s, edges)[0]
     right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
-    right.set_title(
-        f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}",
-        loc="left",
-        fontsize=9.5,
-    )
+    dress(right, f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}")
     right.set_xlabel("t [s]", fontsize=9)
-    for a in (left, right):
-        a.grid(True, color="#e4e4e4", lw=0.6)
-        a.tick_params(labelsize=8.5)
     path = folder / "timing.png"
     _save(figure, path)
     return path
@@ -247,16 +240,13 @@ def draw_laws(
     whole = max(len(s["t"]) for s in runs.values())
     if all(s["t"][0:1] == 0 for s in runs.values()):  # not only a window of each run
         whole = scenario.ticks
-    for a, (title, name) in zip(
-        axes,
-        (
-            ("active power p", "true_p"),
-            ("frequency", "true_omega_u"),
-            ("reactive power q", "true_q"),
-            ("DC voltage v_dc", "true_v_dc"),
-        ),
-        strict=True,
-    ):
+    panels = (
+        ("active power p", "true_p"),
+        ("frequency", "true_omega_u"),
+        ("reactive power q", "true_q"),
+        ("DC voltage v_dc", "true_v_dc"),
+    )
+    for a, (title, name) in zip(axes, panels, strict=True):
         curves = [
             (columns, name, COLOURS[k % len(COLOURS)], law)
             for k, (law, columns) in enumerate(runs.items())

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from gfm_design.margins.tolerance import Region, factor
 from gfm_design.model.closed_loop import ClosedLoop
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 
 _GREY = "#888888"
 _SPAN = 100.0  # 1/s; colours of sigma end there
@@ -69,6 +69,5 @@ def draw_delay(path: Path, loop: ClosedLoop, label: str, margin: float) -> None:
         )  # fmt: skip
     axes.set_xlabel(f"delay on top of the loop's {1e6 * loop.u_delay[0]:g} µs [µs]")
     axes.set_ylabel("largest σ [1/s]")
-    axes.set_title(f"{label}: the loop over its delay", loc="left", fontsize=10)
-    axes.grid(True, color="#e4e4e4", lw=0.6)
+    dress(axes, f"{label}: the loop over its delay")
     figure.savefig(path, dpi=110)

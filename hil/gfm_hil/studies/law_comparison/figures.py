@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import T_S
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 from gfm_hil.studies.law_comparison.experiments import AT, TRACE_EVERY
 from gfm_hil.studies.law_comparison.tables import others, worst
 
@@ -43,10 +43,7 @@ def _spread(rows: Sequence[Row]) -> list[Row]:
 def _figure(width: float, height: float) -> tuple[Figure, Any]:
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots()
-    axes.grid(True, color="#e4e4e4", lw=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    dress(axes)
     return figure, axes
 
 
