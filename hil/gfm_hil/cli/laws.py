@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,7 @@ def call(options: argparse.Namespace) -> int:
                     for k in sorted({*file.phi, *file.psi})
                 },
                 "stages": len(laws.laws),
-                "home_grid": {"L_g": first.home_grid.L_g, "R_g": first.home_grid.R_g,
-                              "note": first.home_grid.note},
+                "home_grid": asdict(first.home_grid),
                 "source": " ".join(first.source.split()),
             }
         )  # fmt: skip
@@ -110,8 +110,7 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
             n: {"value": p.value, "unit": p.unit, "source": p.source}
             for n, p in law.parameters.items()
         },
-        "home_grid": {"L_g": law.home_grid.L_g, "R_g": law.home_grid.R_g,
-                      "note": law.home_grid.note},
+        "home_grid": asdict(law.home_grid),
         "order": discrete[0].order,
         "discrete": [
             {"T_s": d.T_s, **{n: getattr(d, n).tolist() for n in MATRICES}} for d in discrete
