@@ -213,7 +213,6 @@ class ClosedLoop:
             NoEquilibrium: plant and law have none there.
         """
         of = self.made_of
-        # into the record: the emulator's sub-step, which make_plant checks, plays no part here
         par, nominal = of.par.copy(), load_converter(of.plant.converter).pu()
         for name, factor in factors.items():
             par[name] = nominal[name] * factor
