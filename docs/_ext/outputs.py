@@ -69,8 +69,6 @@ SCENARIO_MISTAKES = (
     ("a reference out of range", "P_ref = 0.8", "P_ref = 8.0"),
     ("an event of an unknown kind", '"grid-voltage"', '"grid-sag"'),
     ("a ramp and a sag at once", "duration = 0.2 ", "rate = 1.0\nduration = 0.2 "),
-    ("a sensor faster than the integration resolves", "bandwidth_hz = 300.0",
-     "bandwidth_hz = 50000.0"),
     ("real time in one process", "seed = 7", 'seed = 7\nmode = "realtime"\nlink.type = "inproc"'),
     ("a file that is not TOML", "[references]", "[references"),
 )  # fmt: skip
