@@ -1,4 +1,4 @@
-"""A law and a plant, closed: the one loop that all analysis and synthesis looks at.
+"""The closed loop of a law and a plant, on which all analysis and synthesis works.
 
 The loop is continuous, as the paper's (Section III), or the exact sampled one of the bench. Around
 its operating point it maps w = (references r, grid d) to y as it truly is, before the sensors:
@@ -6,7 +6,8 @@ its operating point it maps w = (references r, grid d) to y as it truly is, befo
     x' = A x + B w,    y = C x + D w,    x = (plant, its delay lines, law),
 
 where x' is dx/dt or the x of the next tick. Every other quantity (modes, margins, gamma, step)
-is read off these matrices. A loop may be many at once: plants, laws or both on leading axes.
+follows from these matrices. A ``ClosedLoop`` may hold many loops: plants, laws or both on leading
+axes.
 """
 
 from __future__ import annotations
@@ -58,8 +59,9 @@ REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # (V_dcref, P_ref, omega_g, Q_ref, V_ref
 #: the loop's inputs w: the references, and the grid as Eq. (15) has it
 INPUTS = (*REF_NAMES, "grid.omega_g", "grid.V_g")
 
+#: distances from a resonance at which to look, as multiples of its damping
 _ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
-_GONE = 1e-9  # |z| below this is gone within a tick: an emptied delay line, no mode
+_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 _P_REF, _OMEGA_G = INPUTS.index("P_ref"), INPUTS.index("grid.omega_g")
 _V_C, _I_O = 2, 4  # where v_d and i_od are in the plant's state; v_q and i_oq follow
 _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
@@ -71,10 +73,11 @@ class Origin:
 
     Attributes:
         plant: its options.
-        law: at its sampling time; ``ideal`` says that the loop has it as its file writes it.
+        law: at its sampling time.
+        ideal: the loop is continuous and has the law before it was discretised.
         ref: references, shape (5,), p.u.
         par: the plant's record.
-        op: where plant and law rest.
+        op: the operating point.
     """
 
     plant: Plant
@@ -127,7 +130,7 @@ class ClosedLoop:
         T_s: float = T_S,
         ideal: bool = False,
     ) -> Self:
-        """The loop of a law on a plant, around the point where both rest.
+        """The loop of a law on a plant, around their operating point.
 
         Args:
             law: catalogue name, path of a law file (of a scheduled law its first stage), a law, or
@@ -140,7 +143,7 @@ class ClosedLoop:
 
         Raises:
             LawError: no such law, or it cannot be discretised.
-            NoEquilibrium: plant and law have no common rest.
+            NoEquilibrium: there is no operating point.
         """
         if not isinstance(law, DiscreteLaw):
             law = discretise(get_law(law) if isinstance(law, str) else law, T_s)
@@ -210,7 +213,7 @@ class ClosedLoop:
         """The loop anew, at its own operating point, with elements at factors of their values.
 
         Raises:
-            NoEquilibrium: plant and law have none there.
+            NoEquilibrium: there is none with these elements.
         """
         of = self.made_of
         par, nominal = of.par.copy(), load_converter(of.plant.converter).pu()
@@ -296,7 +299,7 @@ class ClosedLoop:
         used = self.law.B.any(axis=0) | self.law.D[list(self.commands)].any(axis=0)
         return tuple(int(i) for i in np.flatnonzero(used & self.plant.C.any(axis=1)))
 
-    # what they say
+    # results
 
     def sigma(self) -> Any:
         """Largest real part of any mode, 1/s: a number, or the shape of the leading axes.
@@ -310,7 +313,7 @@ class ClosedLoop:
             return np.log(np.abs(values).max(axis=-1)) / self.T_s
 
     def poles(self) -> Response:
-        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without emptied lines."""
+        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without delay lines."""
         values = np.linalg.eigvals(self.A).astype(complex)
         return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
 
@@ -341,7 +344,7 @@ class ClosedLoop:
         """Gain, phase, disk and delay margins of a sampled loop; takes a second.
 
         Raises:
-            UnstableLoop: there are none.
+            UnstableLoop: the loop is unstable and has no margins.
         """
         from gfm_design.margins.all_margins import loop_margins  # which looks at loops itself
 

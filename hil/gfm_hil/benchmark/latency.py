@@ -30,7 +30,12 @@ Tell = Callable[[str, float], None]  # present work and share done
 
 @dataclass
 class _Cell:
-    """One contender in one mode under one load."""
+    """One contender in one mode under one load.
+
+    Attributes:
+        rounds: round trips of each round, ns.
+        silent: rounds in which no answer came.
+    """
 
     contender: Contender
     mode: Mode
