@@ -32,6 +32,7 @@ from gfm_hil.benchmark.attribution import CAUSES, attribute
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.benchmark.pair import pair
+from gfm_hil.core.terminal import markdown
 from gfm_hil.realtime.environment import environment, may_sched_fifo
 from gfm_hil.recording.columns import TIMES_OF
 from gfm_hil.recording.live import LiveRun
@@ -226,10 +227,10 @@ def _count(timing: Timing, stretches: list[Turn]) -> Found:
 def _table(found: dict[str, Any]) -> str:
     """Side by side, as lines of Markdown."""
     kinds = found["rows"]
-    lines = [f"| | {' | '.join(row['what'] for row in kinds)} |", "|---" * (len(kinds) + 1) + "|"]
+    lines: list[list[str]] = []
 
     def line(name: str, cells: list[str]) -> None:
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+        lines.append([name, *cells])
 
     line("ticks", [f"{row['ticks']}" for row in kinds])
     line("ticks missed", [f"{row['missed']}" for row in kinds])
@@ -248,7 +249,7 @@ def _table(found: dict[str, Any]) -> str:
     more = ", ".join(f"{each:+d}" for each in by_turn)
     error = np.std(by_turn, ddof=1) / len(by_turn) ** 0.5 if len(by_turn) > 1 else math.nan
     return "\n".join([
-        *lines, "",
+        markdown(["", *(row["what"] for row in kinds)], lines), "",
         f"{found['clients']} clients for {found['seconds']:g} s, {found['policy']}: "
         f"{np.mean(by_turn):+.0f} ± {error:.0f} misses in a round (mean and its standard error); "
         f"round by round {more}",

@@ -23,6 +23,7 @@ from gfm_hil.benchmark.pair import Policy, pair
 from gfm_hil.benchmark.pingpong import LinkEnd
 from gfm_hil.benchmark.rounds import Spread, ratio
 from gfm_hil.core.roles import Role
+from gfm_hil.core.terminal import markdown
 from gfm_hil.links.zeromq.curve import Curve, write_keys
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.realtime.environment import environment
@@ -142,9 +143,8 @@ def main() -> None:
         about = {"policy": args.policy, "silent": silent, "environment": environment()}
         print(json.dumps({"settings": plain, **about}, indent=2))
         return
-    print("| setting | p50, µs | ratio |\n|---|---|---|")
-    for name, spread in ratios.items():
-        print(f"| {name} | {Spread.of(medians[name]).text(1)} | {spread.text(2)} |")
+    rows = [(n, Spread.of(medians[n]).text(1), spread.text(2)) for n, spread in ratios.items()]
+    print(markdown(("setting", "p50, µs", "ratio"), rows))
     print(*(f"{name}: a side fell silent" for name in silent), sep="\n")
 
 

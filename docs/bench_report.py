@@ -46,18 +46,10 @@ def main(folder: Path) -> None:
     content = read_result(folder)
     if content["bench"] != "all":
         raise SystemExit(f"{folder}: of `gfmhil bench {content['bench']}`, not of `all`")
-    loop = content["loop"]
-    found = {
-        "latency": list(tables.latency_tables(content["results"])),
-        "realtime": [
-            tables.realtime_table(loop["realtime"]),
-            tables.causes_table(loop["realtime"]),
-        ],
-        "jitter": [tables.jitter_table(content["jitter"])],
-        "lockstep": [tables.lockstep_table(loop["lockstep"]), tables.laws_table(loop["laws"])],
-        "kernel": [tables.kernel_table(content["kernel"])],
-    }
-    parts = {name: "\n\n".join(map(markdown, some)) for name, some in found.items()}
+    parts: dict[str, str] = {}
+    for section, table in tables.tables(content):
+        parts[section] = "\n\n".join(filter(None, (parts.get(section), markdown(table))))
+    parts["realtime"] = parts.pop("misses")
     badge = content["environment"]
     chips = (f"{label} {text_of(badge[key])}" for key, label in _BADGE.items())
     parts["badge"] = f"{'; '.join(chips)}. Measured in {content['seconds']:g} s."

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_design.model.box import Box, Point
@@ -40,7 +39,6 @@ def region() -> None:
     """sigma over L_g and delay, worst over R_f, R_g in {0.1, 1, 3} and P_ref in {0, 0.5, 1}."""
     lines, delays = np.geomspace(0.5, 30.0, 25), np.linspace(1.0, 10.0, 19)
     figure = Figure(figsize=(8.0, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2, sharey=True)
     for axis, law, name in zip(axes, LAWS, NAMES, strict=True):
         box = Box(L_g=tuple(lines), delay=tuple(delays), P_ref=(0.0, 1.0), dc=("controlled",))
@@ -65,7 +63,6 @@ def region() -> None:
 def resistance() -> None:
     """What limits alpha: sigma over R_f = R_g, worst of L_g, delay and P_ref."""
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
     axis = figure.subplots()
     for dc in Box().dc:
         worst = []
@@ -91,7 +88,6 @@ def overshoot() -> None:
         (RIG_LAW, replace(both, dc=("regulated",), **rig), "regulated, its law, R ≥ × 0.33"),
     )
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
     axis = figure.subplots()
     for k, (law, box, name) in enumerate(shown):
         runs = [step_run(p, law) for p in box.corners()]
@@ -121,7 +117,6 @@ def frontier() -> None:
         ("regulated", "overshoot", 100.0, "overshoot allowed [%], R ≥ × 0.33"),
     )
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
     for axis, (dc, moved, factor, label) in zip(figure.subplots(1, 3), panels, strict=True):
         some = [r for r in rows if (r["dc"], r["moved"]) == (dc, moved)]
         some.sort(key=lambda r: float(r["value"]))

@@ -11,6 +11,7 @@ from queue import Empty, Queue
 
 import numpy as np
 
+from gfm_hil.core.terminal import markdown
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import ring
 from gfm_hil.links.frame import DATA_IDS, MAGIC, FrameWriter, frame_dtype
@@ -39,16 +40,15 @@ _RUN = "0123456789abcdef"
 def frame_layout() -> str:
     """Both frames side by side, a row a field."""
     layouts = {name: frame_dtype(name) for name in ("y", "u")}
-    rows = ["| field | type | at byte of $y$ | at byte of $u$ | |", "|---|---|---|---|---|"]
+    rows = []
     names = dict.fromkeys(name for d in layouts.values() for name in (d.names or ())[:-1])
     for name in (*names, "crc"):
         places = {g: d.fields[name] for g, d in layouts.items() if d.fields and name in d.fields}
         kind = next(iter(places.values()))[0].str.lstrip("|")
         cells = [str(places[g][1]) if g in places else "–" for g in layouts]
-        meaning = _MEANING.get(name, "p.u.")
-        rows.append(f"| `{name}` | {_KINDS[kind]} | {' | '.join(cells)} | {meaning} |")
-    sizes = " | ".join(str(d.itemsize) for d in layouts.values())
-    return "\n".join([*rows, f"| size | | {sizes} | bytes |"])
+        rows.append([f"`{name}`", _KINDS[kind], *cells, _MEANING.get(name, "p.u.")])
+    rows.append(["size", "", *(str(d.itemsize) for d in layouts.values()), "bytes"])
+    return markdown(["field", "type", "at byte of $y$", "at byte of $u$", ""], rows)
 
 
 def frame_examples() -> str:
@@ -68,22 +68,22 @@ def frame_examples() -> str:
 def codes(what: str) -> str:
     """The codes of ``states`` or ``reasons``."""
     texts = STATES if what == "states" else ("none", *REASONS[1:])
-    return "\n".join(["| code | |", "|---|---|", *(f"| {k} | {t} |" for k, t in enumerate(texts))])
+    return markdown(("code", ""), [(str(k), text) for k, text in enumerate(texts)])
 
 
 def signals() -> str:
     """The signal table, a row a signal."""
-    rows = ["| vector | signal | base | range, p.u. | on CAN, p.u. a count | |"]
-    rows.append("|---|---|---|---|---|---|")
-    for vector in ("y", "u", "ref", "d"):
-        for s in group(vector):
-            base = f"`{s.base}`"
-            rows.append(
-                f"| `{s.group}` | `{s.name}` (${s.symbol}$) | {base} | {s.low:g} … {s.high:g} "
-                f"| {s.scale:g} | {s.description} |"
-            )
-    rows += ["", f"The table has version {TABLE_VERSION} and hash `{table_hash()}`."]
-    return "\n".join(rows)
+    rows = [
+        [
+            f"`{s.group}`", f"`{s.name}` (${s.symbol}$)", f"`{s.base}`", f"{s.low:g} … {s.high:g}",
+            f"{s.scale:g}", s.description,
+        ]
+        for vector in ("y", "u", "ref", "d")
+        for s in group(vector)
+    ]  # fmt: skip
+    heads = ["vector", "signal", "base", "range, p.u.", "on CAN, p.u. a count", ""]
+    version = f"The table has version {TABLE_VERSION} and hash `{table_hash()}`."
+    return f"{markdown(heads, rows)}\n\n{version}"
 
 
 class _Wire:
@@ -162,9 +162,8 @@ def shm_layout() -> str:
         (segment.RINGS[1], ring.RING, "ring", "the second ring: controller to plant"),
     ]
     assert sum(rows[-1][:2]) == segment.SIZE
-    lines = ["| at byte | bytes | type | |", "|---|---|---|---|"]
-    lines += [f"| {at} | {size} | {kind} | {text} |" for at, size, kind, text in rows]
-    return "\n".join([*lines, f"| size | {segment.SIZE} | | |"])
+    cells = [[str(cell) for cell in row] for row in (*rows, ("size", segment.SIZE, "", ""))]
+    return markdown(("at byte", "bytes", "type", ""), cells)
 
 
 def shm_slot() -> str:
@@ -176,4 +175,4 @@ def shm_slot() -> str:
         ("longest message in bytes, right behind the stamp", ring.LONGEST),
         ("low bits of the stamp that hold the message's length", ring.LENGTH_BITS),
     )
-    return "\n".join(["| | |", "|---|---|", *(f"| {text} | {number} |" for text, number in rows)])
+    return markdown(("", ""), [(text, str(number)) for text, number in rows])

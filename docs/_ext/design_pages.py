@@ -7,6 +7,7 @@ import numpy as np
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
 from gfm_design.tuning.gains import FreeGain, tied
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_hil.core.terminal import markdown
 from gfm_runtime import law_file
 
 #: column: law, gains that differ from its file
@@ -29,22 +30,22 @@ def _channels(law: str, given: dict[str, float]) -> tuple[Channel, ...]:
 def gammas() -> str:
     """||W_ij T_ij|| and the frequency [rad/s] of its peak, one column a set of gains."""
     columns = [_channels(law, given) for _, law, given in _COLUMNS]
-    lines = [f"| | {' | '.join(head for head, *_ in _COLUMNS)} |", "|---" * 6 + "|"]
+    rows = []
     for row in zip(*columns, strict=True):
-        cells = " | ".join(f"{c.norm:.4f} ({_short(c.omega)})" for c in row)
-        lines.append(f"| $W_{{{row[0].i}{row[0].j}}} T_{{{row[0].i}{row[0].j}}}$ | {cells} |")
-    worst = " | ".join(f"**{max(c.norm for c in column):.4f}**" for column in columns)
-    return "\n".join([*lines, f"| **γ** | {worst} |"])
+        cells = [f"{c.norm:.4f} ({_short(c.omega)})" for c in row]
+        rows.append([f"$W_{{{row[0].i}{row[0].j}}} T_{{{row[0].i}{row[0].j}}}$", *cells])
+    rows.append(["**γ**", *(f"**{max(c.norm for c in column):.4f}**" for column in columns)])
+    return markdown(["", *(head for head, *_ in _COLUMNS)], rows)
 
 
 def weights() -> str:
     """Gain at rest and at high frequency, zeros and poles of each weight."""
-    lines = ["| | at ω = 0 | zeros [rad/s] | poles [rad/s] | at ω → ∞ |", "|---" * 5 + "|"]
+    rows = []
     for w in PAPER_WEIGHTS:
         zeros, poles = (_roots(c) for c in (w.num, w.den))
         rest, far = w.num[-1] / w.den[-1], w.num[0] / w.den[0]
-        lines.append(f"| $W_{{{w.i}{w.j}}}$ | {rest:.4g} | {zeros} | {poles} | {far:.4g} |")
-    return "\n".join(lines)
+        rows.append([f"$W_{{{w.i}{w.j}}}$", f"{rest:.4g}", zeros, poles, f"{far:.4g}"])
+    return markdown(["", "at ω = 0", "zeros [rad/s]", "poles [rad/s]", "at ω → ∞"], rows)
 
 
 def _short(omega: float) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
 from gfm_hil.cli.laws import cell_text
+from gfm_hil.core.terminal import markdown
 from gfm_plant import Plant
 from gfm_runtime import discretise, law_file, law_names, load_law
 from gfm_runtime.lawfile import ElementSpec, LawFile, Number
@@ -142,11 +143,9 @@ def _mode_text(mode: Mode) -> str:
     return f"{text} 1/s at {f:.3g} Hz" if f < 100 else f"{text} 1/s at {f:.0f} Hz"
 
 
-def _overview() -> list[str]:
-    lines = [
-        "| law | elements | states | errors | grid | least damped, ideal | least damped, rig |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def overview() -> str:
+    """One row a law."""
+    rows = []
     for name in law_names():
         file, law = law_file(name), load_law(name).laws[0]
         cells = "; ".join(
@@ -156,12 +155,13 @@ def _overview() -> list[str]:
             if cell_text(file, i + j) != "0"
         )
         home = law.home_grid
-        lines.append(
-            f"| [{name}](#law-{name}) | {cells} | {discretise(law, T_S).order} |"
-            f" {law.error_map} | {'paper' if home.L_g == 1 else f'× {home.L_g:g}'} |"
-            f" {_mode_text(worst_mode(name, False))} | {_mode_text(worst_mode(name, True))} |"
-        )
-    return lines
+        rows.append([
+            f"[{name}](#law-{name})", cells, str(discretise(law, T_S).order), law.error_map,
+            "paper" if home.L_g == 1 else f"× {home.L_g:g}",
+            *(_mode_text(worst_mode(name, rig)) for rig in (False, True)),
+        ])  # fmt: skip
+    heads = ("law", "elements", "states", "errors", "grid")
+    return markdown([*heads, "least damped, ideal", "least damped, rig"], rows)
 
 
 def _set_points(file: LawFile) -> str:
@@ -183,11 +183,16 @@ def _law(name: str) -> list[str]:
     lines += ["$$", matrix(file, "phi"), "$$", ""]
     if file.psi:
         lines += ["On the feedback only:", "", "$$", matrix(file, "psi"), "$$", ""]
-    lines += ["| | $v_{dc}$ | $p$ | $\\omega_u$ | $q$ | $V$ |", "|---|---|---|---|---|---|"]
-    for i, u in enumerate(("i_u", "\\omega_u", "E_u")):
-        cells = " | ".join(cell_text(file, f"{i + 1}{j + 1}") for j in range(5))
-        lines.append(f"| ${u}$ | {cells} |")
+    elements = [
+        [f"${u}$", *(cell_text(file, f"{i}{j}") for j in "12345")]
+        for i, u in zip("123", ("i_u", "\\omega_u", "E_u"), strict=True)
+    ]
+    parameters = [
+        [f"${symbol(key)}$ `{key}`", f"{p.value:.9g}", p.unit or "–", p.source]
+        for key, p in law.parameters.items()
+    ]
     lines += [
+        markdown(["", "$v_{dc}$", "$p$", "$\\omega_u$", "$q$", "$V$"], elements),
         "",
         f"Errors: {law.error_map}"
         + (f", ${_ERRORS[law.error_map]}$" if law.error_map != "linear" else "")
@@ -199,24 +204,17 @@ def _law(name: str) -> list[str]:
         + f"with one sample of delay and {BANDWIDTH_HZ:g} Hz sensors {_mode_text(rig)} "
         + f"({rig.ratio:.2g}).".replace("-", "−"),
         "",
-        "| parameter | value | unit | source |",
-        "|---|---|---|---|",
+        markdown(["parameter", "value", "unit", "source"], parameters),
     ]
-    for key, p in law.parameters.items():
-        lines.append(f"| ${symbol(key)}$ `{key}` | {p.value:.9g} | {p.unit or '–'} | {p.source} |")
     if laws.schedule is not None:
         lines += ["", "Stages, by the estimated reactance $X$ of the grid [p.u.]:", ""]
-        lines += ["| up to $X$ | parameters that differ |", "|---|---|"]
+        rows = []
         for k, stage in enumerate(laws.schedule.stages):
             last = k == len(laws.schedule.stages) - 1
             changed = ", ".join(f"`{n}` = {v:g}" for n, v in stage.parameters.items())
-            lines.append(f"| {'no end' if last else f'{stage.X:g}'} | {changed or 'none'} |")
+            rows.append(("no end" if last else f"{stage.X:g}", changed or "none"))
+        lines.append(markdown(("up to $X$", "parameters that differ"), rows))
     return [*lines, ""]
-
-
-def overview() -> str:
-    """One row a law."""
-    return "\n".join(_overview())
 
 
 def catalogue() -> str:

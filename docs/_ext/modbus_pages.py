@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gfm_hil.core.terminal import markdown
 from gfm_hil.modbus.device import Device
 from gfm_hil.modbus.gains import Gains
 from gfm_hil.modbus.image import Point, definition
@@ -25,7 +26,7 @@ def registers() -> str:
         mine = [p for p in points if p.path.partition(".")[0] == model]
         rows = [_row(device, p) for p in mine if _is_there(device, p)]
         absent = [f"`{p.name}`" for p in mine if not _is_there(device, p)]
-        parts += [f"## {model}: {group['label']}", "", *_HEAD, *rows, ""]
+        parts += [f"## {model}: {group['label']}", "", markdown(_HEAD, rows), ""]
         if absent:
             parts += [f"Not implemented: {', '.join(absent)}.", ""]
     return "\n".join(parts)
@@ -34,18 +35,15 @@ def registers() -> str:
 def droops() -> str:
     """Which laws have the droops that models 711 and 705 speak of."""
     gains = Gains(law_names())
-    rows = ["| law | $D_p$ (711) | $D_q$ (705) |", "|---|---|---|"]
+    rows = []
     for law in law_names():
         found = gains.droops(law, {})
         cells = ["–" if v is None else f"{v:g}" for v in (found.D_p, found.D_q)]
-        rows.append(f"| `{law}` | {' | '.join(cells)} |")
-    return "\n".join(rows)
+        rows.append((f"`{law}`", *cells))
+    return markdown(("law", "$D_p$ (711)", "$D_q$ (705)"), rows)
 
 
-_HEAD = (
-    "| address | registers | point | type | unit | access | |",
-    "|---|---|---|---|---|---|---|",
-)
+_HEAD = ("address", "registers", "point", "type", "unit", "access", "")
 
 
 def _device() -> Device:
@@ -65,7 +63,7 @@ def _is_there(device: Device, point: Point) -> bool:
     return point.name in later or point.type == "pad" or device.image.get(point.path) is not None
 
 
-def _row(device: Device, point: Point) -> str:
+def _row(device: Device, point: Point) -> tuple[str, ...]:
     unit = str(point.definition.get("units", "")).replace("%", "% ")
     if point.exponent:
         unit = f"{unit} · 10^{point.exponent}^".strip()
@@ -75,7 +73,5 @@ def _row(device: Device, point: Point) -> str:
     named = ", ".join(f"{s['value']} {s['name']}" for s in symbols) if len(symbols) < 9 else ""
     text = point.definition.get("desc", point.definition.get("label", "")).rstrip(".")
     text = f"{text}{note}" + (f": {named}" if named else "")
-    return (
-        f"| {point.address} | {point.length} | `{point.name}` | {point.type} | {unit} | {access} "
-        f"| {text} |"
-    )
+    where = str(point.address), str(point.length)
+    return (*where, f"`{point.name}`", point.type, unit, access, text)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from gfm_hil.core.terminal import markdown
 from gfm_hil.links.impaired import Impairment
 from gfm_hil.scenario import events
 from gfm_hil.scenario import model as scenario
@@ -102,9 +103,9 @@ def _default(field: FieldInfo) -> str:
     return f'`"{value}"`' if isinstance(value, str) else f"`{value}`"
 
 
-def table(model: type[BaseModel], leave_out: tuple[str, ...] = ()) -> list[str]:
+def table(model: type[BaseModel], leave_out: tuple[str, ...] = ()) -> str:
     """One row a key."""
-    lines = ["| key | value | default | meaning |", "|---|---|---|---|"]
+    rows = []
     for name, field in model.model_fields.items():
         if name in leave_out:
             continue
@@ -113,43 +114,38 @@ def table(model: type[BaseModel], leave_out: tuple[str, ...] = ()) -> list[str]:
         if not field.description:
             raise KeyError(f"{model.__name__}.{name} has no description")
         text = field.description.replace("|", "\\|")
-        lines.append(f"| `{name}` | {kind} | {_default(field)} | {text} |")
-    return lines
+        rows.append((f"`{name}`", kind, _default(field), text))
+    return markdown(("key", "value", "default", "meaning"), rows)
+
+
+def _tables(tables: tuple[tuple[str, type[BaseModel]], ...]) -> str:
+    """Several tables of a file, each below its title."""
+    titled = [(f"`{t}`" if t[0] == "[" else t, model) for t, model in tables]
+    return "\n".join(f"**{title}**\n\n{table(model)}\n" for title, model in titled)
 
 
 def scenario_tables() -> str:
     """Every table of a scenario file."""
-    lines: list[str] = []
-    tables: tuple[tuple[str, type[BaseModel]], ...] = (*TABLES, TRIP)
-    for title, model in tables:
-        lines += [f"**{title if title[0] != '[' else f'`{title}`'}**", "", *table(model), ""]
-    return "\n".join(lines)
+    return _tables((*TABLES, TRIP))
 
 
 def end_reasons() -> str:
     """The names that ``expect_reason`` may give, by status."""
-    lines = ["| `expect` | `expect_reason` |", "|---|---|"]
-    for status, names in END_REASONS.items():
-        if names:
-            lines.append(f"| `{status}` | {', '.join(f'`{name}`' for name in names)} |")
-    return "\n".join(lines)
+    named = {status: [f"`{name}`" for name in names] for status, names in END_REASONS.items()}
+    rows = [(f"`{status}`", ", ".join(names)) for status, names in named.items() if names]
+    return markdown(("`expect`", "`expect_reason`"), rows)
 
 
 def event_tables() -> str:
     """Every kind of event."""
-    common = table(events._Event)
-    lines = ["All events:", "", *common, ""]
+    lines = ["All events:", "", table(events._Event), ""]
     for model in EVENTS:
         kind = get_args(model.model_fields["type"].annotation)[0]
         lines += [f'**`type = "{kind}"`** {inspect.cleandoc(model.__doc__ or "")}', ""]
-        lines += [*table(model, ("type", "t", "tick")), ""]
+        lines += [table(model, ("type", "t", "tick")), ""]
     return "\n".join(lines)
 
 
 def law_tables() -> str:
     """Every table of a law file."""
-    lines: list[str] = []
-    for title, model in LAW_TABLES:
-        shown = f"`{title}`" if title[0] == "[" else title
-        lines += [f"**{shown}**", "", *table(model), ""]
-    return "\n".join(lines)
+    return _tables(LAW_TABLES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 
+from gfm_hil.core.terminal import markdown
 from gfm_hil.scope.view import HEAD
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.steps import Steps
@@ -12,14 +13,13 @@ from gfm_hil.testing.steps import Steps
 
 def scope_head() -> str:
     """The numbers that a picture of the scope begins with, a row each."""
-    rows = [f"| {k} | {name} | {text} |" for k, (name, text) in enumerate(HEAD.items())]
-    return "\n".join(["| | | |", "|---|---|---|", *rows])
+    return markdown(("", "", ""), [(str(k), *row) for k, row in enumerate(HEAD.items())])
 
 
 def calls(what: str) -> str:
     """The ``steps`` or the ``assertions`` of the fixture: signature and what it says of itself."""
     owner = Steps if what == "steps" else Experiment
-    rows = ["| call | |", "|---|---|"]
+    rows = []
     for name, member in vars(owner).items():
         if not inspect.isfunction(member) or name.startswith("_"):
             continue
@@ -28,5 +28,5 @@ def calls(what: str) -> str:
             for p in list(inspect.signature(member).parameters.values())[1:]
         ]
         text = " ".join((inspect.getdoc(member) or "").split("\n\n")[0].split())
-        rows.append(f"| `bench.{name}({', '.join(named)})` | {text.replace('``', '`')} |")
-    return "\n".join(rows)
+        rows.append((f"`bench.{name}({', '.join(named)})`", text.replace("``", "`")))
+    return markdown(("call", ""), rows)

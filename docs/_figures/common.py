@@ -9,6 +9,7 @@ from typing import Any
 
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
+from gfm_hil.core.terminal import markdown
 from gfm_hil.results.figures import dress as dress
 from gfm_hil.results.runner import run_in_memory as run  # noqa: F401
 from gfm_hil.scenario.model import Scenario, check_scenario, find_scenario
@@ -66,6 +67,4 @@ def signed(value: float) -> str:
 
 def write_table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A Markdown table for the page to include."""
-    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    lines += [f"| {' | '.join(row)} |" for row in rows]
-    (TABLES / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (TABLES / f"{name}.md").write_text(markdown(head, rows) + "\n", encoding="utf-8")

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from _figures.common import FIGURES, dress, number, write_table
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -41,7 +40,6 @@ def poles(law: str, sensors: int) -> tuple[NDArray[np.complex128], ...]:
 def loci() -> None:
     """The s-plane: LC modes with ideal sensors above, all below 500 Hz with real ones below."""
     figure = Figure(figsize=(9.6, 6.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2, sharex="row", sharey="row")
     shown = None
     spans = (((-45, 38), (1050, 1200)), ((-420, 200), (-12, 470)))
@@ -83,7 +81,6 @@ def _ratio(s: NDArray[np.complex128], band: tuple[float, float]) -> float:
 def damping() -> None:
     """Damping ratio over the delay: of the LC modes, and of what the sensors bring about."""
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2)
     cases = ((0, LC, "LC modes, ideal sensors"), (1, BELOW, "20 to 900 Hz, 300 Hz sensors"))
     for a, (sensors, band, title) in zip(panels, cases, strict=True):

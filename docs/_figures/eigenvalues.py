@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from _figures.common import FIGURES, GREY, LAWS, RIG, modes, number, signed, within, write_table
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 
 
 def ideal_table() -> None:
@@ -58,7 +57,6 @@ def resistance_figure() -> None:
         ("MIMO-GFM, LC resonance at 1075 Hz", sweep("mimo-gfm", 900, 1300), COLOURS[0], "-"),
     )
     figure = Figure(figsize=(8.6, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.axhspan(0, 30, color="#b34500", alpha=0.07, lw=0)
     axes.axhline(0, color="#444444", lw=0.8)
@@ -70,9 +68,7 @@ def resistance_figure() -> None:
     axes.set_ylim(-42, 26)
     axes.set_xlim(0.2, 1.5)
     axes.set_xlabel("factor on $R_f$ and $R_g$", fontsize=9)
-    axes.set_title("growth rate σ [1/s] of the oscillation", loc="left", fontsize=9.5)
-    axes.grid(True, color="#e4e4e4", lw=0.6)
-    axes.tick_params(labelsize=8.5)
+    dress(axes, "growth rate σ [1/s] of the oscillation")
     axes.legend(fontsize=8.5, frameon=False, loc="upper right", ncols=2)
     figure.savefig(FIGURES / "resistance.png", dpi=110)
 

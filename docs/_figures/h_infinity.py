@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from _figures.common import FIGURES, GREY, dress
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
@@ -44,7 +43,6 @@ def starts(of: PaperProblem) -> NDArray[np.float64]:
 def weights() -> None:
     """|W_ij| over the frequency."""
     figure = Figure(figsize=(7.6, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     places = {  # where a curve is named: rad/s, offset in points
         (1, 1): (2e-2, (6, 6)), (2, 1): (9e3, (-34, 4)), (2, 2): (2e-2, (0, 5)),
@@ -83,7 +81,6 @@ def _omega(loop: StateSpace) -> NDArray[np.float64]:
 def channels(found: Tuned) -> None:
     """|T_ij| of printed and tuned gains under 1/|W_ij|, one panel a channel."""
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3, sharex=True).ravel()
     cases = (
         ("printed gains", COLOURS[1], 2.6, printed(), None),
@@ -176,7 +173,6 @@ def bound(found: Tuned) -> None:
     rows.append(("MIMO-GFM as printed", max(c.norm for c in printed().channels(starts(printed()))),
                  COLOURS[1]))  # fmt: skip
     figure = Figure(figsize=(7.6, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     for y, (_, value, colour) in enumerate(rows):
         axes.barh(-y, value, color=colour, height=0.7)

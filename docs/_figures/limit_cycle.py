@@ -17,11 +17,10 @@ from _figures.common import (
     write_table,
 )
 from _figures.steps import window
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import ClosedLoop
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 from gfm_hil.results.runner import Run
 from gfm_plant import Plant
 
@@ -61,7 +60,6 @@ def limit_cycles() -> None:
     head = ["chokes", "$\\kappa$", "$\\varphi$", "least $N$", "E_u predicted", "E_u measured"]
     write_table("relay", head, theory)
     figure = Figure(figsize=(8.6, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 1, sharex=True)
     panels = (("R_g × 0.5", 0.06), ("R_f × 0.5, R_g × 0.5", 0.6))
     for a, (name, span) in zip(axes, panels, strict=True):
@@ -72,10 +70,8 @@ def limit_cycles() -> None:
             s = window(drawn[name, dac], 0.8, 4.0)
             a.plot(s["t"], s["true_p"], color=colour, lw=0.5, label=label)
         a.set_ylim(0.5 - span, 0.5 + span)
-        a.set_title(f"{name}: active power p [p.u.]", loc="left", fontsize=9.5)
+        dress(a, f"{name}: active power p [p.u.]")
         a.axvline(1.0, color=GREY, lw=0.8, ls=(0, (4, 3)))
-        a.grid(True, color="#e4e4e4", lw=0.6)
-        a.tick_params(labelsize=8.5)
     axes[0].legend(fontsize=8.5, frameon=False, loc="upper right", ncols=2)
     axes[0].annotate("law vsg-2", (1.0, 0.44), (4, 4), textcoords="offset points", fontsize=8.5)
     axes[1].set_xlabel("t [s]", fontsize=9)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from _figures.common import FIGURES, GREY
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
@@ -22,7 +21,6 @@ _SERVICES = (
 def services() -> None:
     """Boxes and arrows."""
     figure = Figure(figsize=(9.2, 3.9), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.set(xlim=(0, 9.2), ylim=(-0.15, 3.75), aspect="equal")
     axes.axis("off")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from _figures.common import FIGURES, GREY, dress, scenario
 from asammdf import MDF
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_hil.results.export import export_run
@@ -35,7 +34,6 @@ def from_mf4() -> None:
 
 def _draw(mdf: MDF) -> Figure:
     figure = Figure(figsize=(8.2, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
     *panels, strip = figure.subplots(
         len(_SHOWN) + 1, 1, sharex=True, height_ratios=[*(1 for _ in _SHOWN), 0.16]
     )

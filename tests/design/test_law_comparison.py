@@ -7,8 +7,15 @@ import pytest
 
 from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.law_comparison import as_it_is, gamma, late_loop, search, stands
-from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
+from gfm_design.tuning.law_comparison import (
+    ALPHA,
+    LateProblem,
+    as_it_is,
+    gamma,
+    late_loop,
+    search,
+    stands,
+)
 from gfm_design.tuning.law_comparison_modes import Culprit, culprit
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE

@@ -56,7 +56,9 @@ def test_state_space_of_a_weight(weight: Weight) -> None:
 
 def test_sampled_fast_leads_to_the_continuous_norm() -> None:
     p = PaperProblem(law_file("mimo-gfm"), (), T_s=1e-6)
-    for sampled, ideal in zip(p.sampled_channels(NONE), p.channels(NONE), strict=True):
+    for sampled, ideal in zip(
+        p.closed_loop(NONE).sampled(p.T_s).channels(), p.channels(NONE), strict=True
+    ):
         # half a microsecond of hold turns 6785 rad/s by 0.2 degrees
         assert sampled.norm == pytest.approx(ideal.norm, rel=0.02)
 

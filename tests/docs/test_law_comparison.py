@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.law_comparison import as_it_is, gamma
-from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
+from gfm_design.tuning.law_comparison import ALPHA, LateProblem, as_it_is, gamma
 from gfm_design.tuning.law_comparison_modes import Culprit
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.studies.law_comparison.row import LEFT_OUT, as_shipped

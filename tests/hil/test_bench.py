@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
+from gfm_hil.benchmark.c_code import compile_twin
 from gfm_hil.benchmark.contenders import FRAME, Contender
 from gfm_hil.benchmark.kernel import compare
-from gfm_hil.benchmark.kernel_twin import compile_twin
 from gfm_hil.benchmark.peers import has_iceoryx2
 from gfm_hil.cli import main
 from gfm_hil.cli.main import parser

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gfm_hil.benchmark.histogram import summary
 from gfm_hil.benchmark.page import write_page
 from gfm_hil.benchmark.plots import figures
 from gfm_hil.benchmark.rounds import Spread
-from gfm_hil.benchmark.spread import summary
 from gfm_hil.benchmark.tables import tables
 from gfm_hil.realtime.environment import caveats, environment
 
@@ -108,7 +108,7 @@ def read(content: dict[str, Any], folder: Path) -> Outline:
 
 def test_page_holds_every_table_and_figure(content: dict[str, Any], tmp_path: Path) -> None:
     page = read(content, tmp_path)
-    drawn = list(tables(content))
+    drawn = [table for _, table in tables(content)]
     assert page.tables == len(drawn) == 10
     for table in drawn:
         assert table.heading in page.text

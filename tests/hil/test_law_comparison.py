@@ -92,24 +92,6 @@ def test_mimo_gfm_with_other_gains_is_not_searched() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--laws", "no-such-law"], "not in the catalogue"),
-        (["--laws", "vsg-2,,mimo-gfm"], "none empty"),
-        (["--laws", "mimo-gfm-scheduled"], "first stage"),
-        (["--jobs", "0"], "at least 1"),
-        (["--seed", "-1"], "at least 0"),
-        (["--evaluations", "0"], "at least 1"),
-    ],
-)
-def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
-    assert main(["design", "compare", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
     ("value", "text"),
     [(None, "–"), (0.0, "0"), (1.42879, "1.43"), (-0.00132, "−0.00132"), (987.98, "988")],
 )

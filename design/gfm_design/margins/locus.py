@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
+from gfm_design.model.closed_loop import ClosedLoop, frequencies_near, response
 
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -42,9 +42,7 @@ class Locus:
     def __call__(self, omega: Matrix) -> Response:
         """H at omega [rad/s], shape (len(omega), m, m)."""
         z = np.exp(1j * omega * self.T_s)
-        eye = np.eye(len(self.A))
-        states = np.linalg.solve(z[:, None, None] * eye - self.A, self.B.astype(complex))
-        return np.asarray(self.C @ states + 0.5 * np.eye(len(self.channels)), complex)
+        return response((self.A, self.B, self.C, 0.5 * np.eye(len(self.channels))), z)
 
     def sampled(self) -> tuple[Matrix, Response]:
         """(omega, H(omega)) from 0 to the Nyquist frequency, as fine as the locus needs."""

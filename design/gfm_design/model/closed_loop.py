@@ -377,7 +377,7 @@ class ClosedLoop:
 
     def frequency_response(self, omega: ArrayLike) -> Response:
         """The closed loop from ``INPUTS`` to y at omega [rad/s] (K,), shape (K, 5, 7)."""
-        return _response(self.state_space, self._at(omega))
+        return response(self.state_space, self._at(omega))
 
     def loop_transfer(self, omega: ArrayLike, at_y: bool = False) -> Response:
         """L of all loops cut at u, or at y, so that S = (I + L)^-1; shape (K, 3, 3) or (K, 5, 5).
@@ -386,7 +386,7 @@ class ClosedLoop:
         """
         p, c, s = self.held, self.law, self._at(omega)
         zero = np.zeros((NY, NU))
-        plant, law = _response((p.A, p.B, p.C, zero), s), _response((c.A, c.B, c.C, c.D), s)
+        plant, law = response((p.A, p.B, p.C, zero), s), response((c.A, c.B, c.C, c.D), s)
         return -plant @ law if at_y else -law @ plant
 
     def loop_gain(self, at: str, omega: ArrayLike) -> Response:
@@ -443,15 +443,15 @@ class ClosedLoop:
         alone = LinearPlant(A, whole.B[rest], whole.B_d[rest], C, whole.C_true[:, rest])
         p = ClosedLoop(alone, self.law, self.T_s, self.u_delay, self.y_delay).held
         c, at = self.law, self._at(omega)
-        G = _response((p.A, p.B, p.C, np.zeros((NY, NU))), at)
-        K = _response((c.A, c.B, c.C, c.D), at)
-        y = _response((A, by_i, C, y_by_i), s) * np.exp(-s[:, None] * self.y_delay)[:, :, None]
+        G = response((p.A, p.B, p.C, np.zeros((NY, NU))), at)
+        K = response((c.A, c.B, c.C, c.D), at)
+        y = response((A, by_i, C, y_by_i), s) * np.exp(-s[:, None] * self.y_delay)[:, :, None]
         u = np.linalg.solve(np.eye(NU) - K @ G, K @ y)
         if self.T_s is not None:  # u acts late, and is held over the tick
             hold_at = (1.0 - np.exp(-s * self.T_s)) / (s * self.T_s)
             u = u * (hold_at[:, None] * np.exp(-s[:, None] * self.u_delay))[:, :, None]
         zero = np.zeros((2, NU + 2))
-        v_by = _response((A, np.hstack([alone.B, by_i]), v, zero), s)
+        v_by = response((A, np.hstack([alone.B, by_i]), v, zero), s)
         return -(v_by[..., NU:] + v_by[..., :NU] @ u)
 
     def _at(self, omega: ArrayLike) -> Response:
@@ -465,7 +465,7 @@ def frequencies_near(poles: Response) -> Matrix:
     return np.asarray(np.abs(poles.imag[:, None] + _ACROSS * poles.real[:, None]).ravel())
 
 
-def _response(of: StateSpace, s: Response) -> Response:
+def response(of: StateSpace, s: Response) -> Response:
     """C (s I - A)^-1 B + D, one a row of s."""
     A, B, C, D = of
     states = np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))

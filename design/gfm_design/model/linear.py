@@ -103,6 +103,10 @@ class Mode:
         size = float(np.hypot(self.sigma, 2 * np.pi * self.frequency_hz))
         return -self.sigma / size if size else 0.0
 
+    def plain(self) -> dict[str, float]:
+        """sigma [1/s], frequency_hz and ratio, for JSON."""
+        return {"sigma": self.sigma, "frequency_hz": self.frequency_hz, "ratio": self.ratio}
+
     @classmethod
     def of(cls, s: complex) -> Mode:
         """The mode of a pole s [1/s]."""

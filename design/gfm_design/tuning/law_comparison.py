@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 from gfm_design.margins.delays import DelayMargin, overall_delay
 from gfm_design.margins.tolerance import Range, element_range
 from gfm_design.model.closed_loop import T_S, ClosedLoop
-from gfm_design.model.linear import Mode
+from gfm_design.model.linear import LinearLaw, Mode
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
-from gfm_design.tuning.gains import FreeGain, free_gains
-from gfm_design.tuning.law_comparison_late import ALPHA, LateProblem
+from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
 from gfm_design.tuning.law_comparison_modes import Culprit, culprit
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import tune_paper
-from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune
+from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
 from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law
 
@@ -39,6 +38,9 @@ _SAME_GAMMA = 1e-4  # relative; by so much a gain may change gamma that makes no
 _NEAR = 0.99  # of the decay asked for
 _SAME = 0.03  # relative; so much the others must not cost a channel that is pinned
 _SETTLES = 3
+
+ALPHA = 1.0  # 1/s
+_SHARES = (1.0, 0.3, 0.1)  # of a polish's step that are tried
 
 Pair = tuple[int, int]  # i, j of a channel
 After = tuple[Channel, ...] | Culprit
@@ -54,7 +56,7 @@ class Found:
         before: channels of the file's own gains, or the mode that grows with them.
         ideal: channels of the gains with the least gamma, whether they can be run or not.
         gains: the least gamma of gains that hold sampled and one sample late
-            (``tuning.law_comparison_late``), with what is tied to them; None if nothing does.
+            (``LateProblem``), with what is tied to them; None if nothing does.
         after: their channels; or the mode in the way, of what came closest.
         fixed: channels (i, j) whose norm, at omega = 0 or infinity, no gains that hold can lower,
             the largest first; the gains were chosen for the least of the others.
@@ -87,6 +89,53 @@ class Stands:
     delay: DelayMargin
     L_g: Range | None
     R: Range | None
+
+
+class LateProblem:
+    """The paper's problem for gains that can be run: the loop must hold one sample late.
+
+    A problem for ``synthesis.tune``: gamma of the ideal continuous loop; gains whose sampled loop
+    decays too slowly, or grows, count as unstable. Without that, the search may end at gains that
+    the kernel cannot run: sampling alone takes the LC resonance, lightly damped by the choke,
+    across the border.
+
+    Args:
+        paper: gamma.
+        alpha: every mode decays at least so fast, 1/s.
+    """
+
+    def __init__(self, paper: PaperProblem, alpha: float = ALPHA) -> None:
+        self.paper, self._alpha = paper, alpha
+
+    def sigma(self, values: Vector) -> Vector:
+        """Largest real part of any mode, 1/s, of sets of gains, one a row; inf where no law."""
+        law, late = self.paper.law(values), self.paper.late
+        good = np.isfinite(law.A).all(axis=(1, 2)) & np.isfinite(law.D).all(axis=(1, 2))
+        out = np.full(len(values), np.inf)
+        if good.any():
+            some = LinearLaw(*(m[good] for m in law.matrices)).sampled(self.paper.T_s)
+            out[good] = late.with_law(some).sigma()
+        return out
+
+    def __call__(self, values: Vector) -> float:
+        """gamma, or what gains cost that do not hold."""
+        return float(self.many(values[None, :])[0])
+
+    def many(self, values: Vector) -> Vector:
+        """Costs of several, one a row."""
+        costs = self.paper.many(values)
+        stable = np.flatnonzero(costs < UNSTABLE)
+        if len(stable):
+            missing = self.sigma(values[stable]) + self._alpha
+            costs[stable] = np.where(missing > 0.0, unstable_cost(missing), costs[stable])
+        return costs
+
+    def polish(self, code: Encoding, point: Vector) -> Vector:
+        """As far towards a lower gamma nearby as the loop holds."""
+        step = self.paper.polish(code, point) - point
+        tried = np.array([point, *(point + share * step for share in _SHARES)])
+        best: Vector = tried[np.argmin(self.many(code.values(tried)))]
+        return best
 
 
 def search(

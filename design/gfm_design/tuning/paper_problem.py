@@ -113,11 +113,3 @@ class PaperProblem:
     def channels(self, values: Vector) -> tuple[Channel, ...]:
         """Every channel's norm, guaranteed. Raises ``Unstable``."""
         return self.closed_loop(values).channels(self.weights)
-
-    def sampled_channels(self, values: Vector) -> tuple[Channel, ...]:
-        """As ``channels`` of the loop at T_s: law by Tustin, u and w held over each tick, no delay.
-
-        Raises:
-            Unstable: the sampled loop is not stable.
-        """
-        return self.closed_loop(values).sampled(self.T_s).channels(self.weights)

@@ -7,7 +7,16 @@ import os
 import shlex
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from gfm_runtime.c_header import c_header
+
+Drive = Callable[..., None]
 
 SOURCES = Path(__file__).parent
 FLAGS = "-O3"
@@ -54,11 +63,25 @@ def load_c(library: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(library))
 
 
-def version_line() -> str:
-    """First line of the compiler's version output.
+def compile_twin(folder: Path, real: DTypeLike, flags: str = FLAGS) -> Drive:
+    """Compile ``drive`` of kernel_step.c, the kernel's step in C, for float64 or float32.
+
+    It has the arguments of ``gfm_hil.benchmark.kernel.drive``; arrays are passed by address,
+    without a copy.
 
     Raises:
-        NoCompiler: there is none.
+        NoCompiler: there is none, or it fails.
     """
-    done = subprocess.run([compiler(), "--version"], capture_output=True, text=True, check=True)
-    return done.stdout.splitlines()[0]
+    dtype = np.dtype(real)
+    (folder / "law.h").write_text(c_header(dtype), encoding="utf-8")
+    function = load_c(compile_c("kernel_step.c", folder, f"twin_{dtype}", flags)).drive
+    scalar = ctypes.c_double if dtype == np.float64 else ctypes.c_float
+    function.argtypes = [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [scalar]
+    function.restype = None
+
+    def drive(*arguments: Any) -> None:
+        *arrays, steps, feedback = arguments
+        inputs: NDArray[Any] = arrays[3]
+        function(*(a.ctypes.data for a in arrays), len(inputs), steps, feedback)
+
+    return drive

@@ -8,7 +8,6 @@ machine right before and after.
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import time
 from collections import Counter
@@ -26,11 +25,11 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.attribution import OURS, attribute, bursts, counts, missed_ticks
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.cpu_load import Load, cpu_load
+from gfm_hil.benchmark.histogram import summary
 from gfm_hil.benchmark.inproc_loop import Loop
 from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
-from gfm_hil.benchmark.pair import Policy, pair
-from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, rounds
-from gfm_hil.benchmark.spread import summary
+from gfm_hil.benchmark.pair import pair
+from gfm_hil.benchmark.rounds import RUNS, Plan, Spread, quickest, rounds
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links import link_kind, open_link
@@ -48,20 +47,6 @@ COMPLETED = "completed"
 Tell = Callable[[str, float], None]
 Found = tuple[list[dict[str, Any]], list[str]]  # rows and remarks
 Timing = dict[str, NDArray[np.int64]]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What to measure: links, loads and policy of real time, s and rounds of both modes (fewer
-    rounds if they would not end by ``until``)."""
-
-    links: Sequence[str]
-    loads: Sequence[Load]
-    policy: Policy
-    lockstep_s: float
-    realtime_s: float
-    rounds: int
-    until: float = math.inf
 
 
 @dataclass
@@ -112,7 +97,7 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
     names = [(INPROC, 0), *((link, delay) for link in plan.links for delay in (0, 1))]
     rates: dict[tuple[str, int], list[float]] = {name: [] for name in names}
     shares: dict[tuple[str, int], list[float]] = {name: [] for name in names}
-    ticks = round(plan.lockstep_s / T_S)
+    ticks = round(plan.seconds / T_S)
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = Loop("pref_step", LAW, _SHORT, place / "inproc")
@@ -126,7 +111,7 @@ def measure_lockstep(plan: Plan, tell: Tell) -> Found:
                     stretches = [alone.whole() for _ in range(RUNS)]
                     tick_ns = fmean(stretches)
                 else:
-                    scenario = _scenario(link, "lockstep", plan.lockstep_s, delay)
+                    scenario = _scenario(link, "lockstep", plan.seconds, delay)
                     timing, _, ended = _run(scenario, place)
                     if ended != COMPLETED:
                         remarks.append(f"{link}, lockstep: a run ended early: {ended}")
@@ -163,7 +148,7 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
     with ExitStack() as stack:
         place = memory_folder(stack)
         load_is = stack.enter_context(cpu_load())
-        two = stack.enter_context(pair(plan.policy, place))
+        two = stack.enter_context(pair(plan.policies[0], place))
         two.both(pace_here, 0, 1, HYBRID, 1)
         for number in rounds(plan.rounds, plan.until):
             for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
@@ -172,9 +157,9 @@ def measure_realtime(plan: Plan, tell: Tell) -> Found:
 
                 def pace(load: Load = cell.load) -> NDArray[np.int64]:
                     with load_is(load):
-                        return pace_both(two, round(T_S * 1e9), HYBRID, plan.realtime_s / 2)
+                        return pace_both(two, round(T_S * 1e9), HYBRID, plan.seconds / 2)
 
-                scenario = _scenario(cell.link, "realtime", plan.realtime_s)
+                scenario = _scenario(cell.link, "realtime", plan.seconds)
                 beside = partial(load_is, cell.load) if cell.load != "idle" else None
                 cell.runs.append(_observe(scenario, place, pace, beside))
     remarks = [

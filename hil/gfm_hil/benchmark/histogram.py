@@ -1,4 +1,4 @@
-"""Log-linear histogram of times: constant relative resolution from 1 ns to 2.3 hours.
+"""Percentiles of times by a log-linear histogram of constant resolution, from 1 ns to 2.3 hours.
 
 As in HdrHistogram: below 2^``BITS`` ns every value has its own bucket; above, each octave is
 divided into 2^(``BITS`` - 1) buckets, so that a bucket is at most 1/64 of its value wide.
@@ -7,11 +7,10 @@ divided into 2^(``BITS`` - 1) buckets, so that a bucket is at most 1/64 of its v
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from gfm_runtime.compiled import cached
 
 BITS = 7
 _HALF = 1 << (BITS - 1)
@@ -19,25 +18,18 @@ _OCTAVES = 36  # above the linear part
 BUCKETS = (_OCTAVES + 2) * _HALF
 RESOLUTION = 1 / _HALF  # largest width of a bucket relative to its lower end
 
+SHARES = {"p50": 0.5, "p90": 0.9, "p99": 0.99, "p99_9": 0.999, "p99_99": 0.9999, "max": 1.0}
+_BY_ROUND = ("p50", "p90", "p99")
+
 Counts = NDArray[np.int64]
 
 
-@cached
-def record(counts, times_ns):
-    """Count every time of ``times_ns`` (n,) in ``counts`` (BUCKETS,); longer ones in the last."""
-    for t in times_ns:
-        v, octave = max(t, 0), 0
-        while v >= 2 * _HALF:
-            v >>= 1
-            octave += 1
-        counts[min(octave * _HALF + v, BUCKETS - 1)] += 1
-
-
 def histogram(times_ns: NDArray[np.int64]) -> Counts:
-    """A new histogram of times in ns."""
-    counts = np.zeros(BUCKETS, np.int64)
-    record(counts, times_ns)
-    return counts
+    """The histogram of times in ns, shape (BUCKETS,); those beyond count in the last bucket."""
+    times = np.maximum(times_ns, 0)
+    octave = np.maximum(np.frexp(times)[1] - BITS, 0)
+    buckets = np.minimum(octave * _HALF + (times >> octave), BUCKETS - 1)
+    return np.bincount(buckets, minlength=BUCKETS)
 
 
 def lower_ends() -> NDArray[np.float64]:
@@ -72,3 +64,27 @@ def dense(pairs: Sequence[Sequence[int]]) -> Counts:
     for k, n in pairs:
         counts[k] = n
     return counts
+
+
+def summary(rounds: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
+    """``n``, ``<percentile>_us``, ``rounds_p50_us`` and ``histogram`` of rounds of times in ns.
+
+    p50, p90 and p99 are medians over the rounds; from p99.9 on a round has too few times, so these
+    percentiles and the histogram are of all rounds together. Rounds without times are ignored; None
+    stands for an unknown value.
+    """
+    counts = [histogram(times) for times in rounds if len(times)]
+    found: dict[str, Any] = {f"{name}_us": None for name in SHARES}
+    found |= {"n": 0, "rounds_p50_us": [], "histogram": []}
+    if not counts:
+        return found
+    each = np.array([quantiles(some, list(SHARES.values())) for some in counts]) / 1e3
+    whole: Counts = np.sum(counts, axis=0)
+    over_all = np.array(quantiles(whole, list(SHARES.values()))) / 1e3
+    for k, name in enumerate(SHARES):
+        value = np.median(each[:, k]) if name in _BY_ROUND else over_all[k]
+        found[f"{name}_us"] = round(float(value), 3)
+    found["n"] = int(whole.sum())
+    found["rounds_p50_us"] = [round(float(x), 4) for x in each[:, 0]]
+    found["histogram"] = sparse(whole)
+    return found

@@ -6,12 +6,10 @@ the ticks lost here: they are the host's share of the misses.
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,15 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.attribution import bursts
 from gfm_hil.benchmark.contenders import memory_folder
 from gfm_hil.benchmark.cpu_load import Load, cpu_load
+from gfm_hil.benchmark.histogram import summary
 from gfm_hil.benchmark.pair import Pair, Policy, pair
-from gfm_hil.benchmark.rounds import rounds
-from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.benchmark.rounds import REST, Plan, rounds
 from gfm_hil.realtime.clock import now_ns, sleep_until, wait_until
 from gfm_runtime.compiled import cached
 
 HYBRID, SPIN, SLEEP = range(3)
 WAITS = {"sleep+spin": HYBRID, "spin": SPIN, "nanosleep": SLEEP}
+PERIOD_NS = 100_000
 _LEAD_NS = 2_000_000  # between the call and the first deadline
 
 
@@ -64,25 +63,11 @@ def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
     return np.flatnonzero((late > allowed_ns).any(axis=0))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to measure: ways to wait, loads, policies, period in ns, s of a round, rounds of each
-    (fewer if they would not end by ``until``)."""
-
-    waits: Sequence[str]
-    loads: Sequence[Load]
-    policies: Sequence[Policy]
-    period_ns: int
-    seconds: float
-    rounds: int
-    until: float = math.inf
-
-
 def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, Any]]:
     """Measure; returns one row per way to wait, load and policy."""
     cells: dict[tuple[Policy, Load, str], list[NDArray[np.int64]]] = {
         (policy, load, wait): []
-        for policy in plan.policies for load in plan.loads for wait in plan.waits
+        for policy in plan.policies for load in plan.loads for wait in WAITS
     }  # fmt: skip
     with ExitStack() as stack:
         load_is = stack.enter_context(cpu_load())
@@ -96,13 +81,13 @@ def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, An
             for n, (policy, load, wait) in enumerate(list(cells)[:: -1 if number % 2 else 1]):
                 tell(f"{policy}, {load}, {wait}", (number + n / len(cells)) / plan.rounds)
                 with load_is(load):
-                    late = pace_both(two[policy], plan.period_ns, WAITS[wait], plan.seconds)
+                    late = pace_both(two[policy], PERIOD_NS, WAITS[wait], plan.seconds)
                 cells[policy, load, wait].append(late)
                 time.sleep(REST * plan.seconds)
     return [
-        {"policy": policy, "load": load, "wait": wait, "period_us": plan.period_ns / 1e3}
+        {"policy": policy, "load": load, "wait": wait, "period_us": PERIOD_NS / 1e3}
         | summary([late.ravel() for late in found])
-        | _lost(found, plan.period_ns)
+        | _lost(found, PERIOD_NS)
         for (policy, load, wait), found in cells.items()
     ]
 

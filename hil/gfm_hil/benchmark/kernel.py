@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_hil.benchmark.c_code import FLAGS, NoCompiler
-from gfm_hil.benchmark.kernel_twin import Drive, compile_twin
+from gfm_hil.benchmark.c_code import FLAGS, Drive, NoCompiler, compile_twin
 from gfm_hil.benchmark.rounds import Spread, quickest, ratio, seconds, take_turns
 from gfm_runtime import discretise, get_law
 from gfm_runtime.compiled import compiled

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -15,9 +14,9 @@ from numpy.typing import NDArray
 from gfm_hil.benchmark.c_code import NoCompiler, compile_c
 from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
 from gfm_hil.benchmark.cpu_load import Load, cpu_load
-from gfm_hil.benchmark.pair import Policy, pair
-from gfm_hil.benchmark.rounds import rounds
-from gfm_hil.benchmark.spread import REST, summary
+from gfm_hil.benchmark.histogram import summary
+from gfm_hil.benchmark.pair import pair
+from gfm_hil.benchmark.rounds import REST, Plan, rounds
 from gfm_hil.core.errors import UserError
 
 Mode = Literal["lockstep", "realtime"]
@@ -27,30 +26,6 @@ PERIOD_NS = 100_000
 _FIRST_S = 0.02  # length of the warm-up round
 
 Tell = Callable[[str, float], None]  # present work and share done
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What to measure.
-
-    Attributes:
-        links: names.
-        modes: lockstep: one round trip after the other; realtime: one every 100 µs.
-        loads: idle, or busy: with a CPU load on each processor.
-        policy: scheduling of the two processes.
-        payload: bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back.
-        seconds: of one round.
-        rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
-    """
-
-    links: Sequence[str]
-    modes: Sequence[Mode]
-    loads: Sequence[Load]
-    policy: Policy
-    payload: int
-    seconds: float
-    rounds: int
-    until: float = math.inf
 
 
 @dataclass
@@ -84,7 +59,7 @@ def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
             library = None
             remarks.append(f"{problem}: no limits in C, no ratios")
         contenders = of_links(list(plan.links), place, library)
-        two = stack.enter_context(pair(plan.policy, place))
+        two = stack.enter_context(pair(plan.policies[0], place))
         load = stack.enter_context(cpu_load())
         cells = []
         for contender in contenders:
@@ -129,7 +104,7 @@ def _result(cell: _Cell, baseline: _Cell | None, plan: Plan) -> dict[str, Any]:
         "code": "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python"),
         "mode": cell.mode,
         "load": cell.load,
-        "policy": plan.policy,
+        "policy": plan.policies[0],
         "payload": plan.payload,
         **summary(list(cell.rounds.values())),
         "baseline": c.baseline or None,

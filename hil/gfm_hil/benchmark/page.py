@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from gfm_hil.benchmark import tables
 from gfm_hil.benchmark.plots import figures
+from gfm_hil.results.report import html_table
 
 _STYLE = """
 body{font:15px/1.55 system-ui,sans-serif;max-width:76rem;margin:2rem auto;padding:0 1.2rem;
@@ -81,8 +81,8 @@ def write_page(content: dict[str, Any], path: Path) -> None:
     for name, svg in made.items():
         path.with_name(f"{name}.svg").write_bytes(svg)
     by_section: dict[str, list[str]] = {name: [] for name in _SECTIONS}
-    for section, table in _tables(content):
-        by_section[section].append(_table(table))
+    for section, table in tables.tables(content):
+        by_section[section].append(html_table(table.columns, table.rows, table.heading))
     parts = []
     for name, (heading, text) in _SECTIONS.items():
         if not by_section[name]:
@@ -169,28 +169,3 @@ def _cards(content: dict[str, Any]) -> str:
 def _compared(row: dict[str, Any]) -> str:
     ratio = row["ratio_to_baseline_p50"]
     return f"{row['name']}: round trip" + (f", {tables.times(ratio)} the limit" if ratio else "")
-
-
-def _tables(content: dict[str, Any]) -> Iterator[tuple[str, tables.Table]]:
-    for table in tables.latency_tables(content["results"]):
-        yield "latency", table
-    loop = content.get("loop", {})
-    if "realtime" in loop:
-        yield "misses", tables.realtime_table(loop["realtime"])
-        yield "misses", tables.causes_table(loop["realtime"])
-    if "jitter" in content:
-        yield "jitter", tables.jitter_table(content["jitter"])
-    if "lockstep" in loop:
-        yield "lockstep", tables.lockstep_table(loop["lockstep"])
-        yield "lockstep", tables.laws_table(loop["laws"])
-    if "kernel" in content:
-        yield "kernel", tables.kernel_table(content["kernel"])
-
-
-def _table(table: tables.Table) -> str:
-    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in table.rows
-    )
-    caption = f"<caption>{html.escape(table.heading)}</caption>"
-    return f'<div class="scroll"><table>{caption}<tr>{head}</tr>{body}</table></div>'

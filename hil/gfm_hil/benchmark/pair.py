@@ -18,7 +18,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.contenders import Contender, End
+from gfm_hil.benchmark.contenders import CEnd, Contender
+from gfm_hil.benchmark.pingpong import LinkEnd
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
@@ -31,7 +32,7 @@ WARM_NS = 20_000_000
 
 # state in each of the two processes
 _role: Role = "plant"
-_ends: dict[str, End] = {}
+_ends: dict[str, LinkEnd | CEnd] = {}
 _took = np.zeros(0, np.int64)
 _stop = np.zeros(1, np.int64)
 

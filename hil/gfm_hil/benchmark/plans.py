@@ -8,13 +8,16 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gfm_hil.benchmark import closed_loop, inproc_loop, jitter, kernel, latency
+from gfm_hil.benchmark.c_code import FLAGS
 from gfm_hil.benchmark.contenders import FRAME, check_links
 from gfm_hil.benchmark.cpu_load import LOADS
 from gfm_hil.benchmark.pair import Policy
+from gfm_hil.benchmark.rounds import Plan
 from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.environment import may_sched_fifo
 from gfm_runtime import get_law, law_names
@@ -22,15 +25,14 @@ from gfm_runtime import get_law, law_names
 Tell = Callable[[str, float], None]
 Step = Callable[[dict[str, Any], Tell], None]
 
-_PERIOD_NS = 100_000
 _STEPS = 10_000  # of the kernel in a short run
 _TICKS = 2_000  # of the loop in process in a short run
 _FEW_LAWS = ("mimo-gfm", "vsg-2", "droop-2")  # of the loop in `all`
 
-#: `all` measures less of these, so that it takes three minutes
-_ALL = {
-    "mode": "lockstep,realtime", "load": "idle,busy", "policy": "auto", "payload": FRAME,
-    "laws": None, "cflags": "-O3",
+#: of options that a kind of benchmark does not have
+_DEFAULTS = {
+    "links": None, "mode": "lockstep,realtime", "load": "idle,busy", "policy": "auto",
+    "payload": FRAME, "laws": None, "cflags": FLAGS, "seconds": 0.1, "until": math.inf,
 }  # fmt: skip
 
 
@@ -40,110 +42,74 @@ def steps_of(options: Namespace) -> list[Step]:
     Raises:
         UserError: an option is invalid.
     """
-    if options.kind == "all":
-        return _everything(options)
-    make = {"latency": _latency, "jitter": _jitter, "kernel": _kernel, "loop": _loop}
-    return [make[options.kind](options)]
+    if options.kind != "all":
+        measure = {"latency": _latency, "jitter": _jitter, "kernel": _kernel, "loop": _loop}
+        seconds = (0.1, 3600) if options.kind == "loop" else (0.01, 60)
+        return [partial(measure[options.kind], _plan(options, seconds))]
+    # three minutes: each part ends in time, with fewer rounds if necessary
+    now, few = time.monotonic(), ",".join(_FEW_LAWS)
 
+    def part(measure: Callable[..., None], until: float = math.inf, **numbers: Any) -> Step:
+        return partial(measure, _plan(options, until=now + until, **numbers))
 
-def _everything(options: Namespace) -> list[Step]:
-    """Three minutes: each part ends in time, with fewer rounds if necessary."""
-    begin = time.monotonic()
-
-    def with_(**numbers: Any) -> Namespace:
-        return Namespace(**{**_ALL, **vars(options), **numbers})
-
-    few = ",".join(_FEW_LAWS)
     return [
-        _latency(with_(seconds=0.1, rounds=5, until=begin + 45.0)),
-        _jitter(with_(seconds=0.1, rounds=5, until=begin + 62.0)),
-        _kernel(with_(rounds=2)),
-        _loop(with_(mode="lockstep", seconds=3.0, rounds=5, until=begin + 115.0, laws=few)),
-        _loop(with_(mode="realtime", seconds=1.5, rounds=2, until=begin + 150.0)),
+        part(_latency, seconds=0.1, rounds=5, until=45.0),
+        part(_jitter, seconds=0.1, rounds=5, until=62.0),
+        part(_kernel, rounds=2),
+        part(_loop, mode="lockstep", seconds=3.0, rounds=5, until=115.0, laws=few),
+        part(_loop, mode="realtime", seconds=1.5, rounds=2, until=150.0),
     ]
 
 
-def _latency(options: Namespace) -> Step:
-    plan = latency.Plan(
-        links=check_links(split("--links", options.links)),
-        modes=split("--mode", options.mode, latency.MODES),
-        loads=split("--load", options.load, LOADS),
-        policy=policies(options.policy)[0],
-        payload=within("--payload", options.payload, 1, 504),
-        seconds=within("--seconds", options.seconds, 0.01, 60),
-        rounds=within("--rounds", options.rounds, 1, 1000),
-        until=getattr(options, "until", math.inf),
+def _plan(options: Namespace, allowed: tuple[float, float] = (0.01, 60), **numbers: Any) -> Plan:
+    """What the options ask for, with other ``numbers``; ``allowed`` is the range of a round, s."""
+    given = {key: value for key, value in vars(options).items() if value is not None}
+    o = Namespace(**(_DEFAULTS | given | numbers))
+    return Plan(
+        links=check_links(split("--links", o.links)) if o.links is not None else [],
+        modes=split("--mode", o.mode, latency.MODES),
+        loads=split("--load", o.load, LOADS),
+        policies=policies(o.policy),
+        payload=within("--payload", o.payload, 1, 504),
+        laws=laws(o.laws),
+        cflags=o.cflags,
+        seconds=within("--seconds", o.seconds, *allowed),
+        rounds=within("--rounds", o.rounds, 1, 1000),
+        until=o.until,
     )
 
-    def step(content: dict[str, Any], tell: Tell) -> None:
-        rows, remarks = latency.measure(plan, tell)
-        content["results"] += rows
+
+def _latency(plan: Plan, content: dict[str, Any], tell: Tell) -> None:
+    rows, remarks = latency.measure(plan, tell)
+    content["results"] += rows
+    content["remarks"] += remarks
+
+
+def _jitter(plan: Plan, content: dict[str, Any], tell: Tell) -> None:
+    content["jitter"] = jitter.measure(plan, tell)
+
+
+def _kernel(plan: Plan, content: dict[str, Any], tell: Tell) -> None:
+    names = plan.laws or list(law_names())
+    content["kernel"], remarks = kernel.measure(names, _STEPS, plan.rounds, tell, plan.cflags)
+    content["remarks"] += remarks
+
+
+def _loop(plan: Plan, content: dict[str, Any], tell: Tell) -> None:
+    found: dict[str, Any] = content.setdefault("loop", {})
+    tell("trying the links", 0.0)
+    usable, remarks = closed_loop.usable(plan.links)
+    content["remarks"] += [one for one in remarks if one not in content["remarks"]]
+    plan = replace(plan, links=usable)
+    if "lockstep" in plan.modes:
+        names = plan.laws or list(inproc_loop.LAWS)
+        with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
+            found["laws"] = inproc_loop.measure(names, _TICKS, plan.rounds, Path(place), tell)
+        found["lockstep"], remarks = closed_loop.measure_lockstep(plan, tell)
         content["remarks"] += remarks
-
-    return step
-
-
-def _jitter(options: Namespace) -> Step:
-    plan = jitter.Plan(
-        waits=list(jitter.WAITS),
-        loads=split("--load", options.load, LOADS),
-        policies=policies(options.policy),
-        period_ns=_PERIOD_NS,
-        seconds=within("--seconds", options.seconds, 0.01, 60),
-        rounds=within("--rounds", options.rounds, 1, 1000),
-        until=getattr(options, "until", math.inf),
-    )
-
-    def step(content: dict[str, Any], tell: Tell) -> None:
-        content["jitter"] = jitter.measure(plan, tell)
-
-    return step
-
-
-def _kernel(options: Namespace) -> Step:
-    names = laws(options.laws) or list(law_names())
-    rounds = within("--rounds", options.rounds, 1, 1000)
-
-    def step(content: dict[str, Any], tell: Tell) -> None:
-        rows, remarks = kernel.measure(names, _STEPS, rounds, tell, options.cflags)
-        content["kernel"] = rows
+    if "realtime" in plan.modes:
+        found["realtime"], remarks = closed_loop.measure_realtime(plan, tell)
         content["remarks"] += remarks
-
-    return step
-
-
-def _loop(options: Namespace) -> Step:
-    names = laws(options.laws) or list(inproc_loop.LAWS)
-    modes = split("--mode", options.mode, latency.MODES)
-    seconds = within("--seconds", options.seconds, 0.1, 3600)
-    links = check_links(split("--links", options.links))
-    asked = closed_loop.Plan(
-        links=links,
-        loads=split("--load", options.load, LOADS),
-        policy=policies("auto")[0],
-        lockstep_s=seconds,
-        realtime_s=seconds,
-        rounds=within("--rounds", options.rounds, 1, 1000),
-        until=getattr(options, "until", math.inf),
-    )
-
-    def step(content: dict[str, Any], tell: Tell) -> None:
-        found: dict[str, Any] = content.setdefault("loop", {})
-        tell("trying the links", 0.0)
-        usable, remarks = closed_loop.usable(links)
-        content["remarks"] += [one for one in remarks if one not in content["remarks"]]
-        plan = replace(asked, links=usable)
-        if "lockstep" in modes:
-            with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
-                turns = plan.rounds
-                found["laws"] = inproc_loop.measure(names, _TICKS, turns, Path(place), tell)
-            found["lockstep"], remarks = closed_loop.measure_lockstep(plan, tell)
-            content["remarks"] += remarks
-        if "realtime" in modes:
-            found["realtime"], remarks = closed_loop.measure_realtime(plan, tell)
-            content["remarks"] += remarks
-
-    return step
 
 
 def split(option: str, text: str, allowed: Sequence[Any] | None = None) -> list[Any]:

@@ -9,16 +9,15 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.benchmark.attribution import CAUSES
 from gfm_hil.benchmark.histogram import dense, lower_ends
 from gfm_hil.benchmark.tables import lockstep_name
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 
-_GREY, _TEXT = "#888888", "#222222"
+_GREY = "#888888"
 _BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS
 _CAUSE_COLOURS = dict(zip(CAUSES, (_BLUE, _ORANGE, _SKY, "#b8b8b8"), strict=True))
 _LINK_COLOURS = {"shm": _BLUE, "zmq": _RED, "can": _GREEN, "udp": _GREEN}
@@ -39,22 +38,10 @@ def figures(content: dict[str, Any]) -> dict[str, bytes]:
 
 
 def _svg(figure: Figure) -> bytes:
-    FigureCanvasAgg(figure)
     out = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "gfmhil"}):  # equal results give equal bytes
         figure.savefig(out, format="svg", metadata={"Date": None})
     return out.getvalue()
-
-
-def _plain(axes: Axes, heading: str) -> None:
-    axes.set_title(heading, loc="left", fontsize=9.5, color=_TEXT)
-    axes.grid(True, color="#e4e4e4", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8.5, color=_GREY)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(_GREY)
 
 
 def _curve(row: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -97,7 +84,7 @@ def _panels(
             some = [r for r in rows if (r[keys[0]], r[keys[1]]) == (first, second)]
             for k, row in enumerate(some):
                 draw(grid[i][j], row, k)
-            _plain(grid[i][j], heading(first, second))
+            dress(grid[i][j], heading(first, second))
             _percentile_axis(grid[i][j], nines)
             if i + 1 < len(down):
                 grid[i][j].set_xlabel("")
@@ -155,7 +142,7 @@ def _misses(rows: list[dict[str, Any]]) -> Figure:
     left.scatter(host, y, marker="|", s=260, color=_BLACK, label="a loop that only paces")
     left.set_yticks(y, labels)
     left.set_xlim(left=0)
-    _plain(left, "ticks without a fresh u [%], by cause")
+    dress(left, "ticks without a fresh u [%], by cause")
     left.legend(fontsize=8, frameon=False, loc="best")
     for k, row in enumerate(rows):
         if row["bursts"]:
@@ -169,7 +156,7 @@ def _misses(rows: list[dict[str, Any]]) -> Figure:
     for axis in (right.xaxis, right.yaxis):
         axis.set_major_formatter(lambda x, _: f"{x:g}")
     right.set_xlabel("ticks in a row that were missed", fontsize=9)
-    _plain(right, "bursts: how many of each length")
+    dress(right, "bursts: how many of each length")
     if right.get_legend_handles_labels()[1]:
         right.legend(fontsize=8, frameon=False, loc="upper right")
     return figure
@@ -194,7 +181,7 @@ def _lockstep(rows: list[dict[str, Any]]) -> Figure:
         f"{rate:.3g} × ({r['share_of_plant_alone']['median']:.0%} of the plant alone)"
         for r, rate in zip(rows, rates, strict=True)
     ]
-    _plain(axes, "closed loop in lockstep, times real time at 10 kHz")
+    dress(axes, "closed loop in lockstep, times real time at 10 kHz")
     _bars(axes, [lockstep_name(r) for r in rows], rates, texts)
     axes.axvline(1.0, color=_BLACK, lw=0.9, ls=(0, (4, 3)))
     axes.set_xscale("log")
@@ -209,7 +196,7 @@ def _kernel(rows: list[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(8.2, 1.0 + 0.19 * len(rows)), layout="constrained")
     axes = figure.subplots()
     y = np.arange(len(rows))
-    _plain(axes, f"one step of the kernel [ns], {rows[0]['real']}")
+    dress(axes, f"one step of the kernel [ns], {rows[0]['real']}")
     axes.scatter([r["numba_ns"]["median"] for r in rows], y, s=26, color=_BLUE, label="numba")
     if rows[0]["c_ns"]:
         limits = [r["c_ns"]["median"] for r in rows]

@@ -11,9 +11,40 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Literal
+
+from gfm_hil.benchmark.cpu_load import Load
+from gfm_hil.benchmark.pair import Policy
 
 RUNS = 20  # in a turn
+REST = 0.15  # of a round: the kernel takes 5 % of each second from SCHED_FIFO that only spins
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure; a benchmark uses those that concern it.
+
+    Attributes:
+        links, laws: names; no laws: the benchmark's own choice.
+        modes: lockstep: one round trip after the other; realtime: one every 100 µs.
+        loads: idle, or busy: with a CPU load on each processor.
+        policies: scheduling of the two processes, the best one first.
+        payload: bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back.
+        cflags: for the C compiler.
+        seconds: of one round.
+        rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
+    """
+
+    links: Sequence[str]
+    modes: Sequence[Literal["lockstep", "realtime"]]
+    loads: Sequence[Load]
+    policies: Sequence[Policy]
+    payload: int
+    laws: Sequence[str]
+    cflags: str
+    seconds: float
+    rounds: int
+    until: float
 
 
 @dataclass(frozen=True)

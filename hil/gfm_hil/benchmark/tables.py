@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-PERCENTILES = ("p50", "p90", "p99", "p99_9", "p99_99", "max")
+from gfm_hil.benchmark.histogram import SHARES
+
+PERCENTILES = tuple(SHARES)
 
 
 @dataclass(frozen=True)
@@ -42,20 +44,21 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def tables(content: dict[str, Any]) -> Iterator[Table]:
-    """All tables of a result."""
-    yield from latency_tables(content["results"])
-    if "jitter" in content:
-        yield jitter_table(content["jitter"])
+def tables(content: dict[str, Any]) -> Iterator[tuple[str, Table]]:
+    """All tables of a result, each with its section of the page."""
+    for table in latency_tables(content["results"]):
+        yield "latency", table
     loop = content.get("loop", {})
     if "realtime" in loop:
-        yield realtime_table(loop["realtime"])
-        yield causes_table(loop["realtime"])
+        yield "misses", realtime_table(loop["realtime"])
+        yield "misses", causes_table(loop["realtime"])
+    if "jitter" in content:
+        yield "jitter", jitter_table(content["jitter"])
     if "lockstep" in loop:
-        yield lockstep_table(loop["lockstep"])
-        yield laws_table(loop["laws"])
+        yield "lockstep", lockstep_table(loop["lockstep"])
+        yield "lockstep", laws_table(loop["laws"])
     if "kernel" in content:
-        yield kernel_table(content["kernel"])
+        yield "kernel", kernel_table(content["kernel"])
 
 
 def latency_tables(rows: list[dict[str, Any]]) -> Iterator[Table]:

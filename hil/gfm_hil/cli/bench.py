@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-from rich.table import Table
+from rich.progress import BarColumn, TaskProgressColumn
 
-from gfm_hil.cli.common import new_folder
-from gfm_hil.core.terminal import terminal
+from gfm_hil.cli.common import new_folder, progress
+from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.links import link_names
 from gfm_hil.results.run_folder import check_free
 
@@ -23,38 +22,66 @@ _WIDTH = 100  # columns: a table cut short is no use in a file
 Tell = Callable[[str, float], None]
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("bench")
-    kinds = command.add_subparsers(dest="kind", required=True, metavar="WHAT")
-
-    def kind(name: str, text: str, *options: Callable[[argparse.ArgumentParser], None]) -> None:
-        sub = kinds.add_parser(name, help=text)
-        for option in (*options, _add_output):
-            option(sub)
-        sub.set_defaults(call=call)
-
-    kind(
-        "latency", "round trip of every link, and the limit in C",
-        _add_links, _add_modes, _add_load, _add_policy, _add_payload, _add_seconds(0.2),
-        _add_rounds,
-    )  # fmt: skip
-    kind(
-        "jitter", "how late a loop that only paces begins its ticks",
-        _add_load, _add_policy, _add_seconds(0.3), _add_rounds,
-    )  # fmt: skip
-    kind(
-        "kernel",
+#: options of several kinds of benchmark, as argparse takes them
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "--links": {"default": ",".join(link_names()), "help": "by commas (default: %(default)s)"},
+    "--mode": {
+        "default": "lockstep,realtime",
+        "help": "lockstep: as fast as it goes; realtime: every 100 µs (default: %(default)s)",
+    },
+    "--load": {
+        "default": "idle,busy",
+        "help": "idle, or busy: with a CPU load on each processor (default: %(default)s)",
+    },
+    "--policy": {
+        "choices": ["auto", "fifo", "other"],
+        "default": "auto",
+        "help": "SCHED_FIFO, or as any process; auto: fifo if it is permitted (%(default)s)",
+    },
+    "--payload": {
+        "type": int,
+        "default": 64,
+        "help": "bytes there; 64: the bench's frames, 64 there and 48 back (default: %(default)s)",
+    },
+    "--laws": {"help": "names, by commas (default: all that are stable there)"},
+    "--cflags": {"default": "-O3", "help": "for the C compiler (default: %(default)s)"},
+    "--seconds": {"type": float, "help": "of a round (default: %(default)s)"},
+    "--rounds": {"type": int, "default": 5, "help": "of each, interleaved (default: %(default)s)"},
+    "--out": {"help": "folder for bench.json and bench.html; runs/bench-… else"},
+    "--json": {"action": "store_true", "help": "print bench.json and nothing else"},
+    "--quiet": {"action": "store_true", "help": "no progress on stderr"},
+}
+#: kinds of benchmark: what they measure, and their options besides those of the output
+_KINDS = {
+    "latency": (
+        "round trip of every link, and the limit in C",
+        "--links --mode --load --policy --payload --seconds --rounds",
+    ),
+    "jitter": (
+        "how late a loop that only paces begins its ticks",
+        "--load --policy --seconds --rounds",
+    ),
+    "kernel": (
         "time of one step of every law, and of the same in C",
-        _add_laws,
-        _add_cflags,
-        _add_rounds,
-    )
-    kind(
-        "loop", "closed loop: ticks a second in lockstep, misses in real time",
-        _add_links, _add_modes, _add_load, _add_laws, _add_seconds(3.0), _add_rounds,
-    )  # fmt: skip
-    kind("all", "all of it, in three minutes at most", _add_links)
+        "--laws --cflags --rounds",
+    ),
+    "loop": (
+        "closed loop: ticks a second in lockstep, misses in real time",
+        "--links --mode --load --laws --seconds --rounds",
+    ),
+    "all": ("all of it, in three minutes at most", "--links"),
+}
+_SECONDS = {"latency": 0.2, "jitter": 0.3, "loop": 3.0}
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the kinds of benchmark, and the comparison of two results."""
+    kinds = command.add_subparsers(dest="kind", required=True, metavar="WHAT")
+    for name, (text, options) in _KINDS.items():
+        kind = kinds.add_parser(name, help=text)
+        for option in (*options.split(), "--out", "--json", "--quiet"):
+            kind.add_argument(option, **_OPTIONS[option])
+        kind.set_defaults(seconds=_SECONDS.get(name))
     _add_compare(kinds)
 
 
@@ -80,70 +107,6 @@ def _add_compare(kinds: Any) -> None:
     command.set_defaults(call=compare_call)
 
 
-def _add_links(command: argparse.ArgumentParser) -> None:
-    names = ",".join(link_names())
-    command.add_argument("--links", default=names, help="by commas (default: %(default)s)")
-
-
-def _add_modes(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--mode", default="lockstep,realtime",
-        help="lockstep: as fast as it goes; realtime: every 100 µs (default: %(default)s)",
-    )  # fmt: skip
-
-
-def _add_load(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--load", default="idle,busy",
-        help="idle, or busy: with a CPU load on each processor (default: %(default)s)",
-    )  # fmt: skip
-
-
-def _add_policy(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--policy", choices=["auto", "fifo", "other"], default="auto",
-        help="SCHED_FIFO, or as any process; auto: fifo where the rights are there (%(default)s)",
-    )  # fmt: skip
-
-
-def _add_payload(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--payload", type=int, default=64,
-        help="bytes there; 64: the bench's frames, 64 there and 48 back (default: %(default)s)",
-    )  # fmt: skip
-
-
-def _add_laws(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--laws", help="names, by commas (default: all that are stable there)")
-
-
-def _add_cflags(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--cflags", default="-O3", help="for the C compiler (default: %(default)s)"
-    )
-
-
-def _add_seconds(seconds: float) -> Callable[[argparse.ArgumentParser], None]:
-    def add_seconds(command: argparse.ArgumentParser) -> None:
-        command.add_argument(
-            "--seconds", type=float, default=seconds, help="of a round (default: %(default)s)"
-        )
-
-    return add_seconds
-
-
-def _add_rounds(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--rounds", type=int, default=5, help="of each, interleaved (default: %(default)s)"
-    )
-
-
-def _add_output(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--out", help="folder for bench.json and bench.html; runs/bench-… else")
-    command.add_argument("--json", action="store_true", help="print bench.json and nothing else")
-    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-
-
 def call(options: argparse.Namespace) -> int:
     """Carry a measuring command out; returns the exit code."""
     from gfm_hil.benchmark.page import write_page
@@ -164,14 +127,8 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(content, indent=1))
         return 0
-    console = terminal()
-    console.width = max(console.width, _WIDTH)
-    for table in tables(content):
-        console.print(_drawn(table))
-        console.print()
-    for remark in (*content["remarks"], *content["caveats"]):
-        console.print(f"• {escape(remark)}", highlight=False)
-    console.print(f"{content['seconds']:g} s · {folder / 'bench.html'}", highlight=False)
+    _print([table for _, table in tables(content)], (*content["remarks"], *content["caveats"]))
+    print(f"{content['seconds']:g} s · {folder / 'bench.html'}")
     return 0
 
 
@@ -197,34 +154,24 @@ def compare_call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"results": rows, "remarks": remarks}, indent=1))
         return 0
-    console = terminal()
-    console.width = max(console.width, _WIDTH)
-    console.print(_drawn(comparison_table(rows)))
-    for remark in remarks:
-        console.print(f"• {remark}", highlight=False)
+    _print([comparison_table(rows)], remarks)
     return 0
 
 
-def _drawn(table: Any) -> Table:
-    drawn = Table(title=escape(table.heading), title_justify="left", box=None, pad_edge=False)
-    for k, column in enumerate(table.columns):
-        drawn.add_column(escape(column), justify="right" if k else "left")
-    for row in table.rows:
-        drawn.add_row(*map(escape, row))
-    return drawn
+def _print(tables: Iterable[Any], remarks: Iterable[str]) -> None:
+    console = terminal()
+    console.width = max(console.width, _WIDTH)
+    for table in tables:
+        drawn = numbers(*map(escape, table.columns), title=escape(table.heading))
+        for row in table.rows:
+            drawn.add_row(*map(escape, row))
+        console.print(drawn, end="\n\n")
+    for remark in remarks:
+        console.print(f"• {escape(remark)}", highlight=False)
 
 
 @contextmanager
 def _bar(quiet: bool) -> Iterator[Tell]:
-    console = terminal(stderr=True, quiet=quiet)
-    with Progress(
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.description}"),
-        console=console,
-        disable=not console.is_terminal,
-        transient=True,
-        refresh_per_second=4,
-    ) as bar:
+    with progress(BarColumn(), TaskProgressColumn(), "{task.description}", quiet=quiet) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda text, share: bar.update(task, description=escape(text), completed=share)

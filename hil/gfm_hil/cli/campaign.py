@@ -11,12 +11,11 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 
-from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder, progress
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.core.terminal import terminal
 from gfm_hil.results.runner import Notice
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
@@ -30,9 +29,7 @@ from gfm_hil.studies.campaign.worker import Record, compile_once
 _PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("campaign")
+def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", help="campaign file, or the name of a shipped one")
     command.add_argument("--out", help="folder; runs/<campaign>-<time> by default")
     command.add_argument("--resume", action="store_true", help="run what --out has not got yet")
@@ -43,7 +40,6 @@ def add(commands: Any) -> None:
     command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
     command.add_argument("--json", action="store_true", help="print campaign.json, nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -116,17 +112,15 @@ def _only(options: argparse.Namespace, campaign: Campaign) -> int:
 def _checking(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar for the checks, which appears once they take long; one line where there is no
     terminal. Yields what tells it of them."""
-    console, began = terminal(stderr=True, quiet=quiet), time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-    shown = console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=not shown) as bar:
+    began = time.monotonic()
+    with progress("{task.description}", BarColumn(), TaskProgressColumn(), quiet=quiet) as bar:
         task = bar.add_task("checking the runs", visible=False)
 
         def tell(done: int, of: int) -> None:
             if time.monotonic() - began < _PATIENCE_S:
                 return
-            if not shown and not bar.tasks[0].visible:
-                console.print(f"checking the runs: {done} of {of} done …", highlight=False)
+            if bar.disable and not bar.tasks[0].visible:
+                bar.console.print(f"checking the runs: {done} of {of} done …")
             bar.update(task, completed=done, total=of, visible=True)
 
         yield tell
@@ -137,16 +131,8 @@ def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[tuple[Any, N
     """A bar with what became of the runs, and the time left; yields what tells it of records, and
     what prints a line above it."""
     counts = dict.fromkeys(VERDICTS, 0)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[found]}"),
-        TimeRemainingColumn(),
-        console=terminal(stderr=True, quiet=quiet),
-        transient=True,
-        refresh_per_second=4,
-    ) as bar:
+    columns = BarColumn(), TaskProgressColumn(), "{task.fields[found]}", TimeRemainingColumn()
+    with progress("{task.description}", *columns, quiet=quiet) as bar:
         total = campaign.file.runs * len(campaign.file.laws)
         task = bar.add_task(campaign.name, total=total, found="starting …")
 

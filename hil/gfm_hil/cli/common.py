@@ -11,11 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TaskProgressColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.report import as_expected, cell, event_rows
 from gfm_hil.results.runner import Notice
@@ -92,6 +98,13 @@ def new_folder(out: str | None, stem: str) -> Path:
     return folder
 
 
+def progress(*columns: str | ProgressColumn, quiet: bool = False) -> Progress:
+    """A bar on stderr that a pipe or a file does not get; a text is the format of a column."""
+    console = terminal(stderr=True, quiet=quiet, highlight=False)
+    off = not console.is_terminal
+    return Progress(*columns, console=console, disable=off, transient=True, refresh_per_second=4)
+
+
 def above(bar: Progress) -> Notice:
     """What prints a line above a progress bar."""
 
@@ -106,18 +119,8 @@ def progress_bar(
     scenario: Scenario, label: str, quiet: bool
 ) -> Iterator[tuple[TellProgress, Notice]]:
     """A bar with simulated time and misses on stderr; yields (progress, notice)."""
-    console = terminal(stderr=True, quiet=quiet)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[sim]}"),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
-        transient=True,
-        refresh_per_second=5,
-    ) as bar:
+    columns = BarColumn(), TaskProgressColumn(), "{task.fields[sim]}", TimeRemainingColumn()
+    with progress("{task.description}", *columns, quiet=quiet) as bar:
         task = bar.add_task(label, total=scenario.ticks, sim="")
 
         def tell(ticks: int, misses: int) -> None:
@@ -160,10 +163,8 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:
     """A table with one row a quantity and one column an event."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("", no_wrap=True)
-    for event in events:
-        table.add_column(escape(f"{event['label']} @ {event['t']:g} s"), justify="right")
+    table = numbers("", *(escape(f"{event['label']} @ {event['t']:g} s") for event in events))
+    table.columns[0].no_wrap = True
     for name, title in event_rows(events):
         if name not in ("label", "t"):
             table.add_row(escape(title), *[cell(e.get(name)) for e in events])

@@ -20,7 +20,7 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
@@ -29,19 +29,16 @@ from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import find_scenario
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "compare",
-        description="In one process and in lockstep, unless --link, --endpoint, --option or "
-        "--mode realtime asks for two.",
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "In one process and in lockstep, unless --link, --endpoint, --option or "
+        "--mode realtime asks for two."
     )
     add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
     command.add_argument("--out", help="folder; runs/<scenario>-compare-<time> by default")
     command.add_argument("--json", action="store_true", help="print the summaries as JSON")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -79,10 +76,7 @@ def call(options: argparse.Namespace) -> int:
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
     def table_of(names: Sequence[str]) -> Table:
-        table = Table(box=None, pad_edge=False)
-        table.add_column("")
-        for name in names:
-            table.add_column(escape(name), justify="right")
+        table = numbers("", *map(escape, names))
         some = [summaries[name] for name in names]
         table.add_row("status", *[s["status"] for s in some])
         for k, event in enumerate(events):

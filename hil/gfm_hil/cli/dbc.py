@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
+from gfm_hil.core.terminal import numbers, terminal
 
 _RATES = {
     False: [(500_000, 0), (1_000_000, 0)],
@@ -18,14 +17,11 @@ _RATES = {
 }  # fmt: skip
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("dbc")
+def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
     command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -54,11 +50,12 @@ def _budgets(T_s: float) -> Table:
     from gfm_hil.links.can.layout import load_plan
     from gfm_hil.links.can.options import CanOptions
 
-    table = Table(box=None, pad_edge=False, caption_justify="left")
+    heads = ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load")
+    table = numbers("bus [Mbit/s]", *heads)
     table.caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"
-    table.add_column("bus [Mbit/s]", no_wrap=True)
-    for title in ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load"):
-        table.add_column(title, justify="right", no_wrap=True)
+    table.caption_justify = "left"
+    for column in table.columns:
+        column.no_wrap = True
     for fd, rates in _RATES.items():
         plan = load_plan(CanOptions(fd=fd))
         for bitrate, data in rates:

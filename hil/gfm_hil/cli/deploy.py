@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shutil
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core.errors import UserError
 
@@ -17,15 +16,12 @@ _FOLDERS = (
 FILES = ("can/*", "container/Containerfile", "container/compose.yaml", "systemd/**/*", "tune-*")
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "deploy",
-        description="Write what is in deploy/: units of systemd, container files, units of CAN "
-        "interfaces and the script that tunes a machine for real time.",
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Write what is in deploy/: units of systemd, container files, units of CAN "
+        "interfaces and the script that tunes a machine for real time."
     )
     command.add_argument("--out", required=True, metavar="DIR", help="folder; new or empty")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

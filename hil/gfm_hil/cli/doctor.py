@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,19 +13,13 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.results.doctor import examine, worst
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "doctor",
-        description="Judge this machine for real time; it only looks, for about a second.",
-    )
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = "Judge this machine for real time; it only looks, for about a second."
     command.add_argument("--json", action="store_true", help="all facts and findings as JSON")
     command.add_argument("--strict", action="store_true", help="exit code 3 if a line is red")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     facts, findings = examine()
     level = worst(findings)
     if options.json:

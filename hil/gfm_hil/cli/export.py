@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.export import FORMATS, export_run
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "export",
-        description="; ".join(f"{name}: {form.text}" for name, form in FORMATS.items()),
-    )
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = "; ".join(f"{name}: {form.text}" for name, form in FORMATS.items())
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument(
         "--format", choices=list(FORMATS), help="by the ending of FILE if not given"
     )
     command.add_argument("-o", "--out", type=Path, metavar="FILE", help="the run's name by default")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core.roles import ROLES
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "keys",
-        description="Make a key pair per role, for ZeroMQ between two machines (CURVE).",
-    )
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = "Make a key pair per role, for ZeroMQ between two machines (CURVE)."
     command.add_argument("--out", default="keys", help="folder (%(default)s)")
     command.add_argument("--force", action="store_true", help="replace the keys that are there")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,11 @@ from gfm_runtime.signals import U_NAMES, Y_NAMES
 MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
 
 
-def add(commands: Any) -> None:
-    """Add the command and its sub-command to the parser."""
-    command = commands.add_parser("laws")
+def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="as JSON")
     command.add_argument(
         "--tuned", action="store_true", help="those with the gains of the law comparison"
     )
-    command.set_defaults(call=call_list)
     show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
     show.add_argument("name", help="catalogue name or law file")
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
@@ -33,7 +31,7 @@ def add(commands: Any) -> None:
     show.set_defaults(call=call_show)
 
 
-def call_list(options: argparse.Namespace) -> int:
+def call(options: argparse.Namespace) -> int:
     """List the catalogue, or its tuned laws."""
     rows = []
     for name in tuned_names() if options.tuned else law_names():
@@ -50,8 +48,7 @@ def call_list(options: argparse.Namespace) -> int:
                     for k in sorted({*file.phi, *file.psi})
                 },
                 "stages": len(laws.laws),
-                "home_grid": {"L_g": first.home_grid.L_g, "R_g": first.home_grid.R_g,
-                              "note": first.home_grid.note},
+                "home_grid": asdict(first.home_grid),
                 "source": " ".join(first.source.split()),
             }
         )  # fmt: skip
@@ -113,8 +110,7 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
             n: {"value": p.value, "unit": p.unit, "source": p.source}
             for n, p in law.parameters.items()
         },
-        "home_grid": {"L_g": law.home_grid.L_g, "R_g": law.home_grid.R_g,
-                      "note": law.home_grid.note},
+        "home_grid": asdict(law.home_grid),
         "order": discrete[0].order,
         "discrete": [
             {"T_s": d.T_s, **{n: getattr(d, n).tolist() for n in MATRICES}} for d in discrete

@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-#: each command's module and what it does. Only the module of the command that is called is
-#: imported, so that the help and the light commands load neither numba nor the design tools.
+#: each command's module and what it does. A module's ``add`` gives the command's parser its
+#: options, ``call`` carries the command out and returns the exit code. Only the module of the
+#: command that is called is imported, so that the light commands load no numba.
 COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
     "tell": ("tell", "command a run that is going on, or print its newest tick"),
@@ -70,7 +71,10 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     top.add_argument("--version", action=_Version, help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     if command in COMMANDS:
-        import_module(f"gfm_hil.cli.{COMMANDS[command][0]}").add(commands)
+        module = import_module(f"gfm_hil.cli.{COMMANDS[command][0]}")
+        chosen = commands.add_parser(command)
+        chosen.set_defaults(call=getattr(module, "call", None))  # some have only sub-commands
+        module.add(chosen)
     else:
         for name, (_, text) in COMMANDS.items():
             commands.add_parser(name, help=text)

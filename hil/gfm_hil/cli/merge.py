@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.cli.common import exit_code, new_folder, print_summary
 from gfm_hil.results.run_folder import merge_roles
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "merge",
-        description=(
-            "Put the folders that gfmhil controller and gfmhil plant have left of one run together "
-            "into one folder with all signals, metrics, figures and the report. Both stay."
-        ),
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Put the folders that gfmhil controller and gfmhil plant have left of one run together "
+        "into one folder with all signals, metrics, figures and the report. Both stay."
     )
     command.add_argument("first", type=Path, metavar="A", help="folder of one side")
     command.add_argument("second", type=Path, metavar="B", help="folder of the other side")
     command.add_argument("-o", "--out", help="run folder; runs/merged-<time> by default")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import end_with_parent
@@ -14,11 +13,9 @@ PORT = 5020
 _LOOK_S = 0.1
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "modbus",
-        description="Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end.",
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end."
     )
     command.add_argument("folder", nargs="?", type=Path, metavar="RUN", help="the run folder")
     command.add_argument("--wait", action="store_true", help="wait for the run to begin")
@@ -47,11 +44,9 @@ def add(commands: Any) -> None:
         "--vendor-model", action="store_true", help="print the vendor model's file, and end"
     )
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     from gfm_hil.modbus.image import vendor_model
     from gfm_hil.modbus.serve import LOCAL, Address, begun, serve
 

@@ -5,25 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.cli.common import print_summary
 from gfm_hil.results.run_folder import recover
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "recover",
-        description=(
-            "Complete the folder of a run that a kill, a power failure or a full disk cut off: "
-            "signals, times, events, summary, figures and report of all that was recorded. "
-            "The command leaves a folder that is complete as it is."
-        ),
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Complete the folder of a run that a kill, a power failure or a full disk cut off: "
+        "signals, times, events, summary, figures and report of all that was recorded. "
+        "The command leaves a folder that is complete as it is."
     )
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from typing import Any
 
 from gfm_hil.cli.common import add_scenario_options, exit_code, new_folder, print_summary, resolve
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench
 from gfm_hil.engine.process import run_role
@@ -18,21 +17,17 @@ from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import INPROC
 
 
-def add(commands: Any) -> None:
-    """Add both commands to the parser."""
-    for role in ROLES:
-        command = commands.add_parser(role)
-        add_scenario_options(command)
-        command.add_argument("--law", help="override law: catalogue name or law file")
-        command.add_argument("--out", help="run folder; runs/<role>-<time> by default")
-        command.add_argument("--quiet", action="store_true", help="say nothing but errors")
-        command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
-        command.set_defaults(call=call, role=role)
+def add(command: argparse.ArgumentParser) -> None:
+    add_scenario_options(command)
+    command.add_argument("--law", help="override law: catalogue name or law file")
+    command.add_argument("--out", help="run folder; runs/<role>-<time> by default")
+    command.add_argument("--quiet", action="store_true", help="say nothing but errors")
+    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry one side out; returns the exit code."""
-    role: Role = options.role
+    role: Role = options.command
     scenario = resolve(options, law=options.law)
     if scenario.link.type == INPROC:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import sys
-from typing import Any
 
 from gfm_hil.cli.common import (
     add_scenario_options,
@@ -25,9 +24,7 @@ from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import INPROC, find_scenario
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("run")
+def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--out", help="run folder; runs/<scenario>-<time> by default")
@@ -46,11 +43,9 @@ def add(commands: Any) -> None:
         "--modbus", nargs="?", type=int, const=MODBUS_PORT, metavar="PORT",
         help="serve it as a SunSpec device while it goes on, as gfmhil modbus does",
     )  # fmt: skip
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     scenario = resolve(options, law=options.law)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
     with contextlib.ExitStack() as stack:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
 
 from rich.table import Column, Table
 
@@ -12,15 +11,11 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.scenario.model import load_scenario, shipped_scenarios
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser("scenarios")
+def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="as JSON")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     found = {name: load_scenario(name) for name in shipped_scenarios()}
     if options.json:
         rows = [{"name": n, "title": s.title, "mode": s.mode, "law": s.law, "duration": s.duration}

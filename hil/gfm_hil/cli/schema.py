@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel
 
@@ -21,16 +20,13 @@ MODELS: dict[str, type[BaseModel]] = {
 }
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "schema",
-        description="Prints the JSON Schema (draft 2020-12) of a kind of file. It describes every "
-        "key; what keys must be like together, only gfmhil itself checks.",
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Prints the JSON Schema (draft 2020-12) of a kind of file. It describes every "
+        "key; what keys must be like together, only gfmhil itself checks."
     )
     command.add_argument("kind", choices=list(MODELS), help="kind of file")
     command.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -8,7 +8,6 @@ import ssl
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.stopping import end_with_parent
@@ -20,12 +19,10 @@ _OPERATOR = "operator"  # who has the address with control if no names are given
 _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "scope",
-        description="Serves a page with the run's signals. Who opens it with the token that is "
-        "printed can also control the run; others can look.",
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Serves a page with the run's signals. Who opens it with the token that is "
+        "printed can also control the run; others can look."
     )
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument("--wait", action="store_true", help="wait for the run to begin")
@@ -46,11 +43,9 @@ def add(commands: Any) -> None:
         "commanded with it; may be repeated",
     )  # fmt: skip
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     encryption, ports = check(options)
     need_websockets()
     from gfm_hil.scope.access import Access

@@ -9,7 +9,6 @@ import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt, end_with_parent
@@ -20,12 +19,10 @@ _LOOK_S = 0.1
 _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "stream",
-        description="Samples for PlotJuggler's ZeroMQ subscriber (JSON) and, at the next port, "
-        "every tick in blocks for gfm_hil.telemetry.BlockReader. Ends with the run.",
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Samples for PlotJuggler's ZeroMQ subscriber (JSON) and, at the next port, "
+        "every tick in blocks for gfm_hil.telemetry.BlockReader. Ends with the run."
     )
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument("--wait", action="store_true", help="wait for the run to begin")
@@ -45,11 +42,9 @@ def add(commands: Any) -> None:
         help="listen beyond this machine: everybody there can read, nobody can command",
     )  # fmt: skip
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     _check(options)
     from gfm_hil.recording.live import begun
     from gfm_hil.telemetry.follow import Follower

@@ -14,12 +14,8 @@ from gfm_runtime.errors import meant
 from gfm_runtime.signals import REF_NAMES
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "tell",
-        description="Without anything to tell: the newest tick as JSON.",
-    )
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = "Without anything to tell: the newest tick as JSON."
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument(
         "references", nargs="*", metavar="NAME=VALUE", help=f"one of {', '.join(REF_NAMES)}, p.u."
@@ -35,11 +31,9 @@ def add(commands: Any) -> None:
     )
     command.add_argument("--event", metavar="JSON", help="an event as in a scenario, without t")
     command.add_argument("--stop", action="store_true", help="end the run")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry it out; returns the exit code."""
     events = _events(options)
     operator = Operator(options.folder, through="tell")
     try:

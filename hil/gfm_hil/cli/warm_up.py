@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import Any
 
 from gfm_hil.core.terminal import terminal
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "warm-up",
-        description="Compiles the kernel, the loops and every link into numba's cache. The cache "
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Compiles the kernel, the loops and every link into numba's cache. The cache "
         "lies beside the installed modules, or where NUMBA_CACHE_DIR says; another version of "
-        "gfmhil, numba or Python, or another kind of processor, needs another warm-up.",
+        "gfmhil, numba or Python, or another kind of processor, needs another warm-up."
     )
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     from gfm_hil.engine.compiling import compile_everything
 
     console = terminal(stderr=True, quiet=options.quiet)

@@ -1,13 +1,13 @@
-"""Printing tables: as wide as the terminal, or as wide as they need to be in a pipe or a file."""
+"""Tables: on a terminal of any width, in a pipe or a file, and in Markdown."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 _ANY = 100_000  # columns; more than any table takes
 
@@ -38,3 +38,15 @@ def fitting(
             count -= 1
         yield table_of(left[:count])
         left = left[count:]
+
+
+def numbers(first: str, *others: str, title: str = "") -> Table:
+    """An empty table without lines: the first column is text, the others are numbers."""
+    columns = (Column(head, justify="right") for head in others)
+    return Table(first, *columns, title=title, title_justify="left", box=None, pad_edge=False)
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown; a cell's text must not hold a bar."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (heads, *rows)]
+    return "\n".join([lines[0], f"|{'---|' * len(heads)}", *lines[1:]])

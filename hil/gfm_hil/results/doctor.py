@@ -112,7 +112,11 @@ def _can_modules(root: Path) -> list[str]:
 
 def judge(facts: Facts) -> list[Finding]:
     """One finding per rule, in the order of the table."""
-    return [rule(facts) for rule in _RULES]
+    return [
+        Finding(what, found, level, "" if level == "green" else advice)
+        for what, rule in _RULES.items()
+        for found, level, advice in [rule(facts)]
+    ]
 
 
 def worst(findings: Iterable[Finding]) -> Level:
@@ -121,161 +125,151 @@ def worst(findings: Iterable[Finding]) -> Level:
     return "red" if "red" in levels else "yellow" if "yellow" in levels else "green"
 
 
-def _kernel(facts: Facts) -> Finding:
+# What each rule found, its level, and what to do unless that is green.
+Judged = tuple[str, Level, str]
+
+
+def _kernel(facts: Facts) -> Judged:
     model = facts["preemption"]
-    level: Level = "green" if model == "PREEMPT_RT" else "yellow"
-    if re.search(r"none|voluntary", model):
-        level = "red"
-    advice = (
+    slow: Level = "red" if re.search(r"none|voluntary", model) else "yellow"
+    return (
+        f"{facts['kernel']}, {model}",
+        "green" if model == "PREEMPT_RT" else slow,
         "boot a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or preempt=full on its command "
-        "line"
-    )
-    return Finding(
-        "kernel", f"{facts['kernel']}, {model}", level, "" if level == "green" else advice
+        "line",
     )
 
 
-def _processors(facts: Facts) -> Finding:
-    n = facts["cpus"]
-    level: Level = "red" if n < 2 else "yellow" if n < 3 else "green"
-    advice = {
-        "red": "the two sides need a processor each: a larger machine, or one for each side",
-        "yellow": "the loops leave none for other work: one side on a machine of its own",
-    }
-    found = f"{n} of {facts['cpus_of_machine']}, {facts['cpu']}"
-    return Finding("processors", found, level, advice.get(level, ""))
+def _processors(facts: Facts) -> Judged:
+    found = f"{facts['cpus']} of {facts['cpus_of_machine']}, {facts['cpu']}"
+    if facts["cpus"] < 2:
+        advice = "the two sides need a processor each: a larger machine, or one for each side"
+        return found, "red", advice
+    advice = "the loops leave none for other work: one side on a machine of its own"
+    return found, "yellow" if facts["cpus"] < 3 else "green", advice
 
 
-def _isolated(facts: Facts) -> Finding:
+def _isolated(facts: Facts) -> Judged:
     found = facts["isolated_cpus"]
-    if found != "none":
-        return Finding("isolated processors", found, "green")
     advice = "isolate the loops' processors at boot: deploy/tune-realtime prints the options"
-    return Finding("isolated processors", found, "yellow", advice)
+    return found, "yellow" if found == "none" else "green", advice
 
 
-def _threads(facts: Facts) -> Finding:
-    if not facts["smt"]:
-        return Finding("hyper-threads", "off", "green")
+def _threads(facts: Facts) -> Judged:
     advice = "keep the sibling of a loop's processor free, or nosmt on the kernel's command line"
-    return Finding("hyper-threads", "on", "yellow", advice)
+    return ("on", "yellow", advice) if facts["smt"] else ("off", "green", "")
 
 
-def _governor(facts: Facts) -> Finding:
-    names = ", ".join(facts["governors"])
-    if facts["governors"] in ([], ["performance"]):
-        return Finding("frequency governor", names or "none", "green")
-    return Finding(
-        "frequency governor", names, "yellow", "performance: deploy/tune-realtime --apply"
-    )
+def _governor(facts: Facts) -> Judged:
+    good = facts["governors"] in ([], ["performance"])
+    found = ", ".join(facts["governors"]) or "none"
+    return found, "green" if good else "yellow", "performance: deploy/tune-realtime --apply"
 
 
-def _idle(facts: Facts) -> Finding:
+def _idle(facts: Facts) -> Judged:
     us = facts["deepest_idle_us"]
-    if us is None or us <= _WAKE_US:
-        return Finding("deepest idle state", "none" if us is None else f"wakes in {us} µs", "green")
-    return Finding(
-        "deepest idle state", f"wakes in {us} µs", "yellow", "deploy/tune-realtime --apply"
-    )
+    found = "none" if us is None else f"wakes in {us} µs"
+    return found, "yellow" if (us or 0) > _WAKE_US else "green", "deploy/tune-realtime --apply"
 
 
-def _priority(facts: Facts) -> Finding:
-    highest = facts["rt_priority"]
-    found = f"up to {highest}" if facts["sched_fifo"] and highest else "refused"
-    if facts["sched_fifo"] and highest >= PRIORITY:
-        return Finding("SCHED_FIFO", found, "green")
-    n = PRIORITY
-    advice = (
+def _priority(facts: Facts) -> Judged:
+    highest, n = facts["rt_priority"], PRIORITY
+    return (
+        f"up to {highest}" if facts["sched_fifo"] and highest else "refused",
+        "green" if facts["sched_fifo"] and highest >= n else "red",
         f"the loops ask for {n}: LimitRTPRIO={n} in a unit, --ulimit rtprio={n} for a container, "
-        f"'<user> - rtprio {n}' in /etc/security/limits.d for a login"
+        f"'<user> - rtprio {n}' in /etc/security/limits.d for a login",
     )
-    return Finding("SCHED_FIFO", found, "red", advice)
 
 
-def _memory(facts: Facts) -> Finding:
-    if facts["mlock"] == "unlimited":
-        return Finding("locked memory", "unlimited", "green")
-    advice = (
+def _memory(facts: Facts) -> Judged:
+    return (
+        facts["mlock"],
+        "green" if facts["mlock"] == "unlimited" else "red",
         "unlimited: LimitMEMLOCK=infinity in a unit, --ulimit memlock=-1 for a container, "
-        "'<user> - memlock unlimited' in /etc/security/limits.d for a login"
+        "'<user> - memlock unlimited' in /etc/security/limits.d for a login",
     )
-    return Finding("locked memory", facts["mlock"], "red", advice)
 
 
-def _throttling(facts: Facts) -> Finding:
+def _throttling(facts: Facts) -> Judged:
     share = facts["rt_share"]
-    if share is None:
-        return Finding("real-time share", "unknown", "green")
-    if share < 0:
-        return Finding("real-time share", "unlimited", "green")
-    level: Level = "green" if share >= 0.9 else "red"  # the loops sleep in every tick
-    advice = "sysctl kernel.sched_rt_runtime_us=950000" if level == "red" else ""
-    return Finding("real-time share", f"{share:.0%}", level, advice)
+    if share is None or share < 0:
+        return "unknown" if share is None else "unlimited", "green", ""
+    # the loops sleep in every tick
+    level: Level = "green" if share >= 0.9 else "red"
+    return f"{share:.0%}", level, "sysctl kernel.sched_rt_runtime_us=950000"
 
 
-def _clock(facts: Facts) -> Finding:
+def _clock(facts: Facts) -> Judged:
     name = facts["clock_source"]
-    if name in _FAST_CLOCKS:
-        return Finding("clock source", name, "green")
+    slow: Level = "red" if name else "yellow"
     advice = "every look at the clock is a system call: tsc=reliable, or a look into dmesg why not"
-    return Finding("clock source", name or "unknown", "red" if name else "yellow", advice)
+    return name or "unknown", "green" if name in _FAST_CLOCKS else slow, advice
 
 
-def _room(facts: Facts) -> Finding:
+def _room(facts: Facts) -> Judged:
     minutes = facts["shm_minutes"]
     if minutes is None:
-        advice = "recordings go to the disk, and a tick may wait for it: mount a tmpfs"
-        return Finding("/dev/shm", "none", "red", advice)
-    level: Level = "red" if minutes < 1 else "yellow" if minutes < 10 else "green"
-    advice = "a longer run records to the disk: mount -o remount,size=… /dev/shm"
-    found = f"room for {minutes:g} min at 10 kHz"
-    return Finding("/dev/shm", found, level, "" if level == "green" else advice)
+        return "none", "red", "recordings go to the disk, and a tick may wait for it: mount a tmpfs"
+    return (
+        f"room for {minutes:g} min at 10 kHz",
+        "red" if minutes < 1 else "yellow" if minutes < 10 else "green",
+        "a longer run records to the disk: mount -o remount,size=… /dev/shm",
+    )
 
 
-def _virtual(facts: Facts) -> Finding:
+def _virtual(facts: Facts) -> Judged:
     kind, steal = facts["virtual_machine"], facts["steal_pct"]
     if kind == "no":
-        return Finding("virtual machine", "no", "green")
-    level: Level = "red" if (steal or 0.0) > 1 else "yellow"
+        return "no", "green", ""
     found = kind if steal is None else f"{kind}, host takes {steal:g} %"
     advice = "the host can stop it for milliseconds: bare metal, or processors pinned by the host"
-    return Finding("virtual machine", found, level, advice)
+    return found, "red" if (steal or 0.0) > 1 else "yellow", advice
 
 
-def _load(facts: Facts) -> Finding:
+def _load(facts: Facts) -> Judged:
     load = facts["load_average"][0]
-    busy = load / facts["cpus"] > 0.5
     advice = "other work runs on this machine: stop it, or isolate the loops' processors"
-    return Finding("load", f"{load:g}", "yellow" if busy else "green", advice if busy else "")
+    return f"{load:g}", "yellow" if load / facts["cpus"] > 0.5 else "green", advice
 
 
-def _can(facts: Facts) -> Finding:
+def _can(facts: Facts) -> Judged:
     names = [f"{name} {state}" for name, state in facts["can"].items()]
-    if any(not name.endswith(" down") for name in names):
-        return Finding("CAN", ", ".join(names), "green")
     if names:
+        up = any(not name.endswith(" down") for name in names)
         advice = f"systemctl start gfmhil-can@{next(iter(facts['can']))}"
-        return Finding("CAN", ", ".join(names), "yellow", advice)
+        return ", ".join(names), "green" if up else "yellow", advice
     if facts["can_modules"]:
         advice = "for the link can: plug an adapter in, or systemctl start gfmhil-vcan@vcan0"
-        return Finding("CAN", f"drivers {', '.join(facts['can_modules'])}", "yellow", advice)
+        return f"drivers {', '.join(facts['can_modules'])}", "yellow", advice
     advice = "for the link can: a kernel with CAN; the interface gfmhil-udp does without"
-    return Finding("CAN", "no driver", "yellow", advice)
+    return "no driver", "yellow", advice
 
 
-def _versions(facts: Facts) -> Finding:
+def _versions(facts: Facts) -> Judged:
     names = ("python", "gfmhil", *_NEEDED, "libzmq")
     missing = [name for name in _NEEDED if facts[name] is None]
     found = ", ".join(f"{name} {facts[name]}" for name in names if facts[name])
-    if missing:
-        return Finding("versions", found, "red", f"pip install {' '.join(missing)}")
-    return Finding("versions", found, "green")
+    return found, "red" if missing else "green", f"pip install {' '.join(missing)}"
 
 
-_RULES: tuple[Callable[[Facts], Finding], ...] = (
-    _kernel, _processors, _isolated, _threads, _governor, _idle, _priority, _memory, _throttling,
-    _clock, _room, _virtual, _load, _can, _versions,
-)  # fmt: skip
+_RULES: dict[str, Callable[[Facts], Judged]] = {
+    "kernel": _kernel,
+    "processors": _processors,
+    "isolated processors": _isolated,
+    "hyper-threads": _threads,
+    "frequency governor": _governor,
+    "deepest idle state": _idle,
+    "SCHED_FIFO": _priority,
+    "locked memory": _memory,
+    "real-time share": _throttling,
+    "clock source": _clock,
+    "/dev/shm": _room,
+    "virtual machine": _virtual,
+    "load": _load,
+    "CAN": _can,
+    "versions": _versions,
+}
 
 
 def _text(path: Path) -> str:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -62,6 +61,7 @@ def dress(axes: Axes, title: str = "") -> None:
     """What every panel has: a title at the left, a faint grid, no box."""
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
     axes.grid(True, color="#e4e4e4", lw=0.6)
+    axes.set_axisbelow(True)
     axes.tick_params(labelsize=8.5, color=_GREY)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -134,12 +134,6 @@ def _legend(axes: Axes, columns: int) -> None:
     )  # fmt: skip
 
 
-def _figure(size: tuple[float, float]) -> Figure:
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for a in axes[-1]:
@@ -162,7 +156,8 @@ def draw_run(
     """Draw one run into its folder: signals.png and, in real time, timing.png."""
     pictures = []
     if "true_p" in signals:
-        figure, path = _figure(SIZE), folder / "signals.png"
+        figure = Figure(figsize=SIZE, layout="constrained")
+        path = folder / "signals.png"
         draw_signals(figure, scenario, signals, summary)
         _save(figure, path)
         pictures.append(path)
@@ -207,7 +202,6 @@ def draw_signals(
 def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict[str, Any]) -> Path:
     """Draw into timing.png how long the round trips took, and when the plant had no fresh u."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     for duration, colour in ((ROUND_TRIP, COLOURS[0]), (LATE, COLOURS[1])):
         spread = duration.spread(timing, scenario.T_s)
@@ -220,7 +214,7 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict
         scenario.T_s * 1e6, 0.98, f" T_s = {scenario.T_s * 1e6:g} µs", fontsize=8, va="top",
         color="#444444", transform=left.get_xaxis_transform(),
     )  # fmt: skip
-    left.set_title("share of ticks beyond a latency [µs]", loc="left", fontsize=9.5)
+    dress(left, "share of ticks beyond a latency [µs]")
     left.legend(fontsize=8, frameon=False, loc="lower left")
     edges, counts = np.linspace(0, summary["duration_s"], _BINS + 1), np.zeros(_BINS)
     ticks = len(timing["plant_received"])
@@ -228,15 +222,8 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict
         missing = np.flatnonzero(missed(timing, first, first + PIECE))
         counts += np.histogram((first + missing) * scenario.T_s, edges)[0]
     right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
-    right.set_title(
-        f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}",
-        loc="left",
-        fontsize=9.5,
-    )
+    dress(right, f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}")
     right.set_xlabel("t [s]", fontsize=9)
-    for a in (left, right):
-        a.grid(True, color="#e4e4e4", lw=0.6)
-        a.tick_params(labelsize=8.5)
     path = folder / "timing.png"
     _save(figure, path)
     return path
@@ -253,16 +240,13 @@ def draw_laws(
     whole = max(len(s["t"]) for s in runs.values())
     if all(s["t"][0:1] == 0 for s in runs.values()):  # not only a window of each run
         whole = scenario.ticks
-    for a, (title, name) in zip(
-        axes,
-        (
-            ("active power p", "true_p"),
-            ("frequency", "true_omega_u"),
-            ("reactive power q", "true_q"),
-            ("DC voltage v_dc", "true_v_dc"),
-        ),
-        strict=True,
-    ):
+    panels = (
+        ("active power p", "true_p"),
+        ("frequency", "true_omega_u"),
+        ("reactive power q", "true_q"),
+        ("DC voltage v_dc", "true_v_dc"),
+    )
+    for a, (title, name) in zip(axes, panels, strict=True):
         curves = [
             (columns, name, COLOURS[k % len(COLOURS)], law)
             for k, (law, columns) in enumerate(runs.items())
@@ -282,6 +266,6 @@ def draw_comparison(
     path: Path, scenario: Scenario, runs: Mapping[str, Columns], events: Sequence[dict[str, Any]]
 ) -> None:
     """Draw several laws into a file, see ``draw_laws``."""
-    figure = _figure(SIZE_LAWS)
+    figure = Figure(figsize=SIZE_LAWS, layout="constrained")
     draw_laws(figure, scenario, runs, events)
     _save(figure, path)

@@ -62,15 +62,13 @@ class LoopDelay:
                 f"fits: no tick was missed, u always acted {worst:g} us after its sample; the law "
                 f"allows {allowed:.4g} us"
             )
-        held = f"{self.misses} of {self.ticks} ticks missed, {self.longest_hold} in a row at most"
-        if self.fits(margin_us):
-            return (
-                f"fits: {held}, so u acted at most {worst:g} us after its sample; the law allows "
-                f"{allowed:.4g} us"
-            )
+        fits = self.fits(margin_us)
+        verdict, acted = ("fits", "acted at most") if fits else ("does not fit", "may have acted")
+        beyond = "" if fits else f", exceeded in {self.beyond} ticks"
         return (
-            f"does not fit: {held}, so u may have acted {worst:g} us after its sample; the law "
-            f"allows {allowed:.4g} us, exceeded in {self.beyond} ticks"
+            f"{verdict}: {self.misses} of {self.ticks} ticks missed, {self.longest_hold} in a row "
+            f"at most, so u {acted} {worst:g} us after its sample; the law allows {allowed:.4g} us"
+            f"{beyond}"
         )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ _STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}
 h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
 table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
-border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums} td.n,th.n{text-align:right}
+border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums}
+.scroll :is(th,td):not(:first-child){text-align:right}
 img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
 .status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
 .completed,.expected{background:#00734f} .tripped,.safe{background:#b34500}
@@ -74,6 +76,29 @@ def cell(value: Any) -> str:
     return str(value)
 
 
+def finite(value: Any) -> Any:
+    """None in place of NaN and infinity, which JSON does not know, in lists and dicts too."""
+    match value:
+        case dict():
+            return {k: finite(v) for k, v in value.items()}
+        case list():
+            return [finite(v) for v in value]
+        case float() if not math.isfinite(value):
+            return None
+    return value
+
+
+def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
+    """A table in HTML, which may be wider than the page."""
+
+    def line(tag: str, cells: Sequence[str]) -> str:
+        return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
+
+    title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+    body = line("th", heads) + "".join(line("td", row) for row in rows)
+    return f'<div class="scroll"><table>{title}{body}</table></div>'
+
+
 def write_report(
     folder: Path, scenario: Scenario, summary: dict[str, Any], pictures: Sequence[Path]
 ) -> Path:
@@ -81,17 +106,9 @@ def write_report(
     status = html.escape(summary["status"])
     look, expected = ("expected", ", as expected:") if as_expected(summary) else (status, "")
     columns = event_rows(summary["events"])
-    head = "".join(
-        f"<th class={'n' if k else 'l'}>{html.escape(v)}</th>" for k, (_, v) in enumerate(columns)
-    )
-    body = "".join(
-        "<tr>"
-        + "".join(
-            f"<td class={'n' if k else 'l'}>{html.escape(cell(e.get(name)))}</td>"
-            for k, (name, _) in enumerate(columns)
-        )
-        + "</tr>"
-        for e in summary["events"]
+    events = html_table(
+        [title for _, title in columns],
+        [[cell(event.get(name)) for name, _ in columns] for event in summary["events"]],
     )
     facts = [
         ("controlled by", controlled_by(summary)),
@@ -134,7 +151,7 @@ def write_report(
 <p>{html.escape(scenario.description)}</p>
 <table>{rows}</table>
 {images}
-<h2>Events</h2><div class="scroll"><table><tr>{head}</tr>{body}</table></div>
+<h2>Events</h2>{events}
 <h2>Scenario as resolved</h2><pre>{resolved}</pre></html>
 """,
     )

@@ -9,13 +9,8 @@ import numpy as np
 
 from gfm_design.model.box import Point
 from gfm_design.model.closed_loop import T_S
-from gfm_hil.engine.inproc import run_ticks
-from gfm_hil.engine.setup import make_bench
-from gfm_hil.engine.timeline import safe_reason
-from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
+from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import check_scenario
-from gfm_plant import trip_reason
-from gfm_runtime.states import SAFE
 
 #: what the rig adds to a point: its boards, and the noise of its sensors in p.u.
 RIG: dict[str, Any] = {
@@ -25,7 +20,6 @@ RIG: dict[str, Any] = {
 }
 STEP = (0.5, 1.0)  # of P_ref, p.u.
 _BEFORE, _AFTER = 5000, 25000  # ticks
-_P = PLANT_COLUMNS.index("true_p")
 
 
 @dataclass(frozen=True)
@@ -63,21 +57,16 @@ def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
         "law": law,
         "seed": seed,
         "references": {"P_ref": STEP[0]},
+        "events": [{"tick": _BEFORE, "type": "reference", "P_ref": STEP[1]}],
+        "mode": "lockstep",
+        "link": {"type": "inproc"},
         "plant": plant,
     }
-    bench = make_bench(check_scenario(content, str(point)))
-    c, ticks = bench.controller, _BEFORE + _AFTER
-    signals = np.full((ticks, len(PLANT_COLUMNS)), np.nan)
-    references = np.empty((ticks, len(CONTROLLER_COLUMNS)))
-    for start, stop in ((0, _BEFORE), (_BEFORE, ticks)):
-        if start:
-            c.set("P_ref", STEP[1])
-        done = run_ticks(bench, signals, references, start, stop)
-        if bench.st["trip"][0] or c.ctl["state"][0] == SAFE:
-            tripped = bool(bench.st["trip"][0])
-            why = trip_reason(bench.st, bench.par) if tripped else safe_reason(c.ctl)
-            return Stepped(point, f"{why} at {done * T_S:.3f} s", np.nan, np.nan)
-    p = signals[_BEFORE:, _P]
+    run = run_in_memory(check_scenario(content, str(point)))
+    if run.status != "completed":
+        why = f"{run.summary['reason']} at {run.summary['duration_s']:.3f} s"
+        return Stepped(point, why, np.nan, np.nan)
+    p = np.asarray(run.columns["true_p"])[_BEFORE:]
     rest, step = p[-_AFTER // 10 :], STEP[1] - STEP[0]
     settled = rest.mean()
     overshoot, ripple = (float((v - settled) / step) for v in (p.max(), rest.max()))

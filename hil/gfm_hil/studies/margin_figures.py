@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from gfm_design.margins.tolerance import Region, factor
 from gfm_design.model.closed_loop import ClosedLoop
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 
 _GREY = "#888888"
 _SPAN = 100.0  # 1/s; colours of sigma end there
@@ -21,7 +20,6 @@ _DELAYS = 300
 def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> None:
     """sigma in colour, its zero as a line, the printed and the scenario's line as points."""
     figure = Figure(figsize=(6.6, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_facecolor("#dddddd")
     # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
@@ -60,7 +58,6 @@ def draw_delay(path: Path, loop: ClosedLoop, label: str, margin: float) -> None:
     delays = np.linspace(0.0, end, _DELAYS)
     sigma = [loop.later(float(d)).sigma() for d in delays]
     figure = Figure(figsize=(6.6, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.plot(1e6 * delays, sigma, color=COLOURS[0], lw=1.4)
     axes.axhline(0.0, color=_GREY, lw=0.8)
@@ -72,6 +69,5 @@ def draw_delay(path: Path, loop: ClosedLoop, label: str, margin: float) -> None:
         )  # fmt: skip
     axes.set_xlabel(f"delay on top of the loop's {1e6 * loop.u_delay[0]:g} µs [µs]")
     axes.set_ylabel("largest σ [1/s]")
-    axes.set_title(f"{label}: the loop over its delay", loc="left", fontsize=10)
-    axes.grid(True, color="#e4e4e4", lw=0.6)
+    dress(axes, f"{label}: the loop over its delay")
     figure.savefig(path, dpi=110)

@@ -7,7 +7,8 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.campaign.axes import find_axes
-from gfm_hil.studies.campaign.execute import Here, execute, processes
+from gfm_hil.studies.campaign.execute import execute, processes
 from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
 from gfm_hil.studies.campaign.result import CampaignResult, write_result
 from gfm_hil.studies.campaign.store import Store
@@ -179,7 +180,7 @@ def campaign(
         store = Store(place, made, resume)
         if jobs := store.missing(made):
             compile_once(made, lambda text: None)  # silent, as all of this module
-            with nullcontext(Here()) if workers == 1 else processes(workers) as pool:
+            with ThreadPoolExecutor(1) if workers == 1 else processes(workers) as pool:
                 execute(made, jobs, pool, workers, store.append, lambda: False)
         found = CampaignResult(made, store.sorted(made), place)
     if place is not None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from gfm_design.norms.performance import Channel
-from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime.lawfile import LawFile
 
@@ -28,6 +27,25 @@ def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
     return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 
+def law_text(
+    file: LawFile, gains: Mapping[str, float], by: str, comments: Sequence[str], **about: str | None
+) -> str:
+    """A law file with other gains, and comments above them.
+
+    Args:
+        file: the law.
+        gains: the parameters that change.
+        by: what found the gains; their source.
+        comments: one a line.
+        about: other keys of the file that change, such as name and title; None leaves a key out.
+    """
+    content = {**file.model_dump(mode="json", exclude_none=True), **about}
+    for name, value in gains.items():
+        content["parameters"][name] |= {"value": value, "source": by}
+    kept = {key: value for key, value in content.items() if value is not None}
+    return "".join(f"# {line}\n" for line in comments) + "\n" + toml_text(kept)
+
+
 def write_law(
     path: Path,
     file: LawFile,
@@ -38,10 +56,8 @@ def write_law(
 ) -> None:
     """Write a law file with its tuned gains and, as comments, what they were tuned for.
 
-    Its name is that of the path.
-
     Args:
-        path: the new file.
+        path: the new file; its stem is the name of the law.
         file: the law that was tuned. The new one is meant for the paper's grid, whatever this one
             was meant for.
         gains: the parameters that change.
@@ -50,24 +66,16 @@ def write_law(
         by: the command that found the gains.
 
     Raises:
-        UserError: the file cannot be written.
+        OSError: the file cannot be written.
     """
-    content = file.model_dump(mode="json", exclude_none=True)
-    content["name"] = path.stem
-    content["title"] = f"{file.title}, tuned"
-    content["source"] = f"{file.source.strip()}; tuned by {by}, see the comments"
-    content.pop("home_grid")
-    for name, value in gains.items():
-        content["parameters"][name]["value"] = value
-        content["parameters"][name]["source"] = f"{by}, seed {result['seed']}"
-    lines = [
+    comments = [
         f"gamma = {result['gamma']:.6g} of the paper's problem (Section III-B), P_ref = 0.5",
         *(f"W_{c['i']}{c['j']}: {c['norm']:.6g}" for c in result["channels"]),
         f"{result['evaluations']} evaluations, {result['seconds']:.1f} s, seed {result['seed']}",
         *notes,
     ]
-    text = "".join(f"# {line}\n" for line in lines) + "\n" + toml_text(content)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as problem:
-        raise UserError(f"--out {path}: {problem.strerror}") from None
+    source = f"{file.source.strip()}; tuned by {by}, see the comments"
+    about = {"name": path.stem, "title": f"{file.title}, tuned", "source": source}
+    found_by = f"{by}, seed {result['seed']}"
+    text = law_text(file, gains, found_by, comments, home_grid=None, **about)
+    path.write_text(text, encoding="utf-8")

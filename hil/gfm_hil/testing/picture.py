@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -44,7 +43,6 @@ def draw(
         around: time range [s] of the large panel, all by default.
     """
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
-    FigureCanvasAgg(figure)
     rows = figure.subplot_mosaic(
         [["main", "main"], ["a", "b"], ["c", "d"]], height_ratios=[2.2, 1, 1]
     )

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+import argparse
 
 from gfm_hil.cli.design import box, compare, deploy, gamma, loop, margins, tune
 
 
-def add(commands: Any) -> None:
-    """Add the command and its sub-commands to the parser."""
-    command = commands.add_parser("design")
+def add(command: argparse.ArgumentParser) -> None:
+    """Add the sub-commands."""
     kinds = command.add_subparsers(dest="design", required=True, metavar="WHAT")
     for module in (gamma, margins, loop, tune, box, deploy, compare):
         module.add(kinds)

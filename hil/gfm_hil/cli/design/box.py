@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import asdict, fields, replace
+from typing import Any, get_args
 
 import numpy as np
 from rich.progress import track
@@ -17,17 +17,26 @@ from gfm_design.model.box import Box, Point, Source
 from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.robust import Loops, paper_problem
-from gfm_hil.cli.design.box_options import add_box, read_box
+from gfm_design.tuning.robust import Loops, Wanted, paper_problem
 from gfm_hil.cli.design.common import channels_as_json
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.box import STEP, step_run
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import LawFile
 
+_SOURCES = get_args(Source)
+#: the least and the largest that a plant of the box may be
+_RANGE = {
+    "R_f": (0.001, 100.0),
+    "R_g": (0.001, 100.0),
+    "L_g": (0.01, 100.0),
+    "delay": (0.0, 5.99),
+    "P_ref": (-1.5, 1.5),
+}
+
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("box", help="whether a law holds in the box of real loops")
     command.add_argument("--law", required=True, help="catalogue name or law file")
     add_box(command)
@@ -36,6 +45,70 @@ def add(kinds: Any) -> None:
     command.add_argument("--bench", action="store_true", help="step P_ref on the nonlinear bench")
     command.add_argument("--json", action="store_true", help="as JSON")
     command.set_defaults(call=call)
+
+
+def add_box(command: argparse.ArgumentParser) -> None:
+    """The option of the box."""
+    command.add_argument(
+        "--box",
+        action="append",
+        default=[],
+        metavar="NAME=v,v,…",
+        help="other extremes of R_f, R_g, L_g, delay (samples), P_ref, dc; may be repeated",
+    )
+
+
+def read_box(entries: Sequence[str]) -> Box:
+    """The box with some of its extremes replaced.
+
+    Raises:
+        UserError: an unknown name, no value, or one that no plant of the box can have.
+    """
+    found: dict[str, Any] = {}
+    for entry in entries:
+        name, _, text = (part.strip() for part in entry.partition("="))
+        values = [v.strip() for v in text.split(",") if v.strip()]
+        known = [f.name for f in fields(Box)]
+        if name not in known or not values:
+            raise UserError(f"--box {entry!r}: must be NAME=v,v,… with a NAME of {known}")
+        if name in found:
+            raise UserError(f"--box: {name} is given twice")
+        found[name] = tuple(_source(v) if name == "dc" else _number(name, v) for v in values)
+    return replace(Box(), **found)
+
+
+def _source(text: str) -> str:
+    if text not in _SOURCES:
+        raise UserError(f"--box dc={text}: must be of {list(_SOURCES)}")
+    return text
+
+
+def _number(name: str, text: str) -> float:
+    low, high = _RANGE[name]
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not low <= value <= high:
+        raise UserError(f"--box {name}={text}: must be a number from {low:g} to {high:g}")
+    return value
+
+
+def wanted(named: dict[str, float], box: Box) -> Wanted:
+    """The demands, some replaced; those on the rig's source are relaxed only beside the other.
+
+    Raises:
+        UserError: an unknown name, a number that is not positive, a demand on a source that is
+            not in the box.
+    """
+    known = [f.name for f in fields(Wanted)]
+    for name, value in named.items():
+        if name not in known or value <= 0.0:
+            raise UserError(f"--want {name}={value:g}: must be positive, a name of {known}")
+    both = len(set(box.dc)) > 1
+    if not both and (odd := {"rig_alpha", "rig_weight"} & set(named)):
+        raise UserError(f"--want {min(odd)}: only for a box with both DC sources")
+    return replace(Wanted() if both else Wanted(rig_alpha=None), **named)
 
 
 def call(options: argparse.Namespace) -> int:

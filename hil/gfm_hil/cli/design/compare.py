@@ -8,14 +8,13 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
 from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, split_laws
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, progress, split_laws
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
@@ -28,7 +27,6 @@ from gfm_runtime import law_names
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("compare", help="every law tuned for the same problem, in a table")
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
@@ -49,7 +47,7 @@ def call(options: argparse.Namespace) -> int:
     """Compare the laws; a law that the folder --out has already is not tuned again."""
     jobs = _jobs(options)
     folder = new_folder(options.out, "law-comparison")
-    _make(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     rows = {job.law: row for job in jobs if (row := kept(folder, job))}
     missing = [job for job in jobs if job.law not in rows]
     lost = None
@@ -106,25 +104,11 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     ]
 
 
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise UserError(f"--out {folder}: {problem.strerror}") from None
-
-
 @contextlib.contextmanager
 def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     """A bar of laws and one of each search; yields what tells them of evaluations and of rows."""
-    console = terminal(stderr=True, quiet=options.quiet, highlight=False)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[best]}"),
-        console=console,
-        transient=True,
-    ) as bar:
+    columns = BarColumn(), MofNCompleteColumn(), "{task.fields[best]}"
+    with progress("{task.description}", *columns, quiet=options.quiet) as bar:
         laws = bar.add_task("laws", total=len(jobs), best="")
         searches: dict[str, Any] = {}
 

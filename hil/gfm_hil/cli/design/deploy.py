@@ -9,22 +9,21 @@ from typing import Any
 
 from gfm_design.margins.delays import overall_delay
 from gfm_design.model.box import Box, Point, Source
+from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.deployable import Round, deploy
 from gfm_design.tuning.gains import free_gains, tied
 from gfm_design.tuning.robust import Wanted, paper_problem
 from gfm_design.tuning.synthesis import NotStabilised
-from gfm_hil.cli.design.box import margin_text
-from gfm_hil.cli.design.box_options import add_box, read_box, wanted
+from gfm_hil.cli.design.box import add_box, margin_text, read_box, wanted
 from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.toml_out import toml_text
-from gfm_runtime import law_file
+from gfm_hil.studies.tuned_law import law_text
+from gfm_runtime import build_law, discretise, law_file, parse_law
 from gfm_runtime.lawfile import LawFile
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("deploy", help="choose the free gains to hold in the box")
     add_law_options(command)
     add_box(command)
@@ -91,18 +90,7 @@ def _write(
     demands: Wanted,
 ) -> None:
     """The law file and, as comments, what its gains were tuned for."""
-    content = file.model_dump(mode="json", exclude_none=True)
-    content |= {
-        "name": path.stem,
-        "title": f"the paper's MIMO-GFM, gains that hold in the real loop{_source(box)}",
-        "source": "Eq. (36); gains by gfmhil design deploy, see the comments of the file\n",
-    }
-    for name, value in gains.items():
-        content["parameters"][name] |= {
-            "value": value,
-            "source": f"gfmhil design deploy, seed {result['seed']}",
-        }
-    notes = [
+    comments = [
         f"gamma = {result['gamma']:.4f} of the paper's problem (Section III-B), P_ref = 0.5, "
         f"DC source {result['source']}:",
         "  " + ", ".join(f"W_{c['i']}{c['j']} {c['norm']:.4f}" for c in result["channels"]),
@@ -111,13 +99,18 @@ def _write(
         "the box, sensors of 300 Hz, T_s = 100 us, delay in samples:",
         *(f"  {name} {' '.join(map(str, values))}" for name, values in asdict(box).items()),
     ]
-    text = "".join(f"# {line}\n" for line in notes) + "\n" + toml_text(content)
-    try:
-        path.write_text(text, encoding="utf-8")
-        margins = ", ".join(
-            f"{margin_text(overall_delay(Point(dc=dc).loop(str(path))).seconds)} (DC source {dc})"
-            for dc in dict.fromkeys(box.dc)
-        )
-        path.write_text(f"# delay margin at nominal {margins}\n{text}", "utf-8")
-    except OSError as problem:
-        raise UserError(f"--out {path}: {problem.strerror}") from None
+    text = law_text(
+        file,
+        gains,
+        f"gfmhil design deploy, seed {result['seed']}",
+        comments,
+        name=path.stem,
+        title=f"the paper's MIMO-GFM, gains that hold in the real loop{_source(box)}",
+        source="Eq. (36); gains by gfmhil design deploy, see the comments of the file\n",
+    )
+    law = discretise(build_law(parse_law(text)), T_S)
+    margins = ", ".join(
+        f"{margin_text(overall_delay(Point(dc=dc).loop(law)).seconds)} (DC source {dc})"
+        for dc in dict.fromkeys(box.dc)
+    )
+    path.write_text(f"# delay margin at nominal {margins}\n{text}", "utf-8")

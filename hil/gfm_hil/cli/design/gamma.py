@@ -22,7 +22,6 @@ from gfm_hil.studies.law import Law
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("gamma", help="gamma of a law's gains, channel by channel")
     add_law_options(command)
     command.add_argument(

@@ -12,10 +12,9 @@ import numpy as np
 from rich.table import Table
 
 from gfm_design.margins.all_margins import UnstableLoop
-from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, mode_as_json
+from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
+from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
@@ -64,12 +63,7 @@ def call(options: argparse.Namespace) -> int:
     try:
         content, table = options.find(loop, options)
     except UnstableLoop as problem:
-        if options.json:
-            reason = {"mode": mode_as_json(problem.mode), "reason": str(problem)}
-            print(json.dumps({"law": label, "scenario": scenario.title, "stable": False} | reason))
-        else:
-            console.print(f"{label}: no margins, {problem}")
-        return EXIT_OTHERWISE
+        return no_margins(label, scenario.title, problem, options.json)
     if options.json:
         print(json.dumps({"law": label, "scenario": scenario.title} | content, indent=2))
     else:
@@ -136,12 +130,10 @@ def _margins(loop: Loop, options: argparse.Namespace) -> Found:
 
 def _modes(loop: Loop, options: argparse.Namespace) -> Found:
     modes = loop.modes()
-    table = Table(box=None, pad_edge=False)
-    for head in ("σ \\[1/s]", "frequency \\[Hz]", "damping ratio"):
-        table.add_column(head, justify="right")
+    table = numbers("σ \\[1/s]", "frequency \\[Hz]", "damping ratio")
     for mode in modes:
         table.add_row(f"{mode.sigma:.4g}", f"{mode.frequency_hz:.4g}", f"{mode.ratio:.3g}")
-    return {"stable": modes[0].sigma < 0.0, "modes": [mode_as_json(mode) for mode in modes]}, table
+    return {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}, table
 
 
 def _step(loop: Loop, options: argparse.Namespace) -> Found:
@@ -149,9 +141,8 @@ def _step(loop: Loop, options: argparse.Namespace) -> Found:
         t, y = loop.step_response(options.of, options.seconds)
     except ValueError as problem:
         raise UserError(f"--of: {problem}") from None
-    table = Table(box=None, pad_edge=False)
-    for head in (f"after {options.of}", "peak \\[p.u.]", "at \\[s]", "at the end \\[p.u.]"):
-        table.add_column(head, justify="left" if head.startswith("after") else "right")
+    heads = "peak \\[p.u.]", "at \\[s]", "at the end \\[p.u.]"
+    table = numbers(f"after {options.of}", *heads)
     content = {}
     for name, column in zip(Y_NAMES, y.T, strict=True):
         k = int(np.argmax(np.abs(column)))

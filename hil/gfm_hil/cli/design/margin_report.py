@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -10,21 +11,23 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gfm_design.margins.all_margins import ChannelMargins, Margins
+from gfm_design.margins.all_margins import ChannelMargins, Margins, UnstableLoop
 from gfm_design.margins.disk import DiskMargin
-from gfm_design.margins.tolerance import End, GridStrength, Range, Region
-from gfm_design.model.linear import Mode
+from gfm_design.margins.tolerance import End, GridStrength, Range
+from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.loop_delay import LoopDelay
+from gfm_hil.results.report import finite
 
 
 def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, Any]:
     """All margins; ``set_s`` is the loop delay that they are on top of, s."""
     loop = m.loop
     out: dict[str, Any] = {
-        "mode": mode_as_json(loop.worst),
+        "mode": loop.worst.plain(),
         "loop_delay_us": round(1e6 * set_s, 6),
-        "delay_us": _number(1e6 * loop.delay.seconds),
-        "delay_hz": _number(loop.delay.frequency_hz),
+        "delay_us": 1e6 * loop.delay.seconds,
+        "delay_hz": loop.delay.frequency_hz,
         "delay_looked_at_us": 1e6 * loop.longest,
         "u": {c.name: channel_as_json(c) for c in loop.u},
         "y": {c.name: channel_as_json(c) for c in loop.y},
@@ -36,47 +39,42 @@ def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, A
         margin = 1e6 * loop.delay.seconds
         out["run"] = {
             **asdict(measured),
-            "allowed_us": _number(measured.set_us + margin),
+            "allowed_us": measured.set_us + margin,
             "fits": measured.fits(margin),
             "verdict": measured.words(margin),
         }
-    return out
+    return dict(finite(out))
 
 
-def mode_as_json(mode: Mode) -> dict[str, Any]:
-    """One mode."""
-    return {"sigma": mode.sigma, "frequency_hz": mode.frequency_hz, "ratio": mode.ratio}
-
-
-def region_as_json(region: Region) -> dict[str, Any]:
-    """The map: sigma [1/s] by R_g, then L_g; null without an operating point."""
-    rows = [[_number(float(v)) for v in row] for row in region.sigma]
-    return {"L_g": list(region.L_g), "R_g": list(region.R_g), "sigma": rows}
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def no_margins(law: str, scenario: str, problem: UnstableLoop, as_json: bool) -> int:
+    """Say that an unstable loop has none; returns the exit code."""
+    if as_json:
+        found = {"law": law, "scenario": scenario, "stable": False}
+        found |= {"mode": problem.mode.plain(), "reason": str(problem)}
+        print(json.dumps(found, indent=2))
+    else:
+        terminal(highlight=False).print(f"{law}: no margins, {problem}")
+    return EXIT_OTHERWISE
 
 
 def channel_as_json(c: ChannelMargins) -> dict[str, Any]:
     """The margins of one channel; null where there is no limit."""
-    out = {name: _number(value) for name, value in asdict(c.gain_phase).items()}
-    out |= {"delay_us": _number(1e6 * c.delay.seconds), "delay_hz": _number(c.delay.frequency_hz)}
-    return {**out, "confirmed": c.confirmed}
+    delay = {"delay_us": 1e6 * c.delay.seconds, "delay_hz": c.delay.frequency_hz}
+    return dict(finite({**asdict(c.gain_phase), **delay, "confirmed": c.confirmed}))
 
 
 def _disk(d: DiskMargin) -> dict[str, Any]:
     return {
         "alpha": d.alpha,
         "frequency_hz": d.frequency_hz,
-        "gain": [_number(v) for v in d.gain],
+        "gain": list(d.gain),
         "phase_deg": d.phase_deg,
         "alpha_unstructured": d.full,
     }
 
 
 def _end(end: End) -> dict[str, Any]:
-    lost = mode_as_json(end.lost) if end.lost else ("no operating point" if end.bounded else None)
+    lost = end.lost.plain() if end.lost else ("no operating point" if end.bounded else None)
     return {"percent": 100 * (end.factor - 1), "factor": end.factor, "lost": lost}
 
 
@@ -87,7 +85,7 @@ def _range(r: Range) -> dict[str, Any]:
 def _grid(g: GridStrength) -> dict[str, Any]:
     return {
         "scr": g.now,
-        "x_over_r": _number(g.x_over_r),
+        "x_over_r": g.x_over_r,
         "strongest_scr": g.strongest,
         "strongest_is_limit": g.range.low.bounded,
         "weakest_scr": g.weakest,
@@ -138,9 +136,8 @@ def print_margins(
 
 def loops_table(channels: Iterable[ChannelMargins]) -> Table:
     """Gain, phase, delay and disk margin, one row a channel."""
-    table = Table(box=None, pad_edge=False)
-    for head in ("loop at", "gain ↓ @ Hz", "gain ↑ @ Hz", "phase @ Hz", "delay µs @ Hz", "disk α"):
-        table.add_column(head, justify="left" if head == "loop at" else "right")
+    heads = "gain ↓ @ Hz", "gain ↑ @ Hz", "phase @ Hz", "delay µs @ Hz", "disk α"
+    table = numbers("loop at", *heads)
     for c in channels:
         g = c.gain_phase
         table.add_row(
@@ -163,9 +160,7 @@ def _delay(us: float, hz: float) -> str:
 
 
 def _elements_table(m: Margins) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for head in ("element", "down to", "up to"):
-        table.add_column(head, justify="left" if head == "element" else "right")
+    table = numbers("element", "down to", "up to")
     for name, r in m.elements.items():
         ends = (r.low, r.high) if r else ()
         cells = [f"{100 * (e.factor - 1):+.4g} %{_why(e)}" for e in ends] or ["is 0", "is 0"]

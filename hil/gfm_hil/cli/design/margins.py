@@ -7,23 +7,22 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.progress import Progress
+from rich.progress import BarColumn
 
 from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
-from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.cli.design.margin_report import as_json, mode_as_json, print_margins, region_as_json
-from gfm_hil.core.errors import UserError
+from gfm_hil.cli.common import progress
+from gfm_hil.cli.design.margin_report import as_json, no_margins, print_margins
 from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.loop_delay import loop_delay
+from gfm_hil.results.report import finite
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
 from gfm_hil.studies.margin_figures import draw_delay, draw_region
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser(
         "margins", help="gain, phase, delay and disk margins, parameter ranges, stable grids"
     )
@@ -51,13 +50,7 @@ def call(options: argparse.Namespace) -> int:
     try:
         found = margins(loop)
     except UnstableLoop as problem:
-        if options.json:
-            content = {"law": label, "scenario": scenario.title, "stable": False}
-            content |= {"mode": mode_as_json(problem.mode), "reason": str(problem)}
-            print(json.dumps(content, indent=2))
-        else:
-            console.print(f"{label}: no margins, {problem}")
-        return EXIT_OTHERWISE
+        return no_margins(label, scenario.title, problem, options.json)
     margin = found.loop.delay.seconds
     set_s = float(loop.u_delay[0])
     measured = None if run is None else loop_delay(run, set_s, margin)
@@ -66,7 +59,8 @@ def call(options: argparse.Namespace) -> int:
         content = {"law": label, "scenario": scenario.title, "stable": True}
         content |= as_json(found, set_s, measured)
         if region is not None:
-            content["region"] = region_as_json(region)
+            rows = {name: getattr(region, name).tolist() for name in ("L_g", "R_g", "sigma")}
+            content["region"] = finite(rows)
         print(json.dumps(content, indent=2))
     else:
         print_margins(console, label, scenario.title, found, set_s, measured)
@@ -76,11 +70,8 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _draw(folder: Path, loop: Loop, label: str, margin: float) -> Region:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise UserError(f"--figures {folder}: {problem.strerror}") from None
-    with Progress(console=terminal(stderr=True), transient=True) as bar:
+    folder.mkdir(parents=True, exist_ok=True)
+    with progress("{task.description}", BarColumn()) as bar:
         task = bar.add_task("stable region", total=POINTS)
         region = stable_region(loop, POINTS, lambda rows: bar.update(task, completed=rows))
     draw_region(folder / "region.png", loop, label, region)

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
-from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.cli.common import EXIT_OTHERWISE, progress
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
@@ -26,7 +26,6 @@ from gfm_hil.studies.tuned_law import write_law
 
 
 def add(kinds: Any) -> None:
-    """Add the command to the parser."""
     command = kinds.add_parser("tune", help="choose the free gains for the least gamma")
     add_law_options(command)
     command.add_argument("--seed", type=int, default=0, help="of the search")
@@ -88,15 +87,8 @@ def call(options: argparse.Namespace) -> int:
 
 def _searched(law: Law, options: argparse.Namespace) -> Tuning:
     """The search, with a bar on stderr."""
-    console = terminal(stderr=True, quiet=options.quiet)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("γ {task.fields[best]}"),
-        console=console,
-        disable=not console.is_terminal,
-        transient=True,
-    ) as bar:
+    columns = "{task.description}", BarColumn(), "γ {task.fields[best]}"
+    with progress(*columns, quiet=options.quiet) as bar:
         task = bar.add_task(f"tuning {law.name}", best="–")
 
         def tell(done: int, of: int, best: float) -> None:

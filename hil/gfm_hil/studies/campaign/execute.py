@@ -84,19 +84,6 @@ def _keep(done: set[Future[list[Record]]], keep: Callable[[list[Record]], None])
         raise WorkerLost(str(failed) or repr(failed)) from failed
 
 
-class Here(Executor):
-    """Runs each task in this process when it is submitted."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run ``fn``; the future is done."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as problem:
-            future.set_exception(problem)
-        return future
-
-
 @contextlib.contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of fresh processes, each with one thread."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
+from gfm_hil.results.figures import dress
 from gfm_hil.studies.campaign.axes import Axis
 from gfm_hil.studies.campaign.result import VERDICTS, verdict
 from gfm_hil.studies.campaign.spec import Campaign
@@ -27,22 +26,11 @@ _LOOKS = {  # colour, marker, size: told apart without colour too
     "safe": ("#CC79A7", "^", 17),
     "no-steady-state": ("#777777", "s", 13),
 }
-_GREY = "#888888"
 _SHADE = LinearSegmentedColormap.from_list("share", ["#f6d9c6", "#ffffff", "#cfe3f1"])
 _CELLS = 90  # a side of the background
 _REACH = 0.06  # of an axis: how far a run tells about its surroundings (one sigma)
 _UNKNOWN = 0.3  # runs; where fewer are near, the share is unknown: one half
 _LEAST = 60  # runs; fewer tell no share
-
-
-def draw_map(
-    path: Path, campaign: Campaign, records: Sequence[Record], x: Axis, y: Axis | None
-) -> None:
-    """Draw the map into a file, see ``fill_map``."""
-    figure = Figure()
-    FigureCanvasAgg(figure)
-    fill_map(figure, campaign, records, x, y)
-    figure.savefig(path, dpi=130)
 
 
 def fill_map(
@@ -85,6 +73,8 @@ def _panel(
     a = _spread(x, records, 1)
     b = _spread(y, records, 2) if y else np.array([r["run"] for r in records], dtype=float)
     verdicts = np.array([verdict(r, campaign.file.ripple_max) for r in records], dtype=object)
+    dress(axes)
+    axes.grid(False)
     if x.log:
         axes.set_xscale("log")
     if y and y.log:
@@ -151,9 +141,4 @@ def _tidy(axes: Axes, x: Axis, y: Axis | None) -> None:
             drawn.set_major_locator(LogLocator(subs=(1, 2, 5)))
             drawn.set_major_formatter(plain)
             drawn.set_minor_formatter(NullFormatter())
-    axes.tick_params(labelsize=8.5, color=_GREY)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(_GREY)
     axes.margins(0.02)

@@ -114,10 +114,14 @@ def write_result(
         workers: number of processes, or the address of the cluster.
         wall_s: how long the last call took, s.
     """
-    from gfm_hil.studies.campaign.figure import draw_map
-
     if found.records:
-        draw_map(folder / "map.png", found.campaign, found.records, *axes)
+        from matplotlib.figure import Figure
+
+        from gfm_hil.studies.campaign.figure import fill_map
+
+        figure = Figure()
+        fill_map(figure, found.campaign, found.records, *axes)
+        figure.savefig(folder / "map.png", dpi=130)
     content = {**found.summary, "workers": workers, "wall_s": wall_s}
     (folder / "campaign.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
     return content

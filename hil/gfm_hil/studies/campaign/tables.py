@@ -12,7 +12,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.results.report import EVENT_COLUMNS, cell
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.campaign.axes import Axis
@@ -40,10 +40,7 @@ def print_campaign(result: dict[str, Any], axes: tuple[Axis, Axis | None], folde
 
 def _counts(all_laws: dict[str, Any], names: Sequence[str]) -> Table:
     laws = {name: all_laws[name] for name in names}
-    table = Table(box=None, pad_edge=False)
-    table.add_column("")
-    for law in laws:
-        table.add_column(escape(law), justify="right")
+    table = numbers("", *map(escape, laws))
     for name in VERDICTS:
         counts = [found["counts"][name] for found in laws.values()]
         if any(counts):

@@ -13,6 +13,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compiled_bench
 from gfm_hil.engine.inproc import buffers
 from gfm_hil.recording.parts import Part
+from gfm_hil.results.report import finite
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
@@ -80,7 +81,7 @@ def record(
     completed = summary["status"] == "completed"
     events = [{k: v for k, v in e.items() if k not in _EVENT_KEYS} for e in summary["events"]]
     window = p[-max(1, round(_RIPPLE_WINDOW / scenario.T_s)) :]
-    return _finite(
+    return finite(
         {
             "run": run,
             "law": law,
@@ -102,15 +103,3 @@ def _growth(event: dict[str, Any]) -> float | None:
     if zeta is None or hertz is None:
         return None
     return -zeta * 2 * math.pi * hertz / math.sqrt(1 - zeta**2)
-
-
-def _finite(value: Any) -> Any:
-    """None in place of NaN and infinity, which JSON does not know."""
-    match value:
-        case dict():
-            return {k: _finite(v) for k, v in value.items()}
-        case list():
-            return [_finite(v) for v in value]
-        case float() if not math.isfinite(value):
-            return None
-    return value

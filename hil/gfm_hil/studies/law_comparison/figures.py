@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import T_S
-from gfm_hil.results.figures import COLOURS
+from gfm_hil.results.figures import COLOURS, dress
 from gfm_hil.studies.law_comparison.experiments import AT, TRACE_EVERY
 from gfm_hil.studies.law_comparison.tables import others, worst
 
@@ -43,12 +42,8 @@ def _spread(rows: Sequence[Row]) -> list[Row]:
 
 def _figure(width: float, height: float) -> tuple[Figure, Any]:
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
-    axes.grid(True, color="#e4e4e4", lw=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    dress(axes)
     return figure, axes
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -12,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from gfm_design.margins.tolerance import End, Range
-from gfm_design.model.linear import Mode
 from gfm_design.norms.performance import Channel
-from gfm_design.tuning.law_comparison import Found, as_it_is, late_loop, search, stands
-from gfm_design.tuning.law_comparison_late import ALPHA
+from gfm_design.tuning.law_comparison import ALPHA, Found, as_it_is, late_loop, search, stands
 from gfm_design.tuning.law_comparison_modes import Culprit
+from gfm_hil.results.report import finite
 from gfm_hil.studies.law_comparison.experiments import EXPERIMENTS, experiment
 from gfm_hil.studies.tuned_law import channels_as_json, write_law
 from gfm_runtime import law_file
@@ -73,9 +71,9 @@ def make_row(job: Job, folder: Path, tell: Tell) -> Row:
     loop = stands(file, found.gains)
     row |= {
         "sigma": loop.sigma,
-        "worst": _mode(loop.worst),
-        "delay_us": _number(1e6 * loop.delay.seconds),  # null: more than was looked at
-        "delay_hz": _number(loop.delay.frequency_hz),
+        "worst": loop.worst.plain(),
+        "delay_us": finite(1e6 * loop.delay.seconds),  # null: more than was looked at
+        "delay_hz": finite(loop.delay.frequency_hz),
         "L_g": _range(loop.L_g),
         "R": _range(loop.R),
     }
@@ -105,17 +103,9 @@ def _found(found: Found) -> Row:
 def _channels(found: Sequence[Channel] | Culprit) -> Row:
     """gamma and channels, or the reason why there are none."""
     if isinstance(found, Culprit):
-        mode = {**_mode(found.mode), "states": [list(s) for s in found.states]}
+        mode = {**found.mode.plain(), "states": [list(s) for s in found.states]}
         return {"gamma": None, "channels": [], "reason": found.words(), "mode": mode}
     return channels_as_json(found)
-
-
-def _mode(mode: Mode) -> Row:
-    return {"sigma": mode.sigma, "frequency_hz": mode.frequency_hz, "ratio": mode.ratio}
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _range(found: Range | None) -> list[Row] | None:

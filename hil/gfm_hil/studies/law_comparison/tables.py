@@ -10,6 +10,7 @@ from rich.table import Table
 
 from gfm_design.margins.delays import longest
 from gfm_design.model.closed_loop import T_S
+from gfm_hil.core.terminal import markdown as table
 from gfm_hil.core.terminal import terminal
 
 Row = dict[str, Any]
@@ -162,23 +163,20 @@ def markdown(name: str, rows: Sequence[Row]) -> str:
     """One of ``TABLES``."""
     wanted = [r for r in rows if (r["gamma"] is None) == (name == "law_comparison_unstable")]
     columns = _WITH_GAMMA.get(name, _WITHOUT)
-    lines = [f"| {' | '.join(head for head, _ in columns)} |", f"|{'---|' * len(columns)}"]
-    for row in wanted:
-        cells = [text(row).replace("W_", "W").replace("|", "\\|") for _, text in columns]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines[0] = lines[0].replace("W_", "W")
-    return "\n".join(lines) + "\n"
+    heads = [head.replace("W_", "W") for head, _ in columns]
+    lines = [[text(row) for _, text in columns] for row in wanted]
+    cells = [[cell.replace("W_", "W").replace("|", "\\|") for cell in line] for line in lines]
+    return table(heads, cells) + "\n"
 
 
 def print_comparison(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
     """Print the ranking, then the laws that have no place in it, and why."""
     console = terminal(highlight=False)
-    heads = ("law", "γ own", "γ ideal", "γ late", "worst channel", "delay µs", "overshoot %")
-    table = Table(box=None, pad_edge=False)
-    for head in heads:
-        table.add_column(head, no_wrap=head == "law")
+    columns = ("law", "γ own", "γ ideal", "γ late", "worst channel", "delay µs", "overshoot %")
+    ranking = Table(*columns, box=None, pad_edge=False)
+    ranking.columns[0].no_wrap = True
     for row in (r for r in rows if r["gamma"] is not None):
-        table.add_row(
+        ranking.add_row(
             row["law"],
             own(row),
             number(row["ideal"]["gamma"], 4),
@@ -187,7 +185,7 @@ def print_comparison(rows: Sequence[Row], left_out: Mapping[str, str]) -> None:
             _delay(row),
             _bench("p_ref", "overshoot_pct")(row),
         )
-    console.print(table)
+    console.print(ranking)
     for row in (r for r in rows if r["gamma"] is None):
         console.print(f"{row['law']}: {row['reason']}", soft_wrap=True)
     for name, why in left_out.items():
