@@ -1,12 +1,13 @@
-"""A law and a plant, closed: the one loop that all analysis and synthesis looks at.
+"""The closed loop of a law and a plant, which all analysis and synthesis uses.
 
-The loop is continuous, as the paper's (Section III), or the exact sampled one of the bench. Around
-its operating point it maps w = (references r, grid d) to y as it truly is, before the sensors:
+The loop is continuous, as in the paper (Section III), or sampled exactly, as on the bench. Around
+its operating point it maps w = (references r, grid d) to the true y, before the sensors:
 
     x' = A x + B w,    y = C x + D w,    x = (plant, its delay lines, law),
 
-where x' is dx/dt or the x of the next tick. Every other quantity (modes, margins, gamma, step)
-is read off these matrices. A loop may be many at once: plants, laws or both on leading axes.
+where x' is dx/dt or the x of the next tick. All other quantities (modes, margins, gamma, step
+responses) follow from these matrices. One object may hold many loops: plants, laws or both have
+leading axes.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # (V_dcref, P_ref, omega_g, Q_ref, V_ref
 INPUTS = (*REF_NAMES, "grid.omega_g", "grid.V_g")
 
 _ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
-_GONE = 1e-9  # |z| below this is gone within a tick: an emptied delay line, no mode
+_GONE = 1e-9  # |z| below this belongs to a delay line: no mode
 _P_REF, _OMEGA_G = INPUTS.index("P_ref"), INPUTS.index("grid.omega_g")
 _V_C, _I_O = 2, 4  # where v_d and i_od are in the plant's state; v_q and i_oq follow
 _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
@@ -67,14 +68,15 @@ _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
 
 @dataclass(frozen=True)
 class Origin:
-    """What a loop was made of; ``ClosedLoop.changed`` makes it anew with other elements.
+    """Plant and law of a loop, from which ``ClosedLoop.changed`` builds loops with other elements.
 
     Attributes:
         plant: its options.
-        law: at its sampling time; ``ideal`` says that the loop has it as its file writes it.
+        law: at its sampling time.
+        ideal: the loop uses the continuous law.
         ref: references, shape (5,), p.u.
         par: the plant's record.
-        op: where plant and law rest.
+        op: the common operating point of plant and law.
     """
 
     plant: Plant
@@ -94,8 +96,8 @@ class ClosedLoop:
         T_s: sampling time, s; None for a continuous loop, which has no delay.
         u_delay: from the tick that samples y[k] to the moment when u[k] acts, s: a number, or shape
             (..., 3).
-        y_delay: how old y is at its tick, s: a number, or shape (..., 5).
-        origin: what it was made of, if known.
+        y_delay: age of y at its tick, s: a number, or shape (..., 5).
+        origin: plant and law, if known.
 
     Raises:
         ValueError: a continuous loop with a delay.
@@ -127,20 +129,20 @@ class ClosedLoop:
         T_s: float = T_S,
         ideal: bool = False,
     ) -> Self:
-        """The loop of a law on a plant, around the point where both rest.
+        """The loop of a law on a plant, around their common operating point.
 
         Args:
             law: catalogue name, path of a law file (of a scheduled law its first stage), a law, or
-                one at its sampling time.
+                a discretised law.
             plant: converter, delay, sensors, DC source, grid and factors of the elements, as in a
                 scenario; by default the paper's converter, with neither delay nor sensors.
             references: (V_dcref, P_ref, omega_g, Q_ref, V_ref), p.u.
-            T_s: sampling time, s; a law that has its own keeps it.
-            ideal: the continuous loop, neither sampled nor delayed, whatever the plant says.
+            T_s: sampling time, s; a discretised law keeps its own.
+            ideal: build the continuous loop, which ignores the plant's delay.
 
         Raises:
-            LawError: no such law, or it cannot be discretised.
-            NoEquilibrium: plant and law have no common rest.
+            LawError: the law does not exist or cannot be discretised.
+            NoEquilibrium: plant and law have no common operating point.
         """
         if not isinstance(law, DiscreteLaw):
             law = discretise(get_law(law) if isinstance(law, str) else law, T_s)
@@ -166,9 +168,9 @@ class ClosedLoop:
 
     @classmethod
     def stacked(cls, loops: Sequence[ClosedLoop]) -> Self:
-        """Single loops of one sampling time, whose sampled plants have one size, as many plants.
+        """Stack single loops with equal sampling times and plants of equal size.
 
-        The law is that of the first; ``with_law`` gives all of them another.
+        All get the law of the first; ``with_law`` gives all of them another.
         """
         plants = LinearPlant.stacked([loop.plant for loop in loops])
         u_delay, y_delay = (
@@ -192,28 +194,28 @@ class ClosedLoop:
         return out
 
     def sampled(self, T_s: float, delay: float = 0.0) -> Self:
-        """A continuous loop with its law by Tustin at T_s and u held ``delay`` later, s."""
+        """Sample a continuous loop: the law by Tustin at T_s, u held and ``delay`` later, s."""
         return type(self)(self.plant, self.law.sampled(T_s), T_s, delay)
 
     def later(self, u: ArrayLike = 0.0, y: ArrayLike = 0.0) -> Self:
-        """The sampled loop with more delay of u (3,) and y (5,), s; one number is for all."""
+        """The sampled loop with additional delay of u (3,) and y (5,), s; a number is for all."""
         u_delay, y_delay = self.u_delay + np.asarray(u), self.y_delay + np.asarray(y)
         return type(self)(self.plant, self.law, self.T_s, u_delay, y_delay, self.origin)
 
     def scaled(self, u: ArrayLike = 1.0, y: ArrayLike = 1.0) -> Self:
-        """The loop with u (3,) and y (5,) multiplied on their way, by complex numbers too."""
+        """The loop with u (3,) and y (5,) multiplied by real or complex factors on their way."""
         by_u, by_y, c = np.broadcast_to(u, NU)[:, None], np.broadcast_to(y, NY), self.law
         parts = (c.A, c.B * by_y, by_u * c.C, by_u * c.D * by_y, c.B_r, by_u * c.D_r)
         return self.with_law(LinearLaw(*parts, rows=c.rows))
 
     def changed(self, factors: Mapping[Element, float]) -> Self:
-        """The loop anew, at its own operating point, with elements at factors of their values.
+        """The loop with elements multiplied by factors, around its new operating point.
 
         Raises:
-            NoEquilibrium: plant and law have none there.
+            NoEquilibrium: plant and law have no common operating point then.
         """
         of = self.made_of
-        # into the record: the emulator's sub-step, which make_plant checks, plays no part here
+        # change the record: make_plant would also check the emulator's sub-step
         par, nominal = of.par.copy(), load_converter(of.plant.converter).pu()
         for name, factor in factors.items():
             par[name] = nominal[name] * factor
@@ -221,10 +223,10 @@ class ClosedLoop:
 
     @property
     def made_of(self) -> Origin:
-        """What the loop was made of.
+        """Plant and law of the loop.
 
         Raises:
-            ValueError: it was made of matrices.
+            ValueError: the loop was made from matrices.
         """
         if self.origin is None:
             raise ValueError("this loop was made of matrices, not of a plant and a law")
@@ -234,7 +236,7 @@ class ClosedLoop:
 
     @cached_property
     def held(self) -> LinearPlant:
-        """The plant as the law meets it: from tick to tick with its delay lines, or continuous."""
+        """The plant as the law sees it: sampled, with its delay lines, or continuous."""
         T_s = self.T_s
         if T_s is None:
             return self.plant
@@ -275,8 +277,8 @@ class ClosedLoop:
     def performance(self, D_q: float = D_Q) -> StateSpace:
         """(A, B, C, D) of T from w = (P_ref, omega_g) to z = (P_ref - p, p, omega_u, q + V/D_q).
 
-        Section III-B of the paper. omega_g is the grid's frequency; the law's own reference omega_g
-        stays where it is (no PLL, as in the paper's MIMO-GFM).
+        Section III-B of the paper. omega_g is the grid's frequency; the law's reference omega_g
+        stays constant (no PLL, as in the paper's MIMO-GFM).
         """
         A, B, C, D = self.state_space
         w, z = [_P_REF, _OMEGA_G], np.zeros((4, NY))
@@ -287,22 +289,22 @@ class ClosedLoop:
 
     @cached_property
     def commands(self) -> tuple[int, ...]:
-        """Those of u that act: i_u does not where the DC source regulates itself."""
+        """Indices of the u that act: i_u does not if the DC source regulates itself."""
         acts = self.plant.B.any(axis=0) & (self.law.C.any(axis=1) | self.law.D.any(axis=1))
         return tuple(int(j) for j in np.flatnonzero(acts))
 
     @cached_property
     def measurements(self) -> tuple[int, ...]:
-        """Those of y that the law uses for a command that acts."""
+        """Indices of the y that the law uses for a command that acts."""
         used = self.law.B.any(axis=0) | self.law.D[list(self.commands)].any(axis=0)
         return tuple(int(i) for i in np.flatnonzero(used & self.plant.C.any(axis=1)))
 
-    # what they say
+    # results
 
     def sigma(self) -> Any:
         """Largest real part of any mode, 1/s: a number, or the shape of the leading axes.
 
-        A sampled loop without any eigenvalue but 0 gives -inf.
+        A sampled loop that has only the eigenvalue 0 gives -inf.
         """
         values = np.linalg.eigvals(self.A)
         if self.T_s is None:
@@ -311,7 +313,7 @@ class ClosedLoop:
             return np.log(np.abs(values).max(axis=-1)) / self.T_s
 
     def poles(self) -> Response:
-        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without emptied lines."""
+        """Poles s of a single loop, 1/s; of a sampled one log(z)/T_s, without delay lines."""
         values = np.linalg.eigvals(self.A).astype(complex)
         return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
 
@@ -323,10 +325,11 @@ class ClosedLoop:
     def channels(
         self, weights: tuple[Weight, ...] = PAPER_WEIGHTS, D_q: float = D_Q
     ) -> tuple[Channel, ...]:
-        """The norm of every weighted channel W_ij T_ij; a sampled loop has the weights by Tustin.
+        """The norm of every weighted channel W_ij T_ij; a sampled loop discretises the weights by
+        Tustin.
 
         Raises:
-            Unstable: the loop is not stable; it has no gamma.
+            Unstable: the loop is not stable and has no gamma.
         """
         return channel_norms(self.performance(D_q), weights, self.T_s)
 
@@ -334,7 +337,7 @@ class ClosedLoop:
         """The H-infinity norm of diag(W_ij T_ij), the largest of ``channels``.
 
         Raises:
-            Unstable: the loop is not stable; it has no gamma.
+            Unstable: the loop is not stable and has no gamma.
         """
         return max(channel.norm for channel in self.channels(weights, D_q))
 
@@ -342,9 +345,9 @@ class ClosedLoop:
         """Gain, phase, disk and delay margins of a sampled loop; takes a second.
 
         Raises:
-            UnstableLoop: there are none.
+            UnstableLoop: the loop is not stable and has no margins.
         """
-        from gfm_design.margins.all_margins import loop_margins  # which looks at loops itself
+        from gfm_design.margins.all_margins import loop_margins  # it imports this module
 
         return loop_margins(self)
 
@@ -353,11 +356,11 @@ class ClosedLoop:
     ) -> tuple[Matrix, Matrix]:
         """(t, y) after a unit step of one of ``INPUTS``: shapes (K,) in s and (K,5), p.u.
 
-        y = (v_dc, p, omega_u, q, V) are deviations, before the sensors, and exact. A sampled loop
-        gives every tick; ``every`` [s] is for a continuous one.
+        y = (v_dc, p, omega_u, q, V) are exact deviations before the sensors. A sampled loop gives
+        every tick, a continuous one a point every ``every`` s.
 
         Raises:
-            ValueError: no such input.
+            ValueError: there is no such input.
         """
         if of not in INPUTS:
             raise ValueError(f"{of!r} is no input of the loop; use one of {list(INPUTS)}")
@@ -380,7 +383,7 @@ class ClosedLoop:
     def loop_transfer(self, omega: ArrayLike, at_y: bool = False) -> Response:
         """L of all loops cut at u, or at y, so that S = (I + L)^-1; shape (K, 3, 3) or (K, 5, 5).
 
-        omega [rad/s] has shape (K,). Delay, sensors and the omega_u loop of the law are in it.
+        omega [rad/s] has shape (K,). L contains delay, sensors and the law's omega_u loop.
         """
         p, c, s = self.held, self.law, self._at(omega)
         zero = np.zeros((NY, NU))
@@ -390,7 +393,7 @@ class ClosedLoop:
     def loop_gain(self, at: str, omega: ArrayLike) -> Response:
         """L of one loop, cut at a channel of u or y while all others are closed, shape (K,).
 
-        The loop is on the verge of stability where L = -1. Gain and phase margins are those of
+        The loop is at its limit of stability where L = -1. Gain and phase margins are those of
         this L, see ``margins.locus``.
 
         Args:
@@ -412,32 +415,32 @@ class ClosedLoop:
     def output_impedance(self, omega: ArrayLike) -> Response:
         """Z of the converter at its capacitor, as the grid sees it: shape (K, 2, 2), p.u. of Z_b.
 
-        (-v_d, -v_q) = Z (i_od, i_oq) for small deviations, in the dq frame that turns steadily at
-        the grid's frequency and lies on the converter's own frame at rest, so that the
-        synchronisation is part of Z (Wen et al., "Analysis of D-Q Small-Signal Impedance of
-        Grid-Tied Inverters", IEEE Trans. Power Electron. 31(1), 2016). The line is not part of it.
-        Of a sampled loop this is the answer at the frequency itself: sampling also excites its
-        images at multiples of the sampling frequency.
+        (-v_d, -v_q) = Z (i_od, i_oq) for small deviations, in a dq frame that rotates at the grid's
+        frequency and coincides with the converter's frame in steady state, so that Z contains the
+        synchronisation (Wen et al., "Analysis of D-Q Small-Signal Impedance of Grid-Tied
+        Inverters", IEEE Trans. Power Electron. 31(1), 2016). The line is not part of Z. For a
+        sampled loop, Z is the response at the same frequency: sampling also excites images of it
+        around multiples of the sampling frequency.
 
         Args:
             omega: frequencies in the dq frame, rad/s, > 0, shape (K,).
 
         Raises:
-            ValueError: the loop was made of matrices.
+            ValueError: the loop was made from matrices.
         """
         x, omega = self.made_of.op.x, np.asarray(omega, float)
         whole, s = self.plant, 1j * omega
         io = np.array([_I_O, _I_O + 1])
         rest = np.delete(np.arange(len(whole.A)), io)
         delta = int(np.flatnonzero(rest == DELTA)[0])
-        turn = np.array([x[_I_O + 1], -x[_I_O]])  # of i_o in the converter's frame, by delta
+        turn = np.array([x[_I_O + 1], -x[_I_O]])  # derivative by delta of i_o, converter's frame
         A, C = whole.A[np.ix_(rest, rest)], whole.C[:, rest]
         by_i, y_by_i = whole.A[np.ix_(rest, io)], whole.C[:, io]
         A[:, delta] += by_i @ turn
         C[:, delta] += y_by_i @ turn
         v = np.zeros((2, len(rest)))
-        v[0, _V_C], v[1, _V_C + 1] = 1.0, 1.0  # these come before i_o: the same places in rest
-        v[:, delta] = -x[_V_C + 1], x[_V_C]  # v in the steady frame, by delta
+        v[0, _V_C], v[1, _V_C + 1] = 1.0, 1.0  # they precede i_o: the same indices in rest
+        v[:, delta] = -x[_V_C + 1], x[_V_C]  # derivative by delta of v in the steady frame
         alone = LinearPlant(A, whole.B[rest], whole.B_d[rest], C, whole.C_true[:, rest])
         p = ClosedLoop(alone, self.law, self.T_s, self.u_delay, self.y_delay).held
         c, at = self.law, self._at(omega)
@@ -445,7 +448,7 @@ class ClosedLoop:
         K = _response((c.A, c.B, c.C, c.D), at)
         y = _response((A, by_i, C, y_by_i), s) * np.exp(-s[:, None] * self.y_delay)[:, :, None]
         u = np.linalg.solve(np.eye(NU) - K @ G, K @ y)
-        if self.T_s is not None:  # u acts late, and is held over the tick
+        if self.T_s is not None:  # u acts after its delay, and is held over the tick
             hold_at = (1.0 - np.exp(-s * self.T_s)) / (s * self.T_s)
             u = u * (hold_at[:, None] * np.exp(-s[:, None] * self.u_delay))[:, :, None]
         zero = np.zeros((2, NU + 2))
@@ -464,7 +467,7 @@ def frequencies_near(poles: Response) -> Matrix:
 
 
 def _response(of: StateSpace, s: Response) -> Response:
-    """C (s I - A)^-1 B + D, one a row of s."""
+    """C (s I - A)^-1 B + D for each element of s."""
     A, B, C, D = of
     states = np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
     return np.asarray(C @ states + D)

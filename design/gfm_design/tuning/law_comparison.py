@@ -1,8 +1,8 @@
 """One law of the comparison: its gains tuned for the paper's converter, and its loop's margins.
 
-gamma is that of the paper's ideal continuous loop (``PaperProblem``). What a real loop does to the
-gains is read off the exact sampled one at T_S: modes, elements and grid with one sample of delay,
-the delay from the sample of y to the action of u counted from none.
+gamma is that of the paper's ideal continuous loop (``PaperProblem``). The modes and the tolerances
+of elements and grid are those of the exact loop sampled at T_S with one sample of delay. The delay
+margin counts from the sample of y to the action of u.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from gfm_runtime.lawfile import LawFile, build_law
 
 Vector = NDArray[np.float64]
 
-_DIGITS = 7  # of a tuned gain: what a reader can compare and the search resolves
-_LATE_EVALUATIONS, _LATE_STARTS = 20, 2  # times the ideal search's; at the border no polish helps
-_SLOWEST = 1e-3  # Hz; what turns more slowly is no oscillation
-_SAME_GAMMA = 1e-4  # relative; by so much a gain may change gamma that makes no difference
-_NEAR = 0.99  # of the decay asked for
-_SAME = 0.03  # relative; so much the others must not cost a channel that is pinned
+_DIGITS = 7  # of a tuned gain: the search resolves no more
+# evaluations relative to the ideal search: at the limit of stability no polish helps
+_LATE_EVALUATIONS, _LATE_STARTS = 20, 2
+_SLOWEST = 1e-3  # Hz; a slower mode does not count as an oscillation
+_SAME_GAMMA = 1e-4  # relative change of gamma below which a gain makes no difference
+_NEAR = 0.99  # of the required decay
+_SAME = 0.03  # relative: by less than this the pinned channels may grow
 _SETTLES = 3
 
 Pair = tuple[int, int]  # i, j of a channel
@@ -47,18 +48,19 @@ Progress = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class Found:
-    """What the search came to.
+    """The result of the search.
 
     Attributes:
         free: names of the gains that were searched.
         before: channels of the file's own gains, or the mode that grows with them.
-        ideal: channels of the gains with the least gamma, whether they can be run or not.
-        gains: the least gamma of gains that hold sampled and one sample late
-            (``tuning.law_comparison_late``), with what is tied to them; None if nothing does.
-        after: their channels; or the mode in the way, of what came closest.
-        fixed: channels (i, j) whose norm, at omega = 0 or infinity, no gains that hold can lower,
-            the largest first; the gains were chosen for the least of the others.
-        evaluations, seconds: what the search took.
+        ideal: channels of the gains with the least gamma, even if the kernel cannot run them.
+        gains: those with the least gamma whose sampled loop is stable with one sample of delay
+            (``tuning.law_comparison_late``), and all parameters tied to them; None if there are
+            none.
+        after: their channels, or the least stable mode of the best gains that were tried.
+        fixed: channels (i, j) whose norm, at omega = 0 or infinity, no stabilising gains can lower,
+            the largest first; the gains minimise the largest of the others.
+        evaluations, seconds: the effort of the search.
     """
 
     free: tuple[str, ...]
@@ -76,10 +78,11 @@ class Stands:
     """The sampled loop at T_S on the nominal converter.
 
     Attributes:
-        worst: the oscillation with the least damping ratio, one sample late.
-        sigma: the loop's largest real part one sample late, 1/s.
-        delay: how late u may act after the sample of y; 0 if the loop does not hold without delay.
-        L_g, R: factors within which it holds one sample late; R is R_f and R_g together.
+        worst: the oscillation with the lowest damping ratio, with one sample of delay.
+        sigma: the largest real part of a mode with one sample of delay, 1/s.
+        delay: from the sample of y to the action of u; 0 if the loop is unstable without delay.
+        L_g, R: factors within which the loop is stable with one sample of delay; R is R_f and R_g
+            together.
     """
 
     worst: Mode
@@ -96,16 +99,16 @@ def search(
     starts: int | None = None,
     progress: Progress = lambda done, best: None,
 ) -> Found:
-    """Tune a law's free gains, first as ``gfmhil design tune`` does, then so that they can be run.
+    """Tune a law's free gains, first as ``gfmhil design tune`` does, then for the sampled loop.
 
     ``seed``, ``evaluations``, ``starts`` and ``progress`` as for ``tune_paper``.
 
     The structure of a law can pin a channel at omega = 0 or infinity, whatever its gains: a row 3
-    that cannot hold q + V/D_q pins W_41 T_41(0), a P_ref that reaches omega_u unfiltered pins
-    W_31 T_31(inf); or gains that would lower it do not hold. Where such a channel is the largest,
-    gamma does not tell good gains from bad ones. They are then searched again for the least of the
-    other channels, and taken if the pinned ones do not suffer; and so on, as long as the largest
-    channel left is at such a limit.
+    that cannot hold q + V/D_q pins W_41 T_41(0), and a P_ref that reaches omega_u unfiltered pins
+    W_31 T_31(inf). Or the gains that would lower the channel make the loop unstable. If such a
+    channel is the largest, gamma does not distinguish good gains from bad ones. The search then
+    minimises the largest of the other channels, and keeps the result if the pinned channels do not
+    grow. It repeats this as long as the largest channel left is at such a limit.
 
     Raises:
         LawError: the file declares no free gain.
@@ -152,7 +155,7 @@ def search(
         spent += sum(t.evaluations for t in tried)
         found = min(tried, key=lambda t: t.cost)
     values = found.values
-    for _ in range(_SETTLES):  # a law without integrators in row 3 rests elsewhere with new gains
+    for _ in range(_SETTLES):  # without integrators in row 3 the operating point depends on gains
         if LateProblem(PaperProblem(file, from_(values)), _NEAR * ALPHA)(values) < UNSTABLE:
             break
         again = late(from_(values))
@@ -169,26 +172,27 @@ def search(
     named = problem.law.named(values)
     problem.move_to(named)
     after = problem.channels(values)
-    ideal = min(ideal, after, key=gamma)  # the first search may have ended a little above
+    ideal = min(ideal, after, key=gamma)  # the first search may have ended slightly above
     return left(named, after, fixed)
 
 
 def restored(file: LawFile, values: Vector, fixed: Sequence[Pair]) -> Vector:
-    """The tuned gains, but those that make no difference to gamma are the file's own again.
+    """The tuned gains, except that gains without influence on gamma return to the file's values.
 
-    Where row 1 only holds v_dc, and nothing else looks at v_dc, gamma does not see its gains: the
-    search leaves them anywhere, where the DC link may collapse in a step. Gains go back one or two
-    at a time, as long as gamma and every stage of it without the fixed channels stay.
+    If row 1 only controls v_dc, and no other row uses v_dc, gamma does not depend on its gains: the
+    search leaves them at arbitrary values, with which the DC link may collapse in a step. Gains
+    return one or two at a time, as long as gamma and the largest of the channels that are not fixed
+    stay the same.
     """
     own = np.array([g.start for g in free_gains(file)])
     names = [g.name for g in free_gains(file)]
-    # the tuned gains may lie on the border, and the operating point is now their own
+    # at the operating point of the tuned gains, which may lie at the limit of stability
     here = PaperProblem(file, free_gains(file, dict(zip(names, map(float, values), strict=True))))
     late, old = LateProblem(here, _NEAR * ALPHA), here.channels(values)
 
     def makes_no_difference(group: tuple[int, ...]) -> bool:
         tried = np.where(np.isin(np.arange(len(own)), group), own, values)
-        # not by the search's own gamma, which is a bound from below
+        # compare the guaranteed norms: the search's own gamma is a lower bound
         held = late(tried) < UNSTABLE
         return held and _no_worse(here.channels(tried), old, fixed, _SAME_GAMMA)
 
@@ -201,7 +205,7 @@ def restored(file: LawFile, values: Vector, fixed: Sequence[Pair]) -> Vector:
 
 
 def as_it_is(file: LawFile) -> Found:
-    """A law with its own gains, nothing searched."""
+    """A law with the gains of its file, without a search."""
     problem = PaperProblem(file, free_gains(file))
     at = np.array([g.start for g in problem.gains])
     channels = _channels(problem, at)
@@ -216,8 +220,8 @@ def gamma(channels: Sequence[Channel]) -> float:
 
 
 def _at_its_limit(channels: Sequence[Channel], fixed: Sequence[Pair]) -> Pair | None:
-    """The largest channel but ``fixed`` whose peak is at omega = 0 or infinity, if it is as good
-    as the largest of all: a search brings others up to one that it cannot lower."""
+    """The largest channel, apart from ``fixed``, whose peak is at omega = 0 or infinity, if it is
+    within 3 % of the largest of all: a search raises others up to one that it cannot lower."""
     left = [c for c in channels if (c.i, c.j) not in fixed]
     worst = max(c.norm for c in left)
     ends = [c for c in left if c.omega in (0.0, np.inf) and c.norm >= (1 - _SAME) * worst]
@@ -230,7 +234,7 @@ def _at_its_limit(channels: Sequence[Channel], fixed: Sequence[Pair]) -> Pair | 
 def _no_worse(
     new: Sequence[Channel], old: Sequence[Channel], fixed: Sequence[Pair], by: float = _SAME
 ) -> bool:
-    """gamma, and the largest of what is left of it without each of ``fixed`` in turn."""
+    """Whether neither gamma nor the largest norm without the first 1, 2, … of ``fixed`` grows."""
 
     def largest(channels: Sequence[Channel], without: Sequence[Pair]) -> float:
         return gamma([c for c in channels if (c.i, c.j) not in without])
@@ -247,13 +251,13 @@ def _channels(problem: PaperProblem, values: Vector) -> After:
 
 
 def late_loop(file: LawFile, gains: Mapping[str, float]) -> ClosedLoop:
-    """A law at some gains on the nominal converter, sampled at T_S, one sample late."""
+    """A law at given gains on the nominal converter, sampled at T_S with one sample of delay."""
     plant = Plant.model_validate({"delay": {"samples": 1}})
     return ClosedLoop.of(build_law(file, gains), plant)
 
 
 def stands(file: LawFile, gains: dict[str, float]) -> Stands:
-    """What the sampled loop of a law at some gains stands; takes some seconds."""
+    """The margins of the sampled loop of a law at given gains; takes some seconds."""
     late = late_loop(file, gains)
     modes = late.modes()
     worst = min((m for m in modes if m.frequency_hz > _SLOWEST), key=lambda m: m.ratio)

@@ -1,8 +1,8 @@
-"""The paper's problem for gains that can be run: sampled and one sample late, the loop must hold.
+"""The paper's problem, constrained to gains whose loop is stable with sampling and delay.
 
-gamma is that of the ideal continuous loop; gains whose sampled loop decays too slowly, or grows,
-count as unstable. Without that, the search may end at gains that the kernel cannot run: sampling
-alone takes the LC resonance, lightly damped by the choke, across the border.
+gamma is that of the ideal continuous loop. Gains whose loop, sampled and with one sample of delay,
+decays too slowly or grows count as unstable. Without this constraint the search may end at gains
+that the kernel cannot run: sampling alone can destabilise the lightly damped LC resonance.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ class LateProblem:
     """Cost of a law's gains; a problem for ``synthesis.tune``.
 
     Args:
-        paper: gamma.
-        alpha: every mode decays at least so fast, 1/s.
+        paper: computes gamma.
+        alpha: least decay rate of every mode, 1/s.
     """
 
     def __init__(self, paper: PaperProblem, alpha: float = ALPHA) -> None:
         self.paper, self._alpha = paper, alpha
 
     def sigma(self, values: Vector) -> Vector:
-        """Largest real part of any mode, 1/s, of sets of gains, one a row; inf where no law."""
+        """Largest real part of any mode, 1/s, by rows of gains; inf where they give no law."""
         law, late = self.paper.law(values), self.paper.late
         good = np.isfinite(law.A).all(axis=(1, 2)) & np.isfinite(law.D).all(axis=(1, 2))
         out = np.full(len(values), np.inf)
@@ -43,11 +43,11 @@ class LateProblem:
         return out
 
     def __call__(self, values: Vector) -> float:
-        """gamma, or what gains cost that do not hold."""
+        """gamma, or the cost of gains that violate the constraint."""
         return float(self.many(values[None, :])[0])
 
     def many(self, values: Vector) -> Vector:
-        """Costs of several, one a row."""
+        """Costs of several sets of gains, one a row."""
         costs = self.paper.many(values)
         stable = np.flatnonzero(costs < UNSTABLE)
         if len(stable):
@@ -56,7 +56,7 @@ class LateProblem:
         return costs
 
     def polish(self, code: Encoding, point: Vector) -> Vector:
-        """As far towards a lower gamma nearby as the loop holds."""
+        """The best point on the way to a lower gamma nearby that meets the constraint."""
         step = self.paper.polish(code, point) - point
         tried = np.array([point, *(point + share * step for share in _SHARES)])
         best: Vector = tried[np.argmin(self.many(code.values(tried)))]

@@ -20,7 +20,7 @@ from gfm_runtime.lawfile import LawFile, build_law
 
 Vector = NDArray[np.float64]
 
-#: Section IV-A's initial K, by law: what ``tune`` starts from if not told otherwise
+#: Section IV-A's initial K, by law: the default start of ``tune``
 PAPER_START: dict[str, dict[str, float]] = {
     "mimo-gfm": {
         "k_pdc": 90.0,
@@ -36,9 +36,9 @@ PAPER_START: dict[str, dict[str, float]] = {
 class PaperProblem:
     """gamma of a law on the paper's converter, as a function of its free gains.
 
-    The plant is ideal whatever ``plant`` says of delay and sensors; factors and the DC source
-    count. The operating point is that of the starting gains. ``late`` is the loop there sampled at
-    T_s with one sample of delay, for other laws to be put into it.
+    The problem uses the factors and the DC source of ``plant``, but neither its delay nor its
+    sensors. The operating point is that of the starting gains. ``late`` is the loop there, sampled
+    at T_s with one sample of delay; callers put other laws into it.
     """
 
     file: LawFile
@@ -54,7 +54,7 @@ class PaperProblem:
         self.move_to({g.name: g.start for g in self.gains})
 
     def move_to(self, named: dict[str, float]) -> None:
-        """Take the operating point of these gains (it hardly depends on them)."""
+        """Move to the operating point of these gains; it hardly depends on them."""
         law, ref = build_law(self.file, named), np.asarray(self.references)
         self._rest = ClosedLoop.of(law, self._ideal, ref, T_s=self.T_s, ideal=True)
         self.late = self._rest.sampled(self.T_s, self.T_s)
@@ -63,7 +63,7 @@ class PaperProblem:
 
     @property
     def op(self) -> OperatingPoint:
-        """Where plant and law rest."""
+        """The common operating point of plant and law."""
         return self._rest.made_of.op
 
     @property
@@ -72,23 +72,23 @@ class PaperProblem:
         return self._rest.plant
 
     def loops(self, values: Vector) -> StateSpace:
-        """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
+        """T(s) at these gains; rows of gains give stacked loops, nan where they give no law."""
         return self.closed_loops(values).performance()
 
     def closed_loop(self, values: Vector) -> ClosedLoop:
         """The continuous loop at these gains, with as few states as the law needs.
 
         Raises:
-            LawError: the gains make no law.
+            LawError: the gains give no valid law.
         """
         return self._rest.with_law(self.law.exact(values))
 
     def closed_loops(self, values: Vector) -> ClosedLoop:
-        """The continuous loops at rows of gains, in one; nan where they make no law."""
+        """The continuous loops at rows of gains, stacked; nan where they give no law."""
         return self._rest.with_law(self.law(values))
 
     def __call__(self, values: Vector) -> float:
-        """Cost: a close lower bound of gamma, or what an unstable loop costs."""
+        """Cost: a close lower bound of gamma, or the cost of an unstable loop."""
         return float(self.many(values[None, :])[0])
 
     def many(self, values: Vector) -> Vector:
@@ -102,7 +102,7 @@ class PaperProblem:
         return costs
 
     def polish(self, code: Encoding, point: Vector) -> Vector:
-        """A lower gamma nearby, by its active peaks."""
+        """A point nearby with a lower gamma, found from the active peaks."""
         try:
             return polish(
                 lambda x: self.loops(code.values(x)), self.weights, point, code.low, code.high
@@ -115,7 +115,7 @@ class PaperProblem:
         return self.closed_loop(values).channels(self.weights)
 
     def sampled_channels(self, values: Vector) -> tuple[Channel, ...]:
-        """As ``channels`` of the loop at T_s: law by Tustin, u and w held over each tick, no delay.
+        """As ``channels``, of the loop sampled at T_s: law by Tustin, u and w held, no delay.
 
         Raises:
             Unstable: the sampled loop is not stable.
