@@ -155,10 +155,10 @@ class Scenario(_Model):
         description="wait: a trip or a safe state does not end the run; the plant stays blocked "
         "until an event, or an operator, resets both sides to the scenario's start",
     )
-    keep_awake: Literal["auto", "always", "never"] = Field(
+    prevent_idle: Literal["auto", "always", "never"] = Field(
         "auto",
-        description="real time: a thread of idle priority keeps each side's processor from "
-        "resting; auto: on a virtual machine, whose host returns late what has rested",
+        description="real time: a thread of idle priority keeps each side's processor busy; auto: "
+        "on a virtual machine, whose host may return an idle processor late",
     )
     ready_laws: list[str] = Field(
         default_factory=list,
