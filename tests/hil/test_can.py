@@ -19,10 +19,10 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import Link, link_kind, open_link
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.layout import load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
-from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.scenario.model import Scenario

@@ -176,10 +176,3 @@ def test_the_last_word_waits_for_room(endpoint):
     finally:
         plant.close()
         controller.close()
-
-
-def test_the_safe_state_travels_in_the_frame():
-    message = FrameWriter("u").pack(9, SAFE, 1, np.ones(3))
-    reader = FrameReader("u")
-    reader.unpack(message, np.zeros(3))
-    assert (reader.state, reader.reason, reader.tick) == (SAFE, 1, 9)

@@ -160,7 +160,7 @@ def test_a_name_that_is_none(role, name):
 def test_the_longest_name_and_a_fresh_one_are_good(tmp_path):
     kind = link_kind("shm")
     for name in ("shm://" + "x" * 200, kind.fresh(tmp_path)):
-        kind.check_endpoint(name)
+        kind.checked(name, {})
         open_link("shm", "controller", name).close()
         assert not segment_of(name).exists()
 

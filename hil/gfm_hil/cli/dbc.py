@@ -50,9 +50,9 @@ def call(options: argparse.Namespace) -> int:
 
 def _budgets(T_s: float) -> Table:
     """Longest frames of y and u by bit rate, and the exchange that fits."""
-    from gfm_hil.links.can.bus_budget import budget
+    from gfm_hil.links.can import CanOptions
+    from gfm_hil.links.can.bus_time import budget
     from gfm_hil.links.can.layout import load_plan
-    from gfm_hil.links.can.options import CanOptions
 
     table = Table(box=None, pad_edge=False, caption_justify="left")
     table.caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"

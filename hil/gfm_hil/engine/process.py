@@ -25,8 +25,8 @@ from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
-from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
-from gfm_hil.links.impaired import ImpairedLink
+from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
+from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording.log import Outcome
@@ -153,7 +153,7 @@ def compile_role(role: Role, bench: Bench, part: Part) -> None:
         values = np.zeros(len(names(group)))
         reader = FrameReader(group)
         reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
-        reader.judge(False, False)
+        judge(reader.record, False, False)
     compile_loops(role, bench, part)
     pump.warm_up()
     if role == "plant":

@@ -15,46 +15,35 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 
-from gfm_hil.realtime.atomics import intrinsic, load_acquire, pause
+from gfm_hil.realtime.atomics import load_acquire, pause
 from gfm_hil.realtime.environment import virtual_machine
 from gfm_runtime.compiled import compiled
 
-_STOP, _RUNS = range(2)
+_STOP, _RUNS, _PRIORITY, _FLAGS = range(4)  # _PRIORITY: a struct sched_param, 0
 _OTHER, _IDLE = 0, 5  # SCHED_OTHER, SCHED_IDLE of sched.h on Linux
 _BETWEEN_LOOKS = 1000  # pauses between two polls of the flag, some 20 µs
 _PATIENCE_S = 1.0
 
 
-@intrinsic
-def _become(typingctx, policy):
-    """Give the calling thread a non-real-time policy; returns 0, or -1 if refused."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        i32 = ir.IntType(32)
-        kind = ir.FunctionType(i32, [i32, i32, i32.as_pointer()])
-        known = builder.module.globals.get("sched_setscheduler")
-        function = known or ir.Function(builder.module, kind, "sched_setscheduler")
-        with builder.goto_entry_block():
-            priority = builder.alloca(i32)
-        builder.store(i32(0), priority)
-        return builder.call(function, [i32(0), builder.trunc(arguments[0], i32), priority])
-
-    return types.int32(types.int64), make
+#: sched_setscheduler(2) of the calling thread (0), a policy, and the address of its priority
+_set_policy: Any = types.ExternalFunction(
+    "sched_setscheduler", types.int32(types.int32, types.int32, types.int64)
+)
 
 
 @compiled
 def _spin(flags):
     """Spin at idle priority until told to stop. It is compiled because a thread of idle priority
     that waits for the processor must not hold the interpreter's lock."""
-    if _become(_IDLE) == 0:
+    priority = flags.ctypes.data + 8 * _PRIORITY
+    if _set_policy(0, _IDLE, priority) == 0:
         flags[_RUNS] = 1
         while load_acquire(flags.ctypes.data) == 0:  # _STOP
             for _ in range(_BETWEEN_LOOKS):
                 pause()
-        _become(_OTHER)
+        _set_policy(0, _OTHER, priority)
 
 
 def warm_up() -> None:
@@ -71,7 +60,7 @@ def prevent_idle(processor: int | None, wanted: str) -> Iterator[bool]:
         wanted: ``prevent_idle`` of the scenario: "auto" (on a virtual machine), "always" or
             "never".
     """
-    flags = np.zeros(2, np.int64)
+    flags = np.zeros(_FLAGS, np.int64)
     if processor is None or not (
         wanted == "always" or (wanted == "auto" and virtual_machine() != "no")
     ):

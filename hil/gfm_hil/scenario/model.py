@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.links import link_kind, link_names
-from gfm_hil.links.impaired.settings import Impairment
+from gfm_hil.links.impaired import Impairment
 from gfm_hil.scenario.events import (
     Breaker,
     Event,
@@ -69,15 +69,7 @@ class Link(_Model):
             raise ValueError(
                 f"type = {self.type!r}: must be one of {known}{meant(self.type, known)}"
             )
-        kind = link_kind(self.type)
-        if self.endpoint is not None:
-            kind.check_endpoint(self.endpoint)
-        try:
-            options = kind.options.model_validate(self.options)
-        except ValidationError as problem:
-            wrong = lines(problem, kind.options)
-            raise ValueError("; ".join(f"options.{line}" for line in wrong)) from None
-        kind.check_both(self.endpoint, options)
+        link_kind(self.type).checked(self.endpoint, self.options)
         return self
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import Role
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.emulation import (
     PLACES,
     arrive,
@@ -23,7 +24,6 @@ from gfm_hil.links.can.emulation import (
     set_bus,
 )
 from gfm_hil.links.can.layout import Plan
-from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import OTHER_DBC, join, joiner_dtype, set_joiner
 from gfm_hil.links.can.sockets import (
     FULL,
@@ -86,13 +86,7 @@ _SOCKETS, _SENDER, _RECEIVER, _JOINER, _SUBRATE, _BUS, _PLACES, _OUT, _INTO, _EN
 
 
 class Node:
-    """The array and, for Python, views of its parts; see the dtypes.
-
-    Args:
-        plan: of the DBC.
-        role: our side.
-        options: of the link.
-    """
+    """The array and, for Python, views of its parts; see the dtypes."""
 
     def __init__(self, plan: Plan, role: Role, options: CanOptions) -> None:
         self.handle: NDArray[np.int64] = np.zeros(_END, np.int64)
