@@ -159,14 +159,14 @@ def _scope(place: Path) -> Iterator[Take]:
     while not ports:
         assert not task.done()
         time.sleep(0.01)
-    hello = json.dumps({"kind": "hello", "token": access.token})
+    hello = json.dumps({"kind": "hello", "token": access.tokens["operator"]})
 
     def take(script: bytes) -> None:
         with (
             connect(f"ws://127.0.0.1:{ports[0]}/socket") as page,
             contextlib.suppress(ConnectionClosed),
         ):
-            for line in script.replace(b"@token@", access.token.encode()).split(b"\n"):
+            for line in script.replace(b"@token@", access.tokens["operator"].encode()).split(b"\n"):
                 page.send(line, text=True)
             page.send(hello)
             while True:

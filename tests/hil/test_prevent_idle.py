@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from pathlib import Path
 
 import pytest
 
 from gfm_hil.realtime import prevent_idle as module
 from gfm_hil.realtime.prevent_idle import prevent_idle
+
+from ..support.processes import wait_for
 
 pytestmark = pytest.mark.processes
 
@@ -36,10 +37,7 @@ def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
         assert thread is not None and thread.native_id is not None
         assert os.sched_getscheduler(thread.native_id) == _IDLE
         assert os.sched_getaffinity(thread.native_id) == {HERE}
-        until = time.monotonic() + 60
-        while used_s(thread) < 0.05:  # on a crowded machine it gets little time
-            assert time.monotonic() < until
-            time.sleep(0.05)
+        wait_for(lambda: used_s(thread) >= 0.05)  # on a crowded machine it gets little time
     thread.join(60)
     assert not thread.is_alive()
     assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == (policy, affinity)

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import Part
 
 from ..support.processes import (
-    PATIENCE_S,
     end,
     has_run,
     roles_of,
@@ -189,10 +187,7 @@ def test_without_the_command_that_started_them_both_roles_end_too(start, tmp_pat
     wait_for(lambda: has_run(folder, 200), process)
     process.kill()
     process.communicate()
-    end_at = time.monotonic() + PATIENCE_S
-    while roles_of(folder) and time.monotonic() < end_at:
-        time.sleep(0.02)
-    assert roles_of(folder) == {}
+    wait_for(lambda: roles_of(folder) == {})
     for role in ROLES:
         part = Part.open(folder, role)
         assert not np.isnan(part.signals[:200]).any()

@@ -159,7 +159,7 @@ def test_a_run_that_is_over_can_be_played(served) -> None:
         (json.dumps({**LOOK, "span": 0.1, "bins": 10**9}), "bins"),
         (json.dumps({**LOOK, "span": -1.0}), "span"),
         (json.dumps({**LOOK, "span": 0.1, "channels": ["p"] * 100}), "channels"),
-        (json.dumps({**LOOK, "span": 0.1, "channels": ["__class__"]}), "none of that name"),
+        (json.dumps({**LOOK, "span": 0.1, "channels": ["__class__"]}), "unknown"),
         (json.dumps({**LOOK, "span": 0.1, "mode": "trigger"}), "trigger"),
         ('{"kind": "look", "span": NaN}', "span"),
     ],
@@ -186,12 +186,12 @@ def test_control_needs_the_token(served) -> None:
     port, access, _ = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         tell = json.dumps({"kind": "tell", "id": 1, "event": {"type": "reset"}})
-        for token in ("", "wrong", access.token[:-1], "é"):
+        for token in ("", "wrong", access.tokens["operator"][:-1], "é"):
             socket.send(json.dumps({"kind": "hello", "token": token}))
             assert words(socket, "control")["granted"] is False
             socket.send(tell)
             assert "may look, not touch" in words(socket, "answer")["text"]
-        socket.send(json.dumps({"kind": "hello", "token": access.token}))
+        socket.send(json.dumps({"kind": "hello", "token": access.tokens["operator"]}))
         assert words(socket, "control")["granted"] is True
         socket.send(tell)
         assert words(socket, "answer") == {

@@ -9,8 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,15 +55,6 @@ class Rig:
     @property
     def token(self) -> str:
         return self.control.partition("#token=")[2]
-
-
-def wait_for(what: Callable[[], Any], patience: float = PATIENCE_S) -> Any:
-    """Poll until the result is true; returns the result."""
-    until = time.monotonic() + patience
-    while not (found := what()):
-        assert time.monotonic() < until, "the condition did not come true in time"
-        time.sleep(0.05)
-    return found
 
 
 def addresses(lines: Iterator[str]) -> tuple[str, str]:

@@ -73,7 +73,7 @@ class RecordedRun:
         scenario: what was run.
         summary: content of summary.json.
         columns: of signals.npz, each shape (ticks,): an array, or a column of the file, of which
-            a slice is read and nothing more.
+            only slices are read.
         laws: labels of the laws, which the column ``law`` refers to.
         events: lines of events.jsonl.
         folder: where it is; None for a run in memory.
@@ -139,7 +139,7 @@ class RecordedRun:
         """What each column of ``recorded`` is, in its order.
 
         Raises:
-            UserError: one is none of a recording.
+            UserError: a column is unknown.
         """
         return [describe(name, self.laws) for name in self.recorded]
 
