@@ -34,6 +34,7 @@ from gfm_hil.scope.access import Access
 from gfm_hil.scope.record import open_record
 
 from ..support.modbus_device import Bench as MadeUp
+from ..support.processes import free_port
 from .conftest import Parser, Take
 from .mutations import blobs, lines, texts
 from .parsers_peers import SCENARIO
@@ -85,9 +86,7 @@ def _modbus(place: Path) -> Iterator[Take]:
 
     block = SimData(BASE, values=device.image.registers, datatype=DataType.REGISTERS)
 
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
 
     async def listen() -> Server:
         server = Server(SimDevice(id=1, simdata=[block], action=action), ("127.0.0.1", port), None)

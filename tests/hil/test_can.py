@@ -29,12 +29,11 @@ from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
 
 from ..support.can_reference import quantised_run
-from ..support.links import in_threads, run_pair
+from ..support.links import PATIENT, in_threads, run_pair
 
 pytestmark = pytest.mark.processes
 
 KIND = link_kind("can")
-PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
 RIG = {
     "delay": {"samples": 1, "fraction": 0.3},
     "adc": "DS2004",

@@ -15,7 +15,7 @@ from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 from gfm_hil.modbus.image import VENDOR
 
 from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
-from ..support.processes import GFMHIL, PATIENCE_S, running
+from ..support.processes import GFMHIL, PATIENCE_S, free_port, running
 
 pytestmark = pytest.mark.processes
 
@@ -46,9 +46,7 @@ def test_stop_ends_the_run_and_the_server_with_it(tmp_path):
 
 def test_a_server_beside_a_run_begins_and_ends_with_it(tmp_path):
     (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(tmp_path / "run")]
     options = ["--modbus", str(port), "--no-figures", "--quiet"]
     run = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -21,7 +21,7 @@ from gfm_hil.scope.server import Scope
 from gfm_hil.scope.view import View
 
 from ..support.processes import takes_commands, wait_for
-from ..support.scope import Rig, mute, rig, serving
+from ..support.scope import Rig, mute, rig, serving, words
 
 pytestmark = pytest.mark.processes
 
@@ -42,14 +42,6 @@ def port(scope) -> Iterator[int]:
 
 def address(port: int, query: str = "") -> str:
     return f"ws://127.0.0.1:{port}/socket{query}"
-
-
-def words(socket: ClientConnection, kind: str) -> dict[str, Any]:
-    """The next message of that kind."""
-    while True:
-        message = socket.recv(60)
-        if isinstance(message, str) and json.loads(message)["kind"] == kind:
-            return dict(json.loads(message))
 
 
 def say(socket: ClientConnection, **content: Any) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from gfm_hil.cli import main
 from gfm_hil.scope.access import Access
@@ -25,7 +25,7 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope, static_files
 from gfm_hil.scope.view import HEAD
 
-from ..support.scope import addresses, serving
+from ..support.scope import addresses, serving, words
 
 pytestmark = pytest.mark.processes
 
@@ -49,14 +49,6 @@ def fetch(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, st
             return answer.status, dict(answer.headers), answer.read()
     except urllib.error.HTTPError as problem:
         return problem.code, dict(problem.headers), problem.read()
-
-
-def words(socket: ClientConnection, kind: str) -> dict[str, Any]:
-    """The next message of that kind."""
-    while True:
-        message = socket.recv(10)
-        if isinstance(message, str) and json.loads(message)["kind"] == kind:
-            return dict(json.loads(message))
 
 
 def test_page_with_its_policy(served) -> None:

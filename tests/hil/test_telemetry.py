@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.operator import Operator
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
@@ -287,14 +288,12 @@ def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint)
     assert [process.returncode for process in (*roles, stream)] == [130, 130, 0]
 
 
-def test_a_port_that_is_taken_is_named(start, tmp_path):
-    folder = tmp_path / "run"
-    run, stream, (port, _) = run_and_stream(start, folder, "lockstep")
-    again = start("stream", str(folder), "--wait", "--port", port)
-    _, error = again.communicate(timeout=PATIENCE_S)
-    assert again.returncode == 2
-    assert f"--port {port}: tcp://127.0.0.1:{port}: Address already in use" in error
-    stop(folder, run, stream)
+def test_a_port_that_is_taken_is_named():
+    with Publisher(Ports("127.0.0.1", 0, 0)) as first:
+        port = int(first.samples.rpartition(":")[2])
+        taken = f"--port {port}: tcp://127.0.0.1:{port}: Address already in use"
+        with pytest.raises(UserError, match=taken):
+            Publisher(Ports("127.0.0.1", port, 0))
 
 
 @pytest.mark.attack(

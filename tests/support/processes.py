@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -65,6 +66,13 @@ def running(folder: Path, scenario: str, *options: str) -> Iterator[subprocess.P
         process.wait(PATIENCE_S)
 
 
+def free_port() -> int:
+    """A TCP port of the loopback device that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 def takes_commands(folder: Path) -> bool:
     """Whether both command servers of a run are announced."""
     return all((folder / f"commands_{role}.json").exists() for role in ROLES)
@@ -89,6 +97,11 @@ def roles_of(folder: Path) -> dict[str, int]:
             if str(folder) in words and state != "Z":
                 found.update({role: int(entry.name) for role in ROLES if role in words})
     return found
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:

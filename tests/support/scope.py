@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import shutil
 import socket
@@ -83,6 +84,14 @@ def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
     finally:
         process.terminate()
         process.wait()
+
+
+def words(socket: Any, kind: str) -> dict[str, Any]:
+    """The next message of that kind."""
+    while True:
+        message = socket.recv(60)
+        if isinstance(message, str) and json.loads(message)["kind"] == kind:
+            return dict(json.loads(message))
 
 
 @contextmanager

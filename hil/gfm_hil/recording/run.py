@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.errors import UserError, lines, need
 from gfm_hil.core.roles import OUR_CONTROLLER
 from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
 from gfm_hil.recording.log import read_events, read_summary
@@ -170,10 +170,9 @@ class RecordedRun:
         Raises:
             UserError: pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise UserError("to_pandas: needs pandas: pip install 'gfmhil[notebook]'") from None
+        need("pandas", "pandas", "to_pandas", "notebook")
+        import pandas
+
         content = {name: column[:] for name, column in self.columns.items()}
         return pandas.DataFrame(content).set_index("t")
 
@@ -183,10 +182,9 @@ class RecordedRun:
         Raises:
             UserError: xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError:
-            raise UserError("to_xarray: needs xarray: pip install 'gfmhil[notebook]'") from None
+        need("xarray", "xarray", "to_xarray", "notebook")
+        import xarray
+
         units = self.units
         content = {
             name: ("t", column[:], {"units": units[name]})
