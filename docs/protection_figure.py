@@ -31,7 +31,6 @@ def run(place: Path, name: str, extrapolate: int, impairment: dict[str, Any] | N
         "law": "vsg-2",
         "T_s": T_S,
         "duration": 0.12,
-        "plant": {"substeps": 100},
         "late_policy": {"hold": 100, "extrapolate": extrapolate},
         "link": {"type": "shm", "peer_timeout_s": 5.0, "impairment": impairment},
         "events": [{"tick": STEP, "type": "reference", "P_ref": 0.8}],

@@ -30,6 +30,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[plant]", options.Plant),
     ("[plant.dc_source]", options.DcSource),
     ("[plant.grid]", options.Grid),
+    ("[plant.grid.finite]", options.FiniteGrid),
     ("[plant.sensors]", options.Sensors),
     ("[plant.adc]", options.AnalogToDigital),
     ("[plant.dac]", options.DigitalToAnalog),

@@ -8,7 +8,14 @@ from .emulator import (
     plant_step,
     plant_truth,
 )
-from .grid import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
+from .grid import (
+    breaker,
+    grid_frequency,
+    grid_impedance,
+    grid_load,
+    grid_voltage,
+    phase_jump,
+)
 from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .options import Plant
 from .parameters import ConverterParameters, load_converter
@@ -29,6 +36,7 @@ __all__ = [
     "breaker",
     "grid_frequency",
     "grid_impedance",
+    "grid_load",
     "grid_voltage",
     "load_converter",
     "make_plant",

@@ -7,15 +7,27 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
 
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Source, find_modes
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.options import COMMANDS, MEASURED, Plant
 from gfm_plant.parameters import load_converter
-from gfm_plant.records import PlantRecord, plant_par_dtype, plant_state_dtype
+from gfm_plant.records import (
+    BLOCKED,
+    OPERATING,
+    PlantRecord,
+    plant_par_dtype,
+    plant_state_dtype,
+)
+from gfm_plant.solution import SOURCES, STATES
 
-MAX_RATE = 1.0
-"""Largest |eigenvalue| times sub-step. RK4 is stable to 2.8; at 1 a mode is still resolved."""
+_DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
+_SWING_STEP = 0.1  # largest rate of a finite grid times T_s
+_PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
+_MOST = 500  # steps, or pieces, in a period
 
 
 def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
@@ -29,22 +41,23 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
         T_s: Sampling period in s.
 
     Raises:
-        ValueError: If the converter is unknown, or something is too fast for the sub-step.
+        ValueError: If the converter is unknown, or the DC source's control is too fast for T_s.
     """
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     par = np.zeros(1, plant_par_dtype)
-    _pack_circuit(par, options)
+    _pack_circuit(par, options, T_s)
     _pack_measurement(par, options)
     _pack_timing(par, options, T_s)
     for k, (name, *_) in enumerate(TRIPS):
         trip = getattr(options.protection, name)
         par["trip_limit"][0, k] = trip.threshold
         par["trip_ticks"][0, k] = math.ceil(trip.delay_s / T_s - 1e-6) if trip.enabled else -1
-    check_sub_step(par)
+    connect(par, closed=True)
 
     st = np.zeros(1, plant_state_dtype)
     st["x"][0, V_DC] = 1.0
+    st["unit"][0, :, 0] = 1.0
     st["sensed"][0, 0] = 1.0
     st["u"][0, :, 1] = st["u_now"][0, 1] = options.grid.omega_g
     st["closed"] = 1
@@ -53,50 +66,77 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
     return par, st
 
 
-def check_sub_step(par: PlantRecord) -> None:
-    """Check that one RK4 sub-step resolves the fastest mode of every part of the plant.
-
-    An open grid breaker only slows the line down, so the line alone is what counts.
+def connect(par: PlantRecord, closed: bool) -> None:
+    """Set the modes of both circuits, with the grid's breaker closed or open.
 
     Raises:
-        ValueError: If one is too fast; it names the option, its value and what is allowed.
+        ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast for
+            the DC link.
     """
-    r = par[0]
-    limit = MAX_RATE / max(r["h_old"], r["h_new"])  # rad/s
-    at = f"at this sub-step: allowed are {limit:.6g} rad/s; raise plant.substeps"
-    if r["omega_s"] > limit:
-        raise ValueError(
-            f"plant.sensors.bandwidth_hz = {r['omega_s'] / (2 * math.pi):.6g}: too fast {at}"
-            f" or stay below {limit / (2 * math.pi):.6g} Hz"
-        )
-    w = r["omega_b"]
-    parts = {
-        "LC resonance of L_f, C_f and L_g": w
-        * math.sqrt((1 / r["L_f"] + 1 / r["L_line"]) / r["C_f"]),
-        "filter R_f/L_f": w * r["R_f"] / r["L_f"],
-        "line R_g/L_g": w * r["R_line"] / r["L_line"],
-        "plant.grid load_R/load_L": w * r["R_load"] / r["L_load"] if r["L_load"] else 0.0,
-        "plant.dc_source.k_p on C_dc": w * r["k_p"] / r["C_dc"],
-    }
-    for name, rate in parts.items():
-        if rate > limit:
-            raise ValueError(f"{name} = {rate:.6g} rad/s: too fast {at}")
+    par["n_states"] = len(STATES) if par[0]["L_load"] > 0 else len(STATES) - 1
+    found = {c: _modes(par[0], closed, c) for c in (OPERATING, BLOCKED)}
+    _pack_pieces(par, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
+    for circuit, (modes, sources) in found.items():
+        n = par["n_modes"][0, circuit] = len(modes.rates)
+        _set(par["rate"][0, circuit, :n], modes.rates)
+        for part, half in enumerate(par["half_h"][0]):
+            _set(par["decay"][0, circuit, part, :n], np.exp(modes.rates * half))
+        _set(par["states"][0, circuit, :, :n], modes.states)
+        _set(par["modes"][0, circuit, :n], modes.modes)
+        par["drive"][0, circuit] = 0.0
+        for k, source in enumerate(sources):
+            _set(par["drive"][0, circuit, :n, SOURCES.index(source.name)], modes.drive[:, k])
 
 
-def _pack_circuit(par: PlantRecord, options: Plant) -> None:
+def _modes(r: Any, closed: bool, circuit: int) -> tuple[Modes, list[Source]]:
+    """The modes of one of the circuits, and its sources."""
+    branches = [Branch("i_o", "terminal", "far", r["L_g"], r["R_g"])]
+    sources = []
+    if circuit == OPERATING:
+        branches.append(Branch("i_f", "bridge", "terminal", r["L_f"], r["R_f"]))
+        sources.append(Source("bridge", "bridge"))
+    if r["L_load"] > 0:
+        branches.append(Branch("i_load", "far", GROUND, r["L_load"], r["R_load"]))
+    if closed:
+        sources.append(Source("grid", "far"))
+    capacitor = Capacitor("v", "terminal", r["C_f"])
+    return find_modes(branches, [capacitor], sources, r["omega_b"], STATES), sources
+
+
+def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:
+    field[..., 0], field[..., 1] = values.real, values.imag
+
+
+def _pack_circuit(par: PlantRecord, options: Plant, T_s: float) -> None:
     converter = load_converter(options.converter)
     bases = converter.bases
     par["omega_b"] = bases.omega_b
     for name, value in converter.pu(options.real_factors()).items():
         par[name] = value
-    par["L_line"], par["R_line"] = par["L_g"], par["R_g"]
     nominal = converter.pu()
     par["L_line_n"], par["R_line_n"] = nominal["L_g"], nominal["R_g"]
     if options.grid.load_R is not None and options.grid.load_L is not None:
         par["R_load"] = bases.to_pu(options.grid.load_R, "R")
         par["L_load"] = bases.to_pu(options.grid.load_L, "L")
 
+    per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
+    par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
+
+    if grid := options.grid.finite:
+        par["H_grid"], par["D_grid"], par["droop_grid"] = grid.H, grid.D, grid.droop
+        par["T_gov"], par["S_grid"] = grid.T_gov, grid.S
+        r = par[0]
+        swing = math.sqrt(r["omega_b"] / (2 * grid.H * grid.S * (r["L_f"] + r["L_g"])))
+        governor = math.sqrt(1 / (2 * grid.H * grid.droop * grid.T_gov))
+        rate = max(swing, governor, grid.D / (2 * grid.H), 1 / grid.T_gov)
+        if rate * T_s > _SWING_STEP:
+            raise ValueError(
+                f"plant.grid.finite: it swings at {rate:.6g} rad/s; allowed are"
+                f" {_SWING_STEP / T_s:.6g} rad/s at this T_s; raise S, H, T_gov or droop"
+            )
+
     source = options.dc_source
+    par["tau_dc"] = source.tau_s or 0.0
     par["i_max"] = math.inf if source.i_max is None else source.i_max
     if source.mode == "controlled":
         par["i_u_gain"] = 1.0
@@ -111,6 +151,7 @@ def _pack_measurement(par: PlantRecord, options: Plant) -> None:
     par["gain"] = [sensors.gain.get(name, 1.0) for name in MEASURED]
     par["offset"] = [sensors.offset.get(name, 0.0) for name in MEASURED]
     par["noise_std"] = [sensors.noise_std.get(name, 0.0) for name in MEASURED]
+    par["noisy"] = any(par["noise_std"][0] > 0.0)
     par["seed"] = sensors.seed
     _pack_converter(par, "adc", options.adc.bits, options.adc.range, MEASURED)
     _pack_converter(par, "dac", options.dac.bits, options.dac.range, COMMANDS)
@@ -132,10 +173,41 @@ def _pack_converter(
 
 
 def _pack_timing(par: PlantRecord, options: Plant, T_s: float) -> None:
-    n, fraction = options.substeps, options.delay.fraction
+    fraction = options.delay.fraction
     par["T_s"], par["delay"] = T_s, options.delay.samples
-    if fraction > 0:
-        par["steps_old"] = steps = math.ceil(n * fraction)
-        par["h_old"] = fraction * T_s / steps
-    par["steps_new"] = steps = math.ceil(n * (1 - fraction))
-    par["h_new"] = (1 - fraction) * T_s / steps
+    par["stretch"] = [[fraction * T_s, (1 - fraction) * T_s]]
+
+
+def _pack_pieces(par: PlantRecord, fastest: float) -> None:
+    """Choose the pieces of Simpson's rule, and the DC link's steps in them, by the fastest mode."""
+    r = par[0]
+    longest = max(r["stretch"])
+    if fastest * longest > 2 * _PIECE * _MOST:
+        raise ValueError(
+            f"the circuit's fastest mode = {fastest:.6g} rad/s: too fast for the DC link; allowed"
+            f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
+            " plant.grid.load_L"
+        )
+    pieces = np.maximum(np.ceil(r["stretch"] * (fastest / (2 * _PIECE))), 1)
+    par["pieces"], par["half_h"] = pieces, r["stretch"] / pieces / 2
+    per_C = r["omega_b"] / r["C_dc"]
+    rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
+    if r["tau_dc"] > 0.0:
+        rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
+    if rate * longest > 2 * _DC_STEP * _MOST:
+        raise ValueError(
+            f"plant.dc_source k_p, k_i, tau_s: with C_dc they are as fast as {rate:.6g}"
+            f" rad/s; allowed are {2 * _DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
+        )
+    par["dc_steps"] = max(1, math.ceil(rate * max(par["half_h"][0]) / _DC_STEP))
+    for part, half in enumerate(par["half_h"][0]):
+        par["sensor_weights"][0, part] = _low_pass(float(r["omega_s"] * 2 * half))
+
+
+def _low_pass(x: float) -> list[float]:
+    """Weights of a first-order low-pass after a stretch of x time constants: of its state, and of
+    its input at the beginning, the middle and the end, between which the input is a parabola."""
+    A = np.diag([1.0, 1.0, 1.0], 1)
+    A[0, 0] = -x
+    whole, f_1, f_2, f_3 = expm(A)[0]  # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
+    return [whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)]

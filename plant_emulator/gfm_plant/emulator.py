@@ -12,17 +12,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.grid import advance_grid
-from gfm_plant.integrator import Held, Vector, integrate
-from gfm_plant.model import DELTA, V_DC, rates, terminal
-from gfm_plant.names import (
-    BAD_COMMAND,
-    DIVERGED,
-)
+from gfm_plant.dc_link import advance_dc_link
+from gfm_plant.model import DELTA, V_DC, terminal
+from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.records import MAX_DELAY, PlantRecord
-from gfm_runtime.compiled import compiled
+from gfm_plant.ramps import advance_grid, brought, settle_grid
+from gfm_plant.records import BLOCKED, MAX_DELAY, OPERATING, PlantRecord
+from gfm_plant.solution import (
+    BRIDGE,
+    GRID,
+    I_F,
+    I_LOAD,
+    I_O,
+    V,
+    drive,
+    enter,
+    half_step,
+    read_states,
+    state,
+)
+from gfm_runtime.compiled import cached, compiled
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 
@@ -37,20 +47,30 @@ def plant_init(
     forever; see `gfm_plant.steady_state` for such points.
     """
     r, s = par[0], st[0]
-    for i in range(8):
-        s.x[i] = x0[i]
+    delta = x0[DELTA]
+    s.unit[GRID, 0], s.unit[GRID, 1] = 1.0, 0.0
+    cos, sin = math.cos(delta), math.sin(delta)
+    s.unit[BRIDGE, 0], s.unit[BRIDGE, 1] = cos, sin
+    for i in range(3):
+        s.w[i, 0] = x0[2 * i] * cos - x0[2 * i + 1] * sin
+        s.w[i, 1] = x0[2 * i] * sin + x0[2 * i + 1] * cos
+    if r.L_load > 0.0:
+        i_load = s.V_g / complex(r.R_load, u0[1] * r.L_load)
+        s.w[I_LOAD, 0], s.w[I_LOAD, 1] = i_load.real, i_load.imag
+    enter(r, s, OPERATING)
+    s.x[DELTA], s.x[V_DC] = delta, x0[V_DC]
+    _write_x(s)
     for j in range(3):
         s.u_now[j] = u0[j]
         for k in range(MAX_DELAY + 2):
             s.u[k, j] = u0[j]
-    p, q, V = terminal(x0[2], x0[3], x0[4], x0[5])
-    s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[V_DC], p, q, V
+    p, q, v = terminal(x0[2], x0[3], x0[4], x0[5])
+    s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[V_DC], p, q, v
     if r.i_u_gain == 0.0:
         s.i_reg = u0[0] - r.k_p * (1.0 - x0[V_DC])
-    if r.L_load > 0.0:
-        v_g = s.V_g * complex(math.cos(x0[DELTA]), -math.sin(x0[DELTA]))
-        i_load = v_g / complex(r.R_load, u0[1] * r.L_load)
-        s.i_load[0], s.i_load[1] = i_load.real, i_load.imag
+    s.i_source, s.E = u0[0], u0[2]
+    if r.H_grid > 0.0:
+        settle_grid(r, s)
 
 
 @compiled
@@ -88,7 +108,7 @@ def plant_command(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> 
         if math.isfinite(u[j]):
             s.u[0, j] = quantise(u[j], r.dac_lo[j], r.dac_hi[j], r.dac_lsb[j])
         else:
-            trip(s, BAD_COMMAND, u[j])
+            trip(r, s, BAD_COMMAND, u[j])
 
 
 @compiled
@@ -96,29 +116,36 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     """Go on by one sampling period under the commands in the delay line."""
     r, s = par[0], st[0]
     newest = max(r.delay - 1, 0)  # place in the line: u[k] itself is not in it yet, if delayed
-    x = s.x
-    v = (
-        x[0], x[1], x[2], x[3], x[4], x[5], x[V_DC], s.i_reg, s.i_load[0], s.i_load[1],
+    before = (
+        s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
+        s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
     )  # fmt: skip
-    delta = x[DELTA]
-    if r.steps_old > 0:
-        v, delta = _stretch(r, s, v, delta, newest + 1, r.steps_old, r.h_old)
-    v, delta = _stretch(r, s, v, delta, newest, r.steps_new, r.h_new)
+    for i in range(r.n_states):
+        s.w_before[i, 0], s.w_before[i, 1] = s.w[i, 0], s.w[i, 1]
+    if r.stretch[0] > 0.0:
+        _stretch(r, s, newest + 1, 0)
+    _stretch(r, s, newest, 1)
     s.tick += 1
 
-    size = abs(delta) / _FAR  # the angle of an island may grow without limit
-    for value in v:
-        size = max(size, abs(value)) if value == value else math.inf
-    if size < _FAR and v[6] > 0.0:
-        for i in range(6):
-            x[i] = v[i]
-        x[DELTA], x[V_DC] = delta, v[6]
-        s.i_reg, s.i_load[0], s.i_load[1] = v[7], v[8], v[9]
-        s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = v[10], v[11], v[12], v[13]
+    size = abs(s.x[DELTA]) / _FAR  # the angle of an island may grow without limit
+    for i in range(r.n_states):
+        size = _larger(size, abs(s.w[i, 0]) + abs(s.w[i, 1]))
+    for j in range(4):
+        size = _larger(size, abs(s.sensed[j]))
+    size = _larger(_larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg)), abs(s.i_source))
+    if size < _FAR and s.x[V_DC] > 0.0:
+        _write_x(s)
         protect(r, s)
-    else:
-        trip(s, DIVERGED, size)  # the last good state stays
+    else:  # the last good state stays
+        (
+            s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
+            s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
+            s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
+        ) = before  # fmt: skip
+        for i in range(r.n_states):
+            s.w[i, 0], s.w[i, 1] = s.w_before[i, 0], s.w_before[i, 1]
+        trip(r, s, DIVERGED, size)
     advance_grid(r, s)
 
 
@@ -129,41 +156,106 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
     out[2] = s.u_now[1]
-    out[5] = math.hypot(s.x[0], s.x[1])
+    out[5] = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
     out[6] = s.x[DELTA]
     out[7] = s.omega_g
     out[8] = s.V_g
     out[9] = s.trip
-    i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
-    i_max = r.i_max if s.trip == 0 else 0.0
-    out[10] = min(max(i_dc, -i_max), i_max)
+    if r.tau_dc > 0.0:
+        out[10] = s.i_source
+    else:
+        i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
+        i_max = r.i_max if s.trip == 0 else 0.0
+        out[10] = min(max(i_dc, -i_max), i_max)
 
 
 @compiled
-def _stretch(
-    r: Any, s: Any, v: Vector, delta: float, age: int, steps: int, h: float
-) -> tuple[Vector, float]:
-    """Go on by `steps` of `h` seconds under the command at place `age` of the delay line."""
+def _stretch(r: Any, s: Any, age: int, part: int) -> None:
+    """Go on by one stretch of the period under the command at place `age` of the delay line."""
     running = s.trip == 0
     if running:
         for j in range(3):
             s.u_now[j] = s.u[age, j]
     else:
-        s.u_now[1] = s.omega_g  # see `trip`
-    i_u, omega_u, E_u = s.u_now[0], s.u_now[1], s.u_now[2]
-    held = Held(
-        i_u=r.i_u_gain * i_u,
-        omega_u=omega_u,
-        E_u=E_u,
-        omega_g=s.omega_g,
-        V_g=s.V_g if s.closed else 0.0,
-        k_p=r.k_p,
-        k_i=r.k_i,
-        i_max=r.i_max if running else 0.0,
-        per_L_load=r.omega_b / r.L_load if r.L_load > 0.0 else 0.0,
-        R_load=r.R_load,
-        omega_s=r.omega_s,
+        s.u_now[1] = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # see `trip`
+    # the modulator divides by the v_dc that it has at the beginning of its period
+    most = r.m_max * s.x[V_DC]
+    s.E = min(max(s.u_now[2], -most), most)
+    c = OPERATING if running else BLOCKED
+    for _ in range(r.pieces[part]):
+        _piece(r, s, c, part)
+
+
+@compiled
+def _piece(r: Any, s: Any, c: int, part: int) -> None:
+    """Go on by one piece of a stretch under the command that acts."""
+    omega_u, E = s.u_now[1], s.E
+    omega_g = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # in the middle of the tick
+    for m in range(r.n_modes[c]):
+        s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
+
+    p_0 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
+    a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
+    if r.filtered:
+        a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    g_0 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
+
+    m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
+    n_r, n_i = drive(r, s, c, part, GRID, s.V_g, omega_g)
+    half_step(r, s, c, part, 0)
+    if r.filtered or r.H_grid > 0.0:
+        read_states(r, s, c)
+        a_1 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    else:
+        s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
+    p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
+    g_1 = brought(s, n_r, n_i)
+
+    half_step(r, s, c, part, 2)
+    read_states(r, s, c)
+    p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
+    g_2 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
+
+    s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
+    v_0 = s.x[V_DC]
+    v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
+    if r.filtered:
+        a_2 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+        _sense(r, s, 0, part, v_0, v_1, v_2)
+        for j in range(3):
+            _sense(r, s, 1 + j, part, a_0[j], a_1[j], a_2[j])
+    s.x[DELTA] += 2.0 * r.half_h[part] * r.omega_b * (omega_u - omega_g)
+
+
+@compiled
+def _larger(size: float, other: float) -> float:
+    """Return the larger one; infinity if the other is no number."""
+    return max(size, other) if other == other else math.inf
+
+
+@compiled
+def _sense(r: Any, s: Any, j: int, part: int, f_0: float, f_1: float, f_2: float) -> None:
+    """Pass a quantity through the low-pass of sensor j."""
+    s.sensed[j] = (
+        r.sensor_weights[part, 0] * s.sensed[j]
+        + r.sensor_weights[part, 1] * f_0
+        + r.sensor_weights[part, 2] * f_1
+        + r.sensor_weights[part, 3] * f_2
     )
-    c = rates(r, 1.0 if running else 0.0)
-    v = integrate(v, delta, steps, h, c, held)
-    return v, delta + steps * h * r.omega_b * (omega_u - s.omega_g)
+
+
+@cached
+def reconnect(par: PlantRecord, st: PlantRecord) -> None:
+    """Go on from the present state in circuits that have changed."""
+    r, s = par[0], st[0]
+    enter(r, s, BLOCKED if s.trip else OPERATING)
+    _write_x(s)
+
+
+@compiled
+def _write_x(s: Any) -> None:
+    """Write the currents and voltages of Eq. (1)-(6): w in the converter's own frame."""
+    u_r, u_i = s.unit[BRIDGE, 0], s.unit[BRIDGE, 1]
+    for i in range(3):
+        w_r, w_i = s.w[i, 0], s.w[i, 1]
+        s.x[2 * i], s.x[2 * i + 1] = w_r * u_r + w_i * u_i, w_i * u_r - w_r * u_i

@@ -1,4 +1,4 @@
-"""The grid simulator: its events, called between two ticks, and its ramps, advanced every tick.
+"""The events of the grid simulator, called between two ticks.
 
 Frequencies and voltages are in p.u., times in s. An event acts from the coming tick on.
 """
@@ -6,12 +6,12 @@ Frequencies and voltages are in p.u., times in s. An event acts from the coming 
 from __future__ import annotations
 
 import math
-from typing import Any
 
-from gfm_plant.build import check_sub_step
+from gfm_plant.build import connect
+from gfm_plant.emulator import reconnect
 from gfm_plant.model import DELTA
 from gfm_plant.records import PlantRecord
-from gfm_runtime.compiled import compiled
+from gfm_plant.solution import GRID
 
 
 def grid_frequency(st: PlantRecord, omega_g: float, rate: float | None = None) -> None:
@@ -53,31 +53,44 @@ def grid_voltage(
         st["V_g"] = V_g
 
 
+def grid_load(par: PlantRecord, st: PlantRecord, change: float) -> None:
+    """Add `change` to the load of a finite grid, p.u. of the grid's rating.
+
+    Raises:
+        ValueError: If the grid is ideal, or `change` is not finite.
+    """
+    _require("change", change, True, "finite")
+    if par[0]["H_grid"] == 0:
+        raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
+    st["P_load"] += change
+
+
 def phase_jump(st: PlantRecord, degrees: float) -> None:
     """Advance the grid's angle by `degrees`, so that delta falls by as much."""
     _require("degrees", degrees, True, "finite")
-    st["x"][0, DELTA] -= math.radians(degrees)
+    angle = math.radians(degrees)
+    st["x"][0, DELTA] -= angle
+    unit = complex(*st["unit"][0, GRID]) * complex(math.cos(angle), math.sin(angle))
+    st["unit"][0, GRID] = unit.real, unit.imag
 
 
 def grid_impedance(par: PlantRecord, st: PlantRecord, L_g: float, R_g: float) -> None:
     """Set the line to `L_g` and `R_g` times the elements of the converter file.
 
-    Its current is continuous. Factors of the options are not applied on top.
+    Its current is continuous, but in an island, where the flux of line and load is. Factors of the
+    options are not applied on top.
 
     Raises:
-        ValueError: If L_g <= 0 or R_g < 0, or the line becomes too fast for the sub-step. The
-            plant is then unchanged.
+        ValueError: If L_g <= 0 or R_g < 0, or a mode becomes too fast for the DC link. The plant
+            is then unchanged.
     """
     _require("L_g", L_g, L_g > 0, "a factor > 0")
     _require("R_g", R_g, R_g >= 0, "a factor >= 0")
-    before = par.copy()
-    par["L_line"], par["R_line"] = L_g * par["L_line_n"], R_g * par["R_line_n"]
-    _connect(par, st)
-    try:
-        check_sub_step(par)
-    except ValueError:
-        par[:] = before
-        raise
+    changed = par.copy()
+    changed["L_g"], changed["R_g"] = L_g * par["L_line_n"], R_g * par["R_line_n"]
+    connect(changed, bool(st[0]["closed"]))
+    par[:] = changed
+    reconnect(par, st)
 
 
 def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
@@ -93,44 +106,13 @@ def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
     """
     if closed == bool(st[0]["closed"]):
         return
-    i_o, i_load = st["x"][0, 4:6], st["i_load"][0]  # views
-    if closed:
-        i_load[:] = i_o
-    else:
-        L_line, L_load = par[0]["L_line"], par[0]["L_load"]
-        if L_load == 0:
-            raise ValueError(
-                "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
-            )
-        i_o[:] = (L_line * i_o + L_load * i_load) / (L_line + L_load)
+    if not closed and par[0]["L_load"] == 0:
+        raise ValueError(
+            "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
+        )
     st["closed"] = closed
-    _connect(par, st)
-
-
-@compiled
-def advance_grid(r: Any, s: Any) -> None:
-    """Move ramps and sags on by one tick."""
-    T_s = r.T_s
-    s.omega_g = _towards(s.omega_g, s.omega_g_to, s.omega_g_rate * T_s)
-    s.V_g = _towards(s.V_g, s.V_g_to, s.V_g_rate * T_s)
-    if s.sag_left > 0.0:
-        s.sag_left -= T_s
-        if s.sag_left < 0.5 * T_s:  # half a tick of slack absorbs the rounding of the sum
-            s.sag_left = 0.0
-            s.V_g = s.V_g_to = s.V_g_after
-
-
-@compiled
-def _towards(value: float, goal: float, most: float) -> float:
-    """Move `value` towards `goal` by at most `most`."""
-    return min(value + most, goal) if value < goal else max(value - most, goal)
-
-
-def _connect(par: PlantRecord, st: PlantRecord) -> None:
-    """Set the path of i_o: the line, and behind an open breaker the load in series with it."""
-    islanded = not st[0]["closed"]
-    par["L_g"] = par["L_line"] + islanded * par["L_load"]
-    par["R_g"] = par["R_line"] + islanded * par["R_load"]
+    connect(par, closed)
+    reconnect(par, st)
 
 
 def _rate(rate: float | None) -> float:

@@ -42,6 +42,21 @@ class DcSource(Options):
     k_p: NonNegative = Field(90.0, description="PI of the regulated source, p.u./p.u.")
     k_i: NonNegative = Field(400.0, description="PI of the regulated source, p.u./(p.u. s)")
     i_max: Positive | None = Field(None, description="limit of |i_dc|, p.u.; unlimited if none")
+    tau_s: Positive | None = Field(
+        None,
+        description="lag between the current that is asked for, within i_max, and the current that "
+        "flows, s; none if not given",
+    )
+
+
+class FiniteGrid(Options):
+    """A grid that reacts: the swing equation of all its machines as one, with a governor."""
+
+    S: Positive = Field(description="rating of the grid over that of the converter")
+    H: Positive = Field(description="inertia constant, s")
+    D: NonNegative = Field(0.0, description="power of the loads by frequency, p.u./p.u.")
+    droop: Positive = Field(0.05, description="frequency by power of the governors, p.u./p.u.")
+    T_gov: Positive = Field(0.5, description="lag of governors and turbines, s")
 
 
 class Grid(Options):
@@ -61,6 +76,9 @@ class Grid(Options):
     )
     x_over_r: Positive | None = Field(
         None, description="X/R of the line at nominal frequency; goes with scr"
+    )
+    finite: FiniteGrid | None = Field(
+        None, description="a grid whose frequency follows its balance of power; ideal if none"
     )
     load_R: NonNegative | None = Field(None, description="local series RL load, ohm")
     load_L: Positive | None = Field(None, description="local series RL load, H")
@@ -221,6 +239,11 @@ class Plant(Options):
     converter: str = Field("paper", description="name of a shipped converter, or a .toml file")
     factors: dict[Element, float] = Field({}, description="real over nominal value of an element")
     dc_source: DcSource = Field(DcSource(), description="the source that feeds C_dc")
+    modulation: Literal["unlimited", "space-vector", "sine"] = Field(
+        "unlimited",
+        description="limit of the bridge's voltage by v_dc: line-to-line RMS at most "
+        "v_dc / sqrt(2) (space-vector) or v_dc sqrt(3/8) (sine-triangle)",
+    )
     grid: Grid = Field(Grid(), description="grid simulator at the start")
     sensors: Sensors = Field(
         Sensors(), description="what stands between the true quantities and the A/D"
@@ -233,7 +256,6 @@ class Plant(Options):
     ] = Field(DigitalToAnalog(), description='"DS2101" (12 bit) or a table; ideal if none')
     delay: Delay = Field(Delay(), description="of the loop")
     protection: Protection = Field(Protection(), description="trips of the converter")
-    substeps: int = Field(10, ge=1, le=1000, description="RK4 steps in one sampling period")
 
     @model_validator(mode="after")
     def _elements_stay_physical(self) -> Plant:

@@ -15,12 +15,13 @@ from gfm_plant.names import (
     TRIP_REASONS,
     TRIPS,
 )
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import BLOCKED, PlantRecord
+from gfm_plant.solution import I_F, enter
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def trip(s: Any, reason: int, value: float) -> None:
+def trip(r: Any, s: Any, reason: int, value: float) -> None:
     """Latch a trip, if none is latched: the bridge blocks and the DC source turns off.
 
     The current of L_f is taken as interrupted at once. From here on the plant obeys no command;
@@ -30,15 +31,16 @@ def trip(s: Any, reason: int, value: float) -> None:
         s.trip = reason
         s.trip_tick = s.tick
         s.trip_value = value
-        s.x[0] = s.x[1] = 0.0
+        s.x[0] = s.x[1] = s.w[I_F, 0] = s.w[I_F, 1] = s.i_source = s.E = 0.0
+        enter(r, s, BLOCKED)
         s.u_now[0], s.u_now[1], s.u_now[2] = 0.0, s.omega_g, 0.0
 
 
 @compiled
 def protect(r: Any, s: Any) -> None:
     """Check every threshold on the true values of this tick."""
-    i = math.hypot(s.x[0], s.x[1])
-    V = math.hypot(s.x[2], s.x[3])
+    i = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
+    V = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
     v_dc = s.x[7]
     omega_u = s.u_now[1]
     _watch(r, s, 0, i, 1.0)
@@ -57,7 +59,7 @@ def _watch(r: Any, s: Any, k: int, value: float, sign: float) -> None:
         return
     # The tick that first sees a crossing starts the time.
     if s.crossed[k] >= r.trip_ticks[k]:
-        trip(s, k + 1, value)
+        trip(r, s, k + 1, value)
     s.crossed[k] += 1
 
 

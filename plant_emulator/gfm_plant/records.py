@@ -14,22 +14,24 @@ PlantRecord = NDArray[np.void]
 """Shape (1,) of `plant_par_dtype` or `plant_state_dtype`."""
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
+N_W = 4  # states of the circuit: currents of filter, line and load, voltage of the filter
+N_SOURCES = 2  # the bridge and the grid
+N_CIRCUITS = 2
+OPERATING, BLOCKED = 0, 1
+"""The circuits: with the bridge in operation, and without the filter inductor."""
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 
 plant_par_dtype = np.dtype(
     [
         ("omega_b", "f8"),  # rad/s
-        # the elements of Eq. (1)-(8); L_g, R_g are what i_o flows through: the line, and behind
-        # an open grid breaker the local load as well
+        # the elements of Eq. (1)-(8)
         ("L_f", "f8"),
         ("R_f", "f8"),
         ("C_f", "f8"),
         ("L_g", "f8"),
         ("R_g", "f8"),
         ("C_dc", "f8"),
-        # the line alone, now and nominally, and the local load (L_load = 0: none)
-        ("L_line", "f8"),
-        ("R_line", "f8"),
+        # the line as the converter file has it, and the local load (L_load = 0: none)
         ("L_line_n", "f8"),
         ("R_line_n", "f8"),
         ("L_load", "f8"),
@@ -39,11 +41,15 @@ plant_par_dtype = np.dtype(
         ("k_p", "f8"),
         ("k_i", "f8"),
         ("i_max", "f8"),
+        ("tau_dc", "f8"),  # its lag, s (0: none)
+        # the bridge: |E| <= m_max v_dc
+        ("m_max", "f8"),
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
         ("gain", "f8", (4,)),
         ("offset", "f8", (4,)),
+        ("noisy", "i8"),
         ("noise_std", "f8", (4,)),
         ("seed", "u8"),
         ("adc_lo", "f8", (4,)),
@@ -53,14 +59,30 @@ plant_par_dtype = np.dtype(
         ("dac_lo", "f8", (3,)),
         ("dac_hi", "f8", (3,)),
         ("dac_lsb", "f8", (3,)),
-        # one sampling period: `steps_old` RK4 steps of `h_old` under u[k - delay - 1], then
-        # `steps_new` of `h_new` under u[k - delay]
+        # a finite grid on its own rating (H_grid = 0: ideal); its rating over the converter's
+        ("H_grid", "f8"),
+        ("D_grid", "f8"),
+        ("droop_grid", "f8"),
+        ("T_gov", "f8"),
+        ("S_grid", "f8"),
+        # one sampling period: a stretch under u[k - delay - 1], which has no length without a
+        # fraction of delay, then one under u[k - delay]; each is cut into pieces for Simpson's
+        # rule, and each piece in halves
         ("T_s", "f8"),
         ("delay", "i8"),
-        ("steps_old", "i8"),
-        ("h_old", "f8"),
-        ("steps_new", "i8"),
-        ("h_new", "f8"),
+        ("stretch", "f8", (2,)),  # s
+        ("pieces", "i8", (2,)),
+        ("half_h", "f8", (2,)),  # s
+        ("dc_steps", "i8"),  # of RK4 for the DC link in each half
+        ("sensor_weights", "f8", (2, 4)),  # of the last reading, and of a piece's parabola
+        # the modes of each circuit: in operation, and with the bridge blocked
+        ("n_states", "i8"),  # of w: without a local load the last one is missing
+        ("n_modes", "i8", (N_CIRCUITS,)),
+        ("rate", "f8", (N_CIRCUITS, N_W, 2)),  # real and imaginary part, also below; 1/s
+        ("decay", "f8", (N_CIRCUITS, 2, N_W, 2)),  # in half a piece of each stretch
+        ("drive", "f8", (N_CIRCUITS, N_W, N_SOURCES, 2)),
+        ("states", "f8", (N_CIRCUITS, N_W, N_W, 2)),
+        ("modes", "f8", (N_CIRCUITS, N_W, N_W, 2)),
         # protection: threshold, and ticks it may stay crossed (-1: disabled)
         ("trip_limit", "f8", (N_TRIPS,)),
         ("trip_ticks", "i8", (N_TRIPS,)),
@@ -71,9 +93,22 @@ plant_par_dtype = np.dtype(
 plant_state_dtype = np.dtype(
     [
         ("tick", "i8"),
-        ("x", "f8", (8,)),  # the state of Eq. (1)-(8)
+        # in the common frame, real and imaginary parts: modes, what drives them in the present
+        # stretch (in its first and its second half), states, and the sources' unit phasors
+        ("z", "f8", (N_W, 2)),
+        ("forced", "f8", (N_W, 4)),
+        # each source's gain on the modes, for which speed and stretch, and turn in half a piece
+        ("gain", "f8", (N_SOURCES, N_W, 2)),
+        ("gain_omega", "f8", (N_SOURCES,)),
+        ("gain_part", "i8", (N_SOURCES,)),
+        ("turn", "f8", (N_SOURCES, 2)),
+        ("w", "f8", (N_W, 2)),
+        ("unit", "f8", (N_SOURCES, 2)),
+        ("w_before", "f8", (N_W, 2)),  # w at the last tick
+        ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
-        ("i_load", "f8", (2,)),  # d and q current of the local load while the breaker is closed
+        ("i_source", "f8"),  # current of a DC source with a lag
+        ("E", "f8"),  # the bridge's voltage at this instant
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, 3)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (3,)),  # the command that acts at this instant
@@ -87,6 +122,13 @@ plant_state_dtype = np.dtype(
         ("V_g_rate", "f8"),
         ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
         ("V_g_after", "f8"),  # voltage it recovers to
+        # a finite grid, p.u. of its rating: power of turbines, set point of governors, load; its
+        # d/dt omega_g, 1/s; energy that the line has brought since the last tick, p.u. of S_n s
+        ("P_turbine", "f8"),
+        ("P_set", "f8"),
+        ("P_load", "f8"),
+        ("omega_g_slope", "f8"),
+        ("brought", "f8"),
         # protection: ticks in a row that each threshold was crossed, and the latched trip
         ("crossed", "i8", (N_TRIPS,)),
         ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none

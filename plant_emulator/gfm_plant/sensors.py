@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_plant.model import V_DC, terminal
-from gfm_plant.noise import gaussian
+from gfm_plant.noise import gaussians
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecord
 from gfm_runtime.compiled import compiled
@@ -26,17 +26,19 @@ def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> N
     else:
         v_dc = s.x[V_DC]
         p, q, V = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
-    y[0] = _measure(r, s, 0, v_dc)
-    y[1] = _measure(r, s, 1, p)
+    n_0 = n_1 = n_2 = n_3 = 0.0
+    if r.noisy:
+        n_0, n_1 = gaussians(r.seed, s.tick, 0)
+        n_2, n_3 = gaussians(r.seed, s.tick, 1)
+    y[0] = _measure(r, 0, v_dc, n_0)
+    y[1] = _measure(r, 1, p, n_1)
     y[2] = s.u_now[1]
-    y[3] = _measure(r, s, 2, q)
-    y[4] = _measure(r, s, 3, V)
+    y[3] = _measure(r, 2, q, n_2)
+    y[4] = _measure(r, 3, V, n_3)
 
 
 @compiled
-def _measure(r: Any, s: Any, j: int, value: float) -> float:
-    """Return a quantity as channel j reads it."""
-    value = r.gain[j] * value + r.offset[j]
-    if r.noise_std[j] > 0.0:
-        value += r.noise_std[j] * gaussian(r.seed, s.tick, j)
+def _measure(r: Any, j: int, value: float, noise: float) -> float:
+    """Return a quantity as channel j reads it; ``noise`` is a sample of N(0, 1)."""
+    value = r.gain[j] * value + r.offset[j] + r.noise_std[j] * noise
     return quantise(value, r.adc_lo[j], r.adc_hi[j], r.adc_lsb[j])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.model import N_U, N_X, f, g
+from gfm_plant.model import N_U, N_X, V_DC, f, g
 from gfm_plant.records import PlantRecord
 
 _ROUNDS = 30
@@ -40,7 +40,13 @@ def plant_equilibrium(
             break
         z = z - step
         if np.abs(step).max() <= 1e-11 * np.abs(z).max():
-            return z[:N_X], z[N_X:]
+            x, u = z[:N_X], z[N_X:]
+            if u[2] > par[0]["m_max"] * x[V_DC]:
+                raise NoEquilibrium(
+                    f"P = {P} p.u., V = {V} p.u., V_g = {V_g} p.u.: the bridge would need E_u = "
+                    f"{u[2]:.4g} p.u., its modulation gives {par[0]['m_max'] * x[V_DC]:.4g} p.u."
+                )
+            return x, u
     raise NoEquilibrium(f"no equilibrium found at P = {P} p.u., V = {V} p.u., V_g = {V_g} p.u.")
 
 

@@ -57,7 +57,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
         event(type="grid-impedance", L_g=-3.0, R_g=1.0), ["events.0", "L_g", "not -3.0"],
     ),
     "line too fast to resolve": (
-        event(type="grid-impedance", L_g=1e-3, R_g=1.0), ["events.0", "too fast", "substeps"],
+        event(type="grid-impedance", L_g=1e-9, R_g=0.0), ["events.0", "too fast", "L_g"],
     ),
     "unknown converter": (
         {"plant": {"converter": "mine"}}, ["converter = 'mine'", "paper"],

@@ -13,7 +13,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from gfm_hil.operator import Operator
 from gfm_hil.telemetry import BlockReader
 
 MB = 1e6
-SETTLE_S = 30.0  # how long a process may take to free the resources of former clients
+SETTLE_S = 15.0  # how long a process may take to free the resources of former clients
 PATIENCE_S = 200.0  # timeout of an answer, on a crowded machine
 _LOOK = {
     "kind": "look", "id": 1, "channels": ["p", "q"], "bins": 64, "mode": "roll", "span": 1.0,
@@ -86,21 +86,36 @@ class Sampler:
     samples: dict[str, list[Sample]] = field(default_factory=dict)
 
     def take(self) -> None:
-        """Take a sample of each, once they have freed the resources of the last round's clients."""
+        """Take a sample of each, once they have freed the resources of the last round's clients.
+
+        The fewest descriptors and threads of several readings count: a server opens the recording
+        anew whenever it reads it, and closes it again.
+        """
         until = time.monotonic() + SETTLE_S
-        while True:
-            now = {n: take_sample(p, time.monotonic() - self.begin) for n, p in self.pids.items()}
-            settled = all(
-                one.descriptors <= self.samples[name][-1].descriptors
-                and one.threads <= self.samples[name][-1].threads
-                for name, one in now.items()
-                if name in self.samples
-            )
-            if settled or time.monotonic() >= until:
-                break
+        now = self._read()
+        while not self._settled(now) and time.monotonic() < until:
             time.sleep(0.2)
+            now = {
+                name: replace(
+                    one,
+                    descriptors=min(one.descriptors, now[name].descriptors),
+                    threads=min(one.threads, now[name].threads),
+                )
+                for name, one in self._read().items()
+            }
         for name, one in now.items():
             self.samples.setdefault(name, []).append(one)
+
+    def _read(self) -> dict[str, Sample]:
+        return {n: take_sample(p, time.monotonic() - self.begin) for n, p in self.pids.items()}
+
+    def _settled(self, now: dict[str, Sample]) -> bool:
+        return all(
+            one.descriptors <= self.samples[name][-1].descriptors
+            and one.threads <= self.samples[name][-1].threads
+            for name, one in now.items()
+            if name in self.samples
+        )
 
     def column(self, name: str, what: str) -> np.ndarray:
         """One figure of one process over all samples."""

@@ -215,7 +215,6 @@ class ClosedLoop:
             NoEquilibrium: plant and law have no common operating point then.
         """
         of = self.made_of
-        # change the record: make_plant would also check the emulator's sub-step
         par, nominal = of.par.copy(), load_converter(of.plant.converter).pu()
         for name, factor in factors.items():
             par[name] = nominal[name] * factor

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.model.operating_point import OperatingPoint
-from gfm_plant.model import N_X, V_DC, f, g
+from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
 from gfm_plant.records import PlantRecord
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
@@ -40,9 +40,10 @@ class LinearPlant:
 
     x' is dx/dt, or the x of the next tick. Shapes: A (n,n), B (n,3), B_d (n,2), C and C_true (5,n);
     several plants have one leading axis more. The first eight states are those of
-    ``gfm_plant.model``; a regulated DC source adds its integral, band-limited sensors add four, and
-    a sampled plant ends with its delay lines. C gives what the controller reads and C_true what
-    the sensors measure. The omega_u row of both is 0, since a law is fed its own omega_u.
+    ``gfm_plant.model``; a regulated DC source adds its integral, one with a lag its current, a
+    finite grid its frequency and its turbines' power, band-limited sensors add four, and a sampled
+    plant ends with its delay lines. C gives what the controller reads and C_true what the sensors
+    measure. The omega_u row of both is 0, since a law is fed its own omega_u.
     """
 
     A: Matrix
@@ -114,23 +115,40 @@ def linearise_plant(
     """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g."""
     r = par[0]
     at = np.concatenate([op.x, op.u, [omega_g, V_g]])
-    slopes = np.empty((N_X + NY, len(at)))
+    slopes = np.empty((N_X + NY + 1, len(at)))
     for j in range(len(at)):
         z = at.astype(complex)
         z[j] += 1j * _STEP
         x, u, d = np.split(z, [N_X, N_X + NU])
-        slopes[:, j] = np.concatenate([f(x, u, d, par), g(x, u)]).imag / _STEP
-    regulated, sensors = int(r["i_u_gain"] == 0.0), 4 * int(r["filtered"])
-    n, s = N_X + regulated, slice(N_X + regulated, N_X + regulated + sensors)
+        p_g = d[1] * (np.cos(x[DELTA]) * x[4] - np.sin(x[DELTA]) * x[5])
+        slopes[:, j] = np.concatenate([f(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
+    regulated, lags = int(r["i_u_gain"] == 0.0), int(r["tau_dc"] > 0.0)
+    finite, sensors = 2 * int(r["H_grid"] > 0.0), 4 * int(r["filtered"])
+    source, swing = N_X + regulated, N_X + regulated + lags  # where the states begin
+    n = swing + finite
+    s = slice(n, n + sensors)
     A, C = np.zeros((n + sensors, n + sensors)), np.zeros((NY, n + sensors))
     B, B_d = np.zeros((n + sensors, NU)), np.zeros((n + sensors, 2))
     A[:N_X, :N_X], B[:N_X], B_d[:N_X] = np.split(slopes[:N_X], [N_X, N_X + NU], axis=1)
-    C[_MEASURED, :N_X] = slopes[N_X:][_MEASURED, :N_X]
+    C[_MEASURED, :N_X] = slopes[N_X:-1][_MEASURED, :N_X]
     C_true = C.copy()
-    if regulated:  # i_dc = k_p (1 - v_dc) + its integral, in place of i_u
-        A[V_DC, V_DC] -= r["k_p"] * B[V_DC, 0]
-        A[V_DC, N_X], A[N_X, V_DC] = B[V_DC, 0], -r["k_i"]
-        B[:, 0] = 0.0
+    per_i_dc, asked = B[V_DC, 0], np.zeros(n + sensors)  # the current asked of the DC source, by x
+    B[V_DC, 0] = 0.0
+    if regulated:
+        asked[V_DC], asked[N_X], A[N_X, V_DC] = -r["k_p"], 1.0, -r["k_i"]
+    if lags:
+        A[source], B[source, 0] = asked / r["tau_dc"], (1 - regulated) / r["tau_dc"]
+        A[source, source] -= 1 / r["tau_dc"]
+        A[V_DC, source] = per_i_dc
+    else:
+        A[V_DC] += per_i_dc * asked
+        B[V_DC, 0] = per_i_dc * (1 - regulated)
+    if finite:  # omega_g is a state, and so is the power of the turbines
+        A[:, swing], B_d[:, 0] = B_d[:, 0], 0.0
+        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] / r["S_grid"], slopes[-1, -1] / r["S_grid"]
+        A[swing, [swing, swing + 1]] = -r["D_grid"], 1.0
+        A[swing], B_d[swing] = A[swing] / (2 * r["H_grid"]), B_d[swing] / (2 * r["H_grid"])
+        A[swing + 1, [swing, swing + 1]] = -1 / (r["droop_grid"] * r["T_gov"]), -1 / r["T_gov"]
     if sensors:
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
         C = np.zeros_like(C)

@@ -86,7 +86,6 @@ class Loop:
         bench.controller.set("P_ref", 0.8)
         self.bench, self.ticks = bench, ticks
         self.T_s = bench.scenario.T_s
-        self.substeps = bench.scenario.plant.substeps
         self.plant = Part.create(folder, "plant", ticks).signals
         self.controller = Part.create(folder, "controller", ticks).signals
         c = bench.controller
@@ -198,5 +197,4 @@ def _measure(loop: Loop, turns: int) -> dict[str, Any]:
     return {f"{name}_ns": Spread.of(times).plain() for name, times in found.items()} | {
         "times_real_time": rate.plain(),
         "allocations_per_tick": loop.allocations_per_tick(),
-        "substeps": loop.substeps,
     }

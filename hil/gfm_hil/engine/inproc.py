@@ -45,7 +45,7 @@ def _run_ticks(plant, controller, y, u, plant_rows, controller_rows, start, stop
         if delayed:  # as over a link, where u[k] may come meanwhile
             plant_step(par, st)
         state = ctl[0].state
-        if obey(st, waits, state) != Why.GO_ON:
+        if obey(par, st, waits, state) != Why.GO_ON:
             return k + 1
         if advance(par, st, u, delayed, tripped, state, True) != Why.GO_ON:
             return k + 1

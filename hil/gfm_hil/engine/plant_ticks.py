@@ -105,7 +105,7 @@ def plant_ticks(end, records, plant, last):
                 u[j] = r.u_last[j] + (r.late + 1) * (r.u_last[j] - r.u_before[j])
         record_command(rows[k], u)
         progress[0] = k + 1
-        why = obey(st, r.waits, reader[0].state)
+        why = obey(par, st, r.waits, reader[0].state)
         if why != Why.GO_ON:
             break
         if came != FRESH:
@@ -123,7 +123,7 @@ def plant_ticks(end, records, plant, last):
         if why != Why.GO_ON:
             break
         if r.waits and reader[0].e2e == INVALID:
-            trip(st[0], CONTROLLER, NOT_HEARD)
+            trip(par[0], st[0], CONTROLLER, NOT_HEARD)
         if st[0].trip != tripped:
             why = Why.CHANGED
             break

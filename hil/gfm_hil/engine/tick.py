@@ -32,7 +32,7 @@ def answer(ctl, laws, states, est, y, u, plant_tripped):
 
 
 @inlined
-def obey(st, waits, state):
+def obey(par, st, waits, state):
     """What the controller's state asks of the plant: PEER_SAFE or PEER_STOPPED end the run.
 
     A plant that ``waits`` for a reset trips instead when the controller is in SAFE.
@@ -40,7 +40,7 @@ def obey(st, waits, state):
     if state == SAFE:
         if not waits:
             return Why.PEER_SAFE
-        trip(st[0], CONTROLLER, SAFE_STATE)
+        trip(par[0], st[0], CONTROLLER, SAFE_STATE)
     if state == STOPPED:
         return Why.PEER_STOPPED
     return Why.GO_ON

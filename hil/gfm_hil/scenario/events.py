@@ -160,6 +160,16 @@ class GridImpedance(_Event):
         return f"line L × {self.L_g:g}, R × {self.R_g:g}"
 
 
+class GridLoad(_Event):
+    """The load of a finite grid changes by ``change`` [p.u. of the grid's rating]."""
+
+    type: Literal["grid-load"] = Field(description="kind of event")
+    change: float = Field(ge=-2, le=2, description="p.u. of the rating of the finite grid")
+
+    def label(self) -> str:
+        return f"grid load {self.change:+g} p.u."
+
+
 class Breaker(_Event):
     """The grid breaker opens onto the local load, or closes again."""
 
@@ -179,6 +189,7 @@ Event = Annotated[
     | GridVoltage
     | PhaseJump
     | GridImpedance
+    | GridLoad
     | Breaker,
     Field(discriminator="type"),
 ]
@@ -188,11 +199,22 @@ CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 def apply_grid_event(event: Any, par: Any, st: Any) -> None:
     """Apply one of the plant's events to its records, between two ticks."""
-    from gfm_plant import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
+    from gfm_plant import (
+        breaker,
+        grid_frequency,
+        grid_impedance,
+        grid_load,
+        grid_voltage,
+        phase_jump,
+    )
 
     f_b = float(par[0]["omega_b"]) / (2 * math.pi)
     match event:
         case GridFrequency():
+            if par[0]["H_grid"] > 0:
+                raise ValueError(
+                    "plant.grid.finite: such a grid sets its own frequency; use grid-load"
+                )
             rate = event.rate / f_b if event.rate else None
             grid_frequency(st, event.f_hz / f_b, rate)
         case GridVoltage():
@@ -201,5 +223,7 @@ def apply_grid_event(event: Any, par: Any, st: Any) -> None:
             phase_jump(st, event.degrees)
         case GridImpedance():
             grid_impedance(par, st, event.L_g, event.R_g)
+        case GridLoad():
+            grid_load(par, st, event.change)
         case Breaker():
             breaker(par, st, event.closed)

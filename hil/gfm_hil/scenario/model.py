@@ -18,7 +18,9 @@ from gfm_hil.links.impaired import Impairment
 from gfm_hil.scenario.events import (
     Breaker,
     Event,
+    GridFrequency,
     GridImpedance,
+    GridLoad,
     LawChange,
     Reset,
     apply_grid_event,
@@ -387,7 +389,7 @@ def _try_law(name: str, stage: Law, T_s: float) -> None:
 
 
 def _try_plant(scenario: Scenario) -> None:
-    """Build the plant with every line of its events; a line may be too fast to simulate."""
+    """Build the plant and try those of its events that not every plant can carry out."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
     if scenario.plant.converter.endswith(".toml"):
         try:
@@ -402,7 +404,7 @@ def _try_plant(scenario: Scenario) -> None:
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):
-        if isinstance(event, GridImpedance):
+        if isinstance(event, GridFrequency | GridImpedance | GridLoad):
             try:
                 apply_grid_event(event, par, st)
             except ValueError as problem:

@@ -1,0 +1,143 @@
+"""A linear circuit of R-L branches and capacitors between voltage sources, and its modes.
+
+All voltages and currents are complex space vectors in one common frame that rotates at omega_b.
+There the circuit obeys w' = A w + B s with the currents of the branches and the voltages of the
+capacitors as w and the voltages of the sources as s. In energy coordinates (a current times
+sqrt(L), a voltage times sqrt(C)) the lossless part of A is skew-Hermitian, so its modes are nearly
+orthogonal even where eigenvalues repeat, as those of identical converters in parallel do.
+
+A node that has neither a capacitor nor a source forces the sum of its branch currents to zero. The
+circuit then lives in the subspace in which these sums vanish, and the projection onto it by
+stored energy is what a switching does physically: it keeps the flux of every loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+GROUND = "ground"
+
+WORST_CONDITION = 1e8
+"""Largest condition number of the modes: beyond it half of the digits would be lost."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """R and L in series from node ``start`` to node ``end``, p.u.; L > 0."""
+
+    name: str
+    start: str
+    end: str
+    L: float
+    R: float
+
+
+@dataclass(frozen=True)
+class Capacitor:
+    """C between a node and ground, p.u.; C > 0."""
+
+    name: str
+    node: str
+    C: float
+
+
+@dataclass(frozen=True)
+class Source:
+    """An ideal voltage at a node, against ground."""
+
+    name: str
+    node: str
+
+
+@dataclass(frozen=True)
+class Modes:
+    """What ``find_modes`` returns, for w of n_w states, n modes and n_s sources.
+
+    Attributes:
+        rates: eigenvalues, (n,), 1/s.
+        states: w of the modes, (n_w, n); a state that the circuit does not have is zero.
+        modes: the modes of w, (n, n_w); it projects by stored energy.
+        drive: rate of the modes per source voltage, (n, n_s), 1/s.
+    """
+
+    rates: NDArray[np.complex128]
+    states: NDArray[np.complex128]
+    modes: NDArray[np.complex128]
+    drive: NDArray[np.complex128]
+
+
+def find_modes(
+    branches: Sequence[Branch],
+    capacitors: Sequence[Capacitor],
+    sources: Sequence[Source],
+    omega_b: float,
+    order: Sequence[str],
+) -> Modes:
+    """Return the modes of a circuit.
+
+    Args:
+        omega_b: rad/s, also the speed of the common frame.
+        order: the names of the states as w has them; those of other circuits may be among them.
+
+    Raises:
+        ValueError: an L or C is not positive, a node hangs on one branch alone, two sources or
+            capacitors share a node, or the modes are too close to each other to be told apart.
+    """
+    for part in (*branches, *capacitors):
+        value = part.L if isinstance(part, Branch) else part.C
+        if not value > 0:
+            raise ValueError(f"{part.name} = {value}: must be > 0")
+    fixed = _places("source", sources)
+    charged = _places("capacitor", capacitors)
+    if both := set(fixed) & set(charged):
+        raise ValueError(f"node {min(both)}: a source and a capacitor in parallel")
+
+    n_b, n_c = len(branches), len(capacitors)
+    n_s = len(sources)
+    M = np.zeros((n_b + n_c, n_b + n_c))  # of the stored quantities: L i' = M w + B s, C v' = M w
+    B = np.zeros((n_b + n_c, n_s))
+    meets: dict[str, NDArray[np.float64]] = {}
+    for j, branch in enumerate(branches):
+        M[j, j] = -branch.R
+        for node, sign in ((branch.start, 1.0), (branch.end, -1.0)):
+            if node in fixed:
+                B[j, fixed[node]] = sign
+            elif node in charged:
+                M[j, n_b + charged[node]] = sign
+                M[n_b + charged[node], j] = -sign
+            elif node != GROUND:
+                meets.setdefault(node, np.zeros(n_b + n_c))[j] = sign
+    for node, row in meets.items():
+        if np.count_nonzero(row) < 2:
+            (j,) = np.flatnonzero(row)
+            raise ValueError(f"node {node}: only {branches[j].name} ends there")
+
+    root = np.sqrt([*(b.L for b in branches), *(c.C for c in capacitors)])
+    K = null_space(np.array(list(meets.values())) / root) if meets else np.eye(n_b + n_c)
+    A = omega_b * K.T @ (M / root[:, None] / root) @ K - 1j * omega_b * np.eye(K.shape[1])
+    rates, X = np.linalg.eig(A)
+    if not np.linalg.cond(X) < WORST_CONDITION:
+        raise ValueError("the circuit's modes cannot be told apart: change one element a little")
+    names = [part.name for part in (*branches, *capacitors)]
+    at = [list(order).index(name) for name in names]
+    states = np.zeros((len(order), len(rates)), complex)
+    modes = np.zeros((len(rates), len(order)), complex)
+    states[at] = (K @ X) / root[:, None]
+    modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
+    return Modes(rates, states, modes, omega_b * np.linalg.solve(X, K.T @ (B / root[:, None])))
+
+
+def _places(kind: str, parts: Sequence[Source] | Sequence[Capacitor]) -> dict[str, int]:
+    """Index of the part at each node."""
+    found: dict[str, int] = {}
+    for k, part in enumerate(parts):
+        if part.node in found:
+            raise ValueError(f"node {part.node}: {parts[found[part.node]].name} and {part.name}, "
+                             f"one {kind} only")  # fmt: skip
+        found[part.node] = k
+    return found

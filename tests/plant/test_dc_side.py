@@ -1,0 +1,59 @@
+"""The DC source's lag and the bridge's modulation limit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from gfm_plant import NoEquilibrium
+from gfm_plant.model import V_DC, f
+
+T_S = 1e-4
+
+
+@pytest.mark.parametrize("source", [{}, {"mode": "regulated"}])
+def test_source_with_a_lag(rest: Callable[..., Any], source: dict[str, Any]) -> None:
+    """Against SciPy: tau i' = what is asked for - i, and C_dc takes i."""
+    plant = rest(P=-0.5, dc_source={**source, "tau_s": 0.02})
+    r, u = plant.par[0], plant.near(i_u=0.1, E_u=1e-3)
+
+    def slope(_: float, z: Any) -> Any:
+        error = 1.0 - z[V_DC]
+        asked = r["i_u_gain"] * u[0] + r["k_p"] * error + z[8]
+        dx = f(z[:8].copy(), np.array([z[9], u[1], u[2]]), np.array([1.0, 1.0]), plant.par)
+        return np.concatenate([dx, [r["k_i"] * error, (asked - z[9]) / 0.02]])
+
+    z = np.concatenate([plant.x, [plant.u[0] * (1 - r["i_u_gain"]), plant.u[0]]])
+    exact = solve_ivp(slope, (0, 0.1), z, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    plant.advance(1000, u)
+    assert plant.st["x"][0] == pytest.approx(exact[:8], abs=1e-8)
+    assert plant.truth()["i_dc"] == pytest.approx(exact[9], abs=1e-7)
+
+
+def test_lag_comes_after_the_limit(rest: Callable[..., Any]) -> None:
+    plant = rest(P=-0.5, dc_source={"i_max": 0.6, "tau_s": 0.01})
+    plant.advance(100, plant.near(i_u=-9.0))  # one time constant towards -0.6
+    start = plant.u[0]
+    assert plant.truth()["i_dc"] == pytest.approx(-0.6 + (start + 0.6) * np.exp(-1.0), abs=1e-9)
+
+
+@pytest.mark.parametrize(("modulation", "most"), [("space-vector", 1.3026), ("sine", 1.1281)])
+def test_modulation_limits_the_bridge_by_v_dc(
+    rest: Callable[..., Any], modulation: str, most: float
+) -> None:
+    """Line-to-line RMS of 700 V DC over 380 V, by hand: 1 / sqrt(2), and sqrt(3 / 8)."""
+    off = {name: {"enabled": False} for name in ("over_current", "over_voltage")}
+    plant = rest(modulation=modulation, protection=off)
+    limits = []
+    for _ in range(30):
+        limits.append(most * plant.truth()["v_dc"])
+        plant.advance(u=plant.near(E_u=2.0))
+        assert plant.st["E"][0] == pytest.approx(limits[-1], abs=1e-4)
+    assert limits[-1] < 0.98 * limits[0]  # v_dc has sagged, and the limit with it
+
+
+def test_no_rest_beyond_the_modulation(rest: Callable[..., Any]) -> None:
+    with pytest.raises(NoEquilibrium, match=r"need E_u = 1.195 p.u.* gives 1.128 p.u."):
+        rest(V=1.2, modulation="sine", grid={"V_g": 1.2})
