@@ -10,6 +10,7 @@ from .emulator import (
 )
 from .grid import (
     breaker,
+    fault,
     grid_frequency,
     grid_impedance,
     grid_load,
@@ -34,6 +35,7 @@ __all__ = [
     "NoEquilibrium",
     "Plant",
     "breaker",
+    "fault",
     "grid_frequency",
     "grid_impedance",
     "grid_load",

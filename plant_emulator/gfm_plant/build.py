@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Source, find_modes
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.options import COMMANDS, MEASURED, Plant
 from gfm_plant.parameters import load_converter
 from gfm_plant.records import (
     BLOCKED,
+    FAULTED,
     OPERATING,
     PlantRecord,
     plant_par_dtype,
@@ -46,6 +47,7 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     par = np.zeros(1, plant_par_dtype)
+    par["fault_at"] = -1.0
     _pack_circuit(par, options, T_s)
     _pack_measurement(par, options)
     _pack_timing(par, options, T_s)
@@ -73,8 +75,11 @@ def connect(par: PlantRecord, closed: bool) -> None:
         ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast for
             the DC link.
     """
-    par["n_states"] = len(STATES) if par[0]["L_load"] > 0 else len(STATES) - 1
-    found = {c: _modes(par[0], closed, c) for c in (OPERATING, BLOCKED)}
+    r = par[0]
+    lacks = (r["fault_at"] <= 0) + (r["fault_at"] <= 0 and r["L_load"] == 0)
+    par["n_states"] = len(STATES) - lacks
+    faults = (0, FAULTED) if r["fault_at"] >= 0 else (0,)
+    found = {c + f: _modes(r, closed, c, f) for c in (OPERATING, BLOCKED) for f in faults}
     _pack_pieces(par, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     for circuit, (modes, sources) in found.items():
         n = par["n_modes"][0, circuit] = len(modes.rates)
@@ -88,11 +93,18 @@ def connect(par: PlantRecord, closed: bool) -> None:
             _set(par["drive"][0, circuit, :n, SOURCES.index(source.name)], modes.drive[:, k])
 
 
-def _modes(r: Any, closed: bool, circuit: int) -> tuple[Modes, list[Source]]:
+def _modes(r: Any, closed: bool, bridge: int, fault: int) -> tuple[Modes, list[Source]]:
     """The modes of one of the circuits, and its sources."""
-    branches = [Branch("i_o", "terminal", "far", r["L_g"], r["R_g"])]
-    sources = []
-    if circuit == OPERATING:
+    at = r["fault_at"]
+    branches, shunts, sources = [], [], []
+    if at > 0:  # the line in two pieces
+        branches.append(Branch("i_o", "terminal", "fault", at * r["L_g"], at * r["R_g"]))
+        branches.append(Branch("i_g", "fault", "far", (1 - at) * r["L_g"], (1 - at) * r["R_g"]))
+    else:
+        branches.append(Branch("i_o", "terminal", "far", r["L_g"], r["R_g"]))
+    if fault:
+        shunts.append(Shunt("fault", "fault" if at > 0 else "terminal", r["fault_R"]))
+    if bridge == OPERATING:
         branches.append(Branch("i_f", "bridge", "terminal", r["L_f"], r["R_f"]))
         sources.append(Source("bridge", "bridge"))
     if r["L_load"] > 0:
@@ -100,7 +112,8 @@ def _modes(r: Any, closed: bool, circuit: int) -> tuple[Modes, list[Source]]:
     if closed:
         sources.append(Source("grid", "far"))
     capacitor = Capacitor("v", "terminal", r["C_f"])
-    return find_modes(branches, [capacitor], sources, r["omega_b"], STATES), sources
+    modes = find_modes(branches, [capacitor], sources, r["omega_b"], STATES, shunts)
+    return modes, sources
 
 
 def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:

@@ -47,6 +47,15 @@ class Capacitor:
 
 
 @dataclass(frozen=True)
+class Shunt:
+    """R from a node to ground, p.u.; R > 0 at a node with a capacitor, elsewhere R >= 0."""
+
+    name: str
+    node: str
+    R: float
+
+
+@dataclass(frozen=True)
 class Source:
     """An ideal voltage at a node, against ground."""
 
@@ -77,12 +86,14 @@ def find_modes(
     sources: Sequence[Source],
     omega_b: float,
     order: Sequence[str],
+    shunts: Sequence[Shunt] = (),
 ) -> Modes:
     """Return the modes of a circuit.
 
     Args:
         omega_b: rad/s, also the speed of the common frame.
         order: the names of the states as w has them; those of other circuits may be among them.
+        shunts: at most one a node, none at a source.
 
     Raises:
         ValueError: an L or C is not positive, a node hangs on one branch alone, two sources or
@@ -97,6 +108,7 @@ def find_modes(
     if both := set(fixed) & set(charged):
         raise ValueError(f"node {min(both)}: a source and a capacitor in parallel")
 
+    through = {shunt.node: shunt.R for shunt in shunts}
     n_b, n_c = len(branches), len(capacitors)
     n_s = len(sources)
     M = np.zeros((n_b + n_c, n_b + n_c))  # of the stored quantities: L i' = M w + B s, C v' = M w
@@ -112,8 +124,16 @@ def find_modes(
                 M[n_b + charged[node], j] = -sign
             elif node != GROUND:
                 meets.setdefault(node, np.zeros(n_b + n_c))[j] = sign
-    for node, row in meets.items():
-        if np.count_nonzero(row) < 2:
+    for node, k in charged.items():
+        if node in through:
+            if not through[node] > 0:
+                raise ValueError(f"node {node}: a shunt of R = {through[node]} on a capacitor")
+            M[n_b + k, n_b + k] -= 1 / through[node]
+    for node, row in list(meets.items()):
+        if node in through:  # its voltage is R times the current that arrives
+            M -= through[node] * np.outer(row, row)
+            del meets[node]
+        elif np.count_nonzero(row) < 2:
             (j,) = np.flatnonzero(row)
             raise ValueError(f"node {node}: only {branches[j].name} ends there")
 

@@ -18,7 +18,7 @@ from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid, brought, settle_grid
-from gfm_plant.records import BLOCKED, MAX_DELAY, OPERATING, PlantRecord
+from gfm_plant.records import MAX_DELAY, OPERATING, PlantRecord
 from gfm_plant.solution import (
     BRIDGE,
     GRID,
@@ -26,6 +26,7 @@ from gfm_plant.solution import (
     I_LOAD,
     I_O,
     V,
+    circuit,
     drive,
     enter,
     half_step,
@@ -147,6 +148,12 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
             s.w[i, 0], s.w[i, 1] = s.w_before[i, 0], s.w_before[i, 1]
         trip(r, s, DIVERGED, size)
     advance_grid(r, s)
+    if s.faulted:
+        s.fault_left -= r.T_s
+        if s.fault_left < 0.5 * r.T_s:
+            s.faulted = 0
+            enter(r, s, circuit(s))
+            _write_x(s)
 
 
 @compiled
@@ -181,7 +188,7 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
     # the modulator divides by the v_dc that it has at the beginning of its period
     most = r.m_max * s.x[V_DC]
     s.E = min(max(s.u_now[2], -most), most)
-    c = OPERATING if running else BLOCKED
+    c = circuit(s)
     for _ in range(r.pieces[part]):
         _piece(r, s, c, part)
 
@@ -198,7 +205,7 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
     if r.filtered:
         a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
-    g_0 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
+    g_0 = brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1])
 
     m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
     n_r, n_i = drive(r, s, c, part, GRID, s.V_g, omega_g)
@@ -209,12 +216,12 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     else:
         s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
     p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
-    g_1 = brought(s, n_r, n_i)
+    g_1 = brought(r, s, n_r, n_i)
 
     half_step(r, s, c, part, 2)
     read_states(r, s, c)
     p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
-    g_2 = brought(s, s.unit[GRID, 0], s.unit[GRID, 1])
+    g_2 = brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1])
 
     s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
     v_0 = s.x[V_DC]
@@ -248,7 +255,7 @@ def _sense(r: Any, s: Any, j: int, part: int, f_0: float, f_1: float, f_2: float
 def reconnect(par: PlantRecord, st: PlantRecord) -> None:
     """Go on from the present state in circuits that have changed."""
     r, s = par[0], st[0]
-    enter(r, s, BLOCKED if s.trip else OPERATING)
+    enter(r, s, circuit(s))
     _write_x(s)
 
 

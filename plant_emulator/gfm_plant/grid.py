@@ -11,7 +11,10 @@ from gfm_plant.build import connect
 from gfm_plant.emulator import reconnect
 from gfm_plant.model import DELTA
 from gfm_plant.records import PlantRecord
-from gfm_plant.solution import GRID
+from gfm_plant.solution import GRID, I_G, I_O
+
+LEAST_FAULT_R = 1e-4
+"""p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
 
 
 def grid_frequency(st: PlantRecord, omega_g: float, rate: float | None = None) -> None:
@@ -63,6 +66,40 @@ def grid_load(par: PlantRecord, st: PlantRecord, change: float) -> None:
     if par[0]["H_grid"] == 0:
         raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
     st["P_load"] += change
+
+
+def fault(
+    par: PlantRecord, st: PlantRecord, position: float, R: float, duration: float | None = None
+) -> None:
+    """Short the three phases to ground through `R`, or with `R` = inf clear what is there.
+
+    Args:
+        position: Place on the line: 0 at the filter capacitor, 1 at the grid.
+        R: Resistance of the fault, p.u.; > 0 at the filter capacitor.
+        duration: Time until the fault is cleared, s; None: another call clears it.
+
+    Raises:
+        ValueError: If a value is out of range. The plant is then unchanged.
+    """
+    if math.isinf(R):
+        st["fault_left"] = 0.0
+        if st[0]["faulted"]:
+            st["faulted"] = 0
+            reconnect(par, st)
+        return
+    _require("position", position, 0 <= position < 1, "in [0, 1)")
+    least = 0.0 if position > 0 else LEAST_FAULT_R
+    _require("R", R, least <= R, f">= {least:g} p.u. at position {position:g}")
+    if duration is not None:
+        _require("duration", duration, duration > 0, "> 0 s")
+    changed = par.copy()
+    changed["fault_at"], changed["fault_R"] = position, R
+    connect(changed, bool(st[0]["closed"]))
+    if par[0]["fault_at"] <= 0:  # the line was in one piece
+        st["w"][0, I_G] = st["w"][0, I_O]
+    par[:] = changed
+    st["faulted"], st["fault_left"] = 1, math.inf if duration is None else duration
+    reconnect(par, st)
 
 
 def phase_jump(st: PlantRecord, degrees: float) -> None:

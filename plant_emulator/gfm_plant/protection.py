@@ -15,8 +15,8 @@ from gfm_plant.names import (
     TRIP_REASONS,
     TRIPS,
 )
-from gfm_plant.records import BLOCKED, PlantRecord
-from gfm_plant.solution import I_F, enter
+from gfm_plant.records import PlantRecord
+from gfm_plant.solution import I_F, circuit, enter
 from gfm_runtime.compiled import compiled
 
 
@@ -32,7 +32,7 @@ def trip(r: Any, s: Any, reason: int, value: float) -> None:
         s.trip_tick = s.tick
         s.trip_value = value
         s.x[0] = s.x[1] = s.w[I_F, 0] = s.w[I_F, 1] = s.i_source = s.E = 0.0
-        enter(r, s, BLOCKED)
+        enter(r, s, circuit(s))
         s.u_now[0], s.u_now[1], s.u_now[2] = 0.0, s.omega_g, 0.0
 
 

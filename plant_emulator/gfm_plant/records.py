@@ -14,11 +14,12 @@ PlantRecord = NDArray[np.void]
 """Shape (1,) of `plant_par_dtype` or `plant_state_dtype`."""
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
-N_W = 4  # states of the circuit: currents of filter, line and load, voltage of the filter
+N_W = 5  # states of the circuit, see `solution.STATES`
 N_SOURCES = 2  # the bridge and the grid
-N_CIRCUITS = 2
-OPERATING, BLOCKED = 0, 1
-"""The circuits: with the bridge in operation, and without the filter inductor."""
+N_CIRCUITS = 4
+OPERATING, BLOCKED, FAULTED = 0, 1, 2
+"""The circuits: with the bridge in operation, or BLOCKED, without the filter inductor; and each of
+them + FAULTED."""
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 
 plant_par_dtype = np.dtype(
@@ -76,7 +77,10 @@ plant_par_dtype = np.dtype(
         ("dc_steps", "i8"),  # of RK4 for the DC link in each half
         ("sensor_weights", "f8", (2, 4)),  # of the last reading, and of a piece's parabola
         # the modes of each circuit: in operation, and with the bridge blocked
-        ("n_states", "i8"),  # of w: without a local load the last one is missing
+        ("n_states", "i8"),  # of w, without those at its end that the plant does not have
+        # a fault: its place on the line, 0 at the terminal and 1 at the grid (-1: none), and R
+        ("fault_at", "f8"),
+        ("fault_R", "f8"),
         ("n_modes", "i8", (N_CIRCUITS,)),
         ("rate", "f8", (N_CIRCUITS, N_W, 2)),  # real and imaginary part, also below; 1/s
         ("decay", "f8", (N_CIRCUITS, 2, N_W, 2)),  # in half a piece of each stretch
@@ -122,6 +126,8 @@ plant_state_dtype = np.dtype(
         ("V_g_rate", "f8"),
         ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
         ("V_g_after", "f8"),  # voltage it recovers to
+        ("faulted", "i8"),
+        ("fault_left", "f8"),  # s until the fault is cleared
         # a finite grid, p.u. of its rating: power of turbines, set point of governors, load; its
         # d/dt omega_g, 1/s; energy that the line has brought since the last tick, p.u. of S_n s
         ("P_turbine", "f8"),

@@ -16,11 +16,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from gfm_plant.records import BLOCKED, FAULTED, OPERATING
 from gfm_runtime.compiled import compiled
 
-STATES = ("i_f", "v", "i_o", "i_load")
-"""The names of w: currents of filter, line and local load; v is the filter capacitor's voltage."""
-I_F, V, I_O, I_LOAD = 0, 1, 2, 3
+STATES = ("i_f", "v", "i_o", "i_load", "i_g")
+"""The names of w: currents of filter, line and local load; v is the filter capacitor's voltage, and
+i_g the current of the line's far piece, if the line has a place for a fault."""
+I_F, V, I_O, I_LOAD, I_G = 0, 1, 2, 3, 4
 SOURCES = ("bridge", "grid")
 BRIDGE, GRID = 0, 1
 
@@ -112,6 +114,12 @@ def read_states(r: Any, s: Any, c: int) -> None:
     """Write all states of w by the modes."""
     for i in range(r.n_states):
         s.w[i, 0], s.w[i, 1] = state(r, s, c, i)
+
+
+@compiled
+def circuit(s: Any) -> int:
+    """Return which circuit is in force."""
+    return (BLOCKED if s.trip else OPERATING) + (FAULTED if s.faulted else 0)
 
 
 @compiled

@@ -105,4 +105,4 @@ def test_power_balance_of_a_run(rest: Callable[..., Any]) -> None:
     ) / (2 * r["omega_b"])  # fmt: skip
     change = stored[-1] - stored[0]
     assert abs(change) > 1e-3
-    assert change == pytest.approx(weights @ flow * 1e-5 / 3, abs=1e-8)
+    assert change == pytest.approx(weights @ flow * 1e-5 / 3, abs=1e-9)

@@ -170,6 +170,34 @@ class GridLoad(_Event):
         return f"grid load {self.change:+g} p.u."
 
 
+class Fault(_Event):
+    """A three-phase fault to ground on the line, through ``R`` [p.u.]."""
+
+    type: Literal["fault"] = Field(description="kind of event")
+    position: float = Field(
+        ge=0, lt=1, description="place on the line: 0 at the filter capacitor, 1 at the grid"
+    )
+    R: float = Field(
+        ge=0, le=1e6, description="resistance, p.u.; at least 1e-4 at the filter capacitor"
+    )
+    duration: float | None = Field(
+        None, gt=0, description="s until it is cleared; none: fault-clear clears it"
+    )
+
+    def label(self) -> str:
+        where = f"{self.position:g} of the line" if self.position else "the filter"
+        return f"fault at {where}" + (f" for {self.duration:g} s" if self.duration else "")
+
+
+class FaultClear(_Event):
+    """The fault is cleared."""
+
+    type: Literal["fault-clear"] = Field(description="kind of event")
+
+    def label(self) -> str:
+        return "fault cleared"
+
+
 class Breaker(_Event):
     """The grid breaker opens onto the local load, or closes again."""
 
@@ -190,6 +218,8 @@ Event = Annotated[
     | PhaseJump
     | GridImpedance
     | GridLoad
+    | Fault
+    | FaultClear
     | Breaker,
     Field(discriminator="type"),
 ]
@@ -201,6 +231,7 @@ def apply_grid_event(event: Any, par: Any, st: Any) -> None:
     """Apply one of the plant's events to its records, between two ticks."""
     from gfm_plant import (
         breaker,
+        fault,
         grid_frequency,
         grid_impedance,
         grid_load,
@@ -225,5 +256,9 @@ def apply_grid_event(event: Any, par: Any, st: Any) -> None:
             grid_impedance(par, st, event.L_g, event.R_g)
         case GridLoad():
             grid_load(par, st, event.change)
+        case Fault():
+            fault(par, st, event.position, event.R, event.duration)
+        case FaultClear():
+            fault(par, st, 0.0, math.inf)
         case Breaker():
             breaker(par, st, event.closed)

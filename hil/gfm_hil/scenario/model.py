@@ -18,6 +18,7 @@ from gfm_hil.links.impaired import Impairment
 from gfm_hil.scenario.events import (
     Breaker,
     Event,
+    Fault,
     GridFrequency,
     GridImpedance,
     GridLoad,
@@ -404,7 +405,7 @@ def _try_plant(scenario: Scenario) -> None:
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):
-        if isinstance(event, GridFrequency | GridImpedance | GridLoad):
+        if isinstance(event, Fault | GridFrequency | GridImpedance | GridLoad):
             try:
                 apply_grid_event(event, par, st)
             except ValueError as problem:

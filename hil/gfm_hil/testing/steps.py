@@ -161,6 +161,19 @@ class Steps:
         the factor ``L_g``: the same line, longer or shorter."""
         self._planned.step("grid-impedance", L_g=L_g, R_g=L_g if R_g is None else R_g)
 
+    def grid_load(self, change: float) -> None:
+        """The load of a finite grid changes, p.u. of the grid's rating."""
+        self._planned.step("grid-load", change=change)
+
+    def fault(self, position: float, R: float, duration: float | None = None) -> None:
+        """A three-phase fault to ground through ``R`` [p.u.], at 0 (filter) to 1 (grid) of the
+        line, for ``duration`` [s] or until ``clear_fault``."""
+        self._planned.step("fault", position=position, R=R, duration=duration)
+
+    def clear_fault(self) -> None:
+        """The fault is cleared."""
+        self._planned.step("fault-clear")
+
     def breaker(self, closed: bool) -> None:
         """The grid breaker opens onto the local load, or closes."""
         self._planned.step("grid-breaker", closed=closed)
