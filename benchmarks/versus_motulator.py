@@ -31,7 +31,7 @@ REMARKS = (
     "both: 100 µs, inputs held for a whole period (no switching ripple), steps of P_ref",
     "motulator: L filter and line, stiff DC voltage, one sample of delay; SciPy's adaptive RK45 "
     "at its default rtol of 1e-3, every solver step kept in lists, arrays made of them at the end",
-    "gfmhil: LC filter, line and DC link, no delay, 10 RK4 sub-steps a period (accuracy: "
+    "gfmhil: LC filter, line and DC link, no delay, the circuit solved by its modes (accuracy: "
     "tests/plant/test_accuracy.py), sensors, limits, protection; every tick recorded; compiling, "
     "some ten seconds once a machine, is not counted",
     "what the ratio shows is compiled against interpreted code, not one method against another; "

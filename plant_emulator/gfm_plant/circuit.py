@@ -99,10 +99,10 @@ def find_modes(
         ValueError: an L or C is not positive, a node hangs on one branch alone, two sources or
             capacitors share a node, or the modes are too close to each other to be told apart.
     """
-    for part in (*branches, *capacitors):
-        value = part.L if isinstance(part, Branch) else part.C
+    stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
+    for name, value in stored.items():
         if not value > 0:
-            raise ValueError(f"{part.name} = {value}: must be > 0")
+            raise ValueError(f"{name} = {value}: must be > 0")
     fixed = _places("source", sources)
     charged = _places("capacitor", capacitors)
     if both := set(fixed) & set(charged):
@@ -134,30 +134,31 @@ def find_modes(
             M -= through[node] * np.outer(row, row)
             del meets[node]
         elif np.count_nonzero(row) < 2:
-            (j,) = np.flatnonzero(row)
-            raise ValueError(f"node {node}: only {branches[j].name} ends there")
+            only = branches[int(np.flatnonzero(row)[0])]
+            raise ValueError(f"node {node}: only {only.name} ends there")
 
-    root = np.sqrt([*(b.L for b in branches), *(c.C for c in capacitors)])
+    root = np.sqrt(list(stored.values()))
     K = null_space(np.array(list(meets.values())) / root) if meets else np.eye(n_b + n_c)
     A = omega_b * K.T @ (M / root[:, None] / root) @ K - 1j * omega_b * np.eye(K.shape[1])
     rates, X = np.linalg.eig(A)
     if not np.linalg.cond(X) < WORST_CONDITION:
         raise ValueError("the circuit's modes cannot be told apart: change one element a little")
-    names = [part.name for part in (*branches, *capacitors)]
-    at = [list(order).index(name) for name in names]
+    at = [list(order).index(name) for name in stored]
     states = np.zeros((len(order), len(rates)), complex)
     modes = np.zeros((len(rates), len(order)), complex)
     states[at] = (K @ X) / root[:, None]
     modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
-    return Modes(rates, states, modes, omega_b * np.linalg.solve(X, K.T @ (B / root[:, None])))
+    drive = np.zeros((len(rates), n_s), complex)
+    drive[:] = omega_b * np.linalg.solve(X, K.T @ (B / root[:, None]))
+    return Modes(rates, states, modes, drive)
 
 
-def _places(kind: str, parts: Sequence[Source] | Sequence[Capacitor]) -> dict[str, int]:
+def _places(kind: str, parts: Sequence[Source | Capacitor]) -> dict[str, int]:
     """Index of the part at each node."""
     found: dict[str, int] = {}
     for k, part in enumerate(parts):
         if part.node in found:
-            raise ValueError(f"node {part.node}: {parts[found[part.node]].name} and {part.name}, "
-                             f"one {kind} only")  # fmt: skip
+            two = f"{parts[found[part.node]].name} and {part.name}"
+            raise ValueError(f"node {part.node}: {two}, one {kind} only")
         found[part.node] = k
     return found
