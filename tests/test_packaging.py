@@ -77,6 +77,14 @@ def test_runtime_needs_numpy_and_numba_only() -> None:
     assert not wrong
 
 
+def test_a_plain_install_has_all_that_the_plant_imports() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    installed = {canonicalize_name(Requirement(each).name) for each in project["dependencies"]}
+    names = {n.split(".")[0] for p in files(FOLDERS["gfm_plant"], {".py"}) for n in imported(p)}
+    foreign = names - set(sys.stdlib_module_names) - {"gfm_plant", "gfm_runtime", "pydantic_core"}
+    assert {canonicalize_name(name) for name in foreign} <= installed
+
+
 @pytest.mark.parametrize("package", FOLDERS)
 def test_package_is_typed(package: str) -> None:
     assert (FOLDERS[package] / "py.typed").is_file()

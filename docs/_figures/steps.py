@@ -22,7 +22,7 @@ COLUMNS = (
     ("f_peak_hz", "f peak [Hz]", 3),
     ("rocof_hz_s", "RoCoF [Hz/s]", 2),
     ("damping_ratio", "damping ratio", 3),
-    ("oscillation_hz", "at [Hz]", 2),
+    ("oscillation_hz", "oscillation [Hz]", 2),
 )
 
 

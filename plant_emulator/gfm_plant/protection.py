@@ -79,7 +79,8 @@ def trip_reason(st: PlantRecord, par: PlantRecord) -> str:
     _, quantity, sign = TRIPS[code - 1]
     limit = par[0]["trip_limit"][code - 1]
     persistence = int(par[0]["trip_ticks"][code - 1]) * T_s
+    lasting = f" for {persistence:.6g} s" if persistence else ""
     return (
         f"{TRIP_REASONS[code]}: {quantity} = {value:.6g} p.u. {'>' if sign > 0 else '<'}"
-        f" {limit:.6g} p.u. for {persistence:.6g} s {at}"
+        f" {limit:.6g} p.u.{lasting} {at}"
     )

@@ -6,10 +6,12 @@ converter. They load by name like the others, but ``law_names`` does not list th
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 from gfm_runtime.errors import LawError, meant
 from gfm_runtime.law import Law
@@ -73,6 +75,9 @@ def law_file(name: str) -> LawFile:
         return _shipped(name, "tuned")
     known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
     close = meant(name, [*law_names(), *tuned_names()])
+    with contextlib.suppress(OSError, ValueError):  # of what can be no path
+        if Path(f"{name}.toml").is_file():
+            close = f"; did you mean '{name}.toml'?"
     raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}{close}")
 
 

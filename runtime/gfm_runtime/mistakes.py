@@ -54,6 +54,10 @@ def _line(error: Any, model: Any) -> str:
     if error["type"] == "extra_forbidden":
         *parents, last = error["loc"]
         return f"{path} = {shown}: unknown key" + meant(last, _fields(model, parents))
+    if error["type"] in ("model_type", "dict_type"):
+        models = _models_at(model, error["loc"])
+        keys = [k for m in models for k, field in m.model_fields.items() if field.is_required()]
+        text = "must be a table" + (f" with {', '.join(keys)}" if keys else "")
     if error["type"] == "literal_error":
         text += meant(error["input"], _quoted(context["expected"]))
     return f"{path}: {text}, not {shown}" if path else f"{text}, not {shown}"
@@ -65,6 +69,11 @@ def _quoted(text: str) -> list[str]:
 
 def _fields(model: Any, path: Sequence[str | int]) -> set[str]:
     """The keys of the table that a path of an error leads to."""
+    return {field for m in _models_at(model, path) for field in m.model_fields}
+
+
+def _models_at(model: Any, path: Sequence[str | int]) -> list[type[BaseModel]]:
+    """The models of the table that a path of an error leads to."""
     models = _models(model)
     for part in path:
         inside = [m.model_fields[part].annotation for m in models if part in m.model_fields]
@@ -72,7 +81,7 @@ def _fields(model: Any, path: Sequence[str | int]) -> set[str]:
             models = [m for annotation in inside for m in _models(annotation)]
         else:  # an index, a name in a table, or the type that chooses one of several models
             models = [m for m in models if part in _tags(m)] or models
-    return {field for m in models for field in m.model_fields}
+    return models
 
 
 def _models(hint: Any) -> list[type[BaseModel]]:

@@ -30,15 +30,22 @@ def test_a_run_in_memory_has_the_bits_of_one_in_a_folder(tmp_path, capsys):
 
 
 def test_a_run_is_saved_and_loaded(tmp_path):
-    run = gfmhil.run("pref_step", duration=2.5)
+    softer = gfmhil.Law.load("vsg-2").with_gains("softer", D_p=0.02)
+    run = gfmhil.run("pref_step", softer)
+    assert run.laws == run.summary["laws"] == ["softer"] and "softer, completed" in repr(run)
     folder = run.save(tmp_path / "kept")
+    repeated = gfmhil.run(folder / "scenario.toml")
+    assert np.array_equal(repeated.signals["p"], run.signals["p"])
     again = gfmhil.load_run(folder)
     assert (folder / "report.html").stat().st_size > 10_000
     assert set(again.columns) == set(run.columns)
     for name in run.columns:
         assert np.array_equal(again.signals[name], run.signals[name])
     assert again.metrics == run.metrics and again.laws == run.laws
-    assert again.scenario == run.scenario
+    law = {"law": str(folder / "law.toml")}  # it was an object, and has no other file
+    assert again.scenario == run.scenario.model_copy(update=law)
+    with pytest.raises(gfmhil.UserError, match=r"with duration 0.1, law softer: events.0"):
+        gfmhil.run("pref_step", softer, duration=0.1)
     with pytest.raises(gfmhil.UserError, match="is not empty"):
         run.save(folder)
     copy = gfmhil.load_run(again.save(tmp_path / "copy"))

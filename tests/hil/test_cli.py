@@ -151,8 +151,11 @@ def test_run_ends_with_a_table_that_fits_the_terminal(call):
     code, out, _ = call("run", scenario(events=events), "--out", "run", "--no-figures")
     assert code == 0
     assert_fits(out)
-    for part in ("completed", "3000 ticks, 0 misses", "p peak [p.u.]", "V max [p.u.]", "P_ref"):
+    for part in ("completed", "3000 ticks, 0 misses", "p peak [p.u.]", "V max [p.u.]"):
         assert part in out
+    shown = [k for k in range(1, 11) if f"P_ref = {0.5 + 0.01 * k:g} @" in " ".join(out.split())]
+    assert shown == [1, 2, 3, 8, 9, 10]
+    assert "4 events between 0.06 s and 0.16 s are not shown; summary.json has all of them" in out
     assert out.rstrip().endswith("run folder: run")
 
 
@@ -303,10 +306,20 @@ def test_an_option_is_blamed_for_its_value_and_not_the_scenario(option, call):
     assert f"{option} -1" in err.split(": ")[1]
 
 
-def test_an_option_that_does_not_fit_the_scenario_is_named_with_it(call):
-    code, _, err = call("run", scenario(**STEP), "--duration", "0.05")
+@pytest.mark.parametrize(
+    ("arguments", "blamed"),
+    [
+        (["run"], "--duration 0.05"),
+        (["compare", "--laws", "vsg-2"], "--duration 0.05"),
+        (["run", "--link", "inproc"], "--link inproc, --duration 0.05"),
+    ],
+)
+def test_options_that_do_not_fit_the_scenario_are_named_with_it(arguments, blamed, call):
+    """Only those that the user gave: not the lockstep that --link inproc implies."""
+    command, *options = arguments
+    code, _, err = call(command, scenario(**STEP), *options, "--duration", "0.05")
     assert code == 2
-    assert err.startswith("gfmhil: short.toml with --duration 0.05: events.0: ")
+    assert err.startswith(f"gfmhil: short.toml with {blamed}: events.0: ")
 
 
 def test_unknown_options_are_argparse_s_to_refuse(capsys):

@@ -155,7 +155,12 @@ a = { value = 0.5, unit = "p.u.", source = "s", free = [-2.0, 2.0] }
     ("was", "becomes", "words"),
     [
         ("value = 0.5", "value = -1.0", "omega_u loop"),  # omega_u = ... + omega_u
-        ("", "", "no steady state"),  # nothing controls v_dc
+        (
+            "",
+            "",
+            "no steady state at P_ref = 0.5 p.u., V_ref = 1 p.u., omega_g = 1 p.u., "
+            "V_g = 1 p.u.; nothing holds v_dc: row 1 answers to no measurement",
+        ),
         ("[-2.0, 2.0]", "[2.0, -2.0]", "parameters.a.free: [2, -2] must be finite and ascending"),
         ("[-2.0, 2.0]", "[1.0, 2.0]", "start 0.5 lies outside [1, 2]"),
     ],

@@ -154,7 +154,7 @@ def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now
     assert set(found.refused) <= {"tick"}
     assert found.reader.e2e == "invalid"
     faults = found.reader.faults
-    end = {"role": "controller", "faults": faults, "e2e": found.reader.e2e, "one_clock": True}
+    end = {"role": "controller", "faults": faults, "e2e": found.reader.e2e}
     (place / "link_controller.json").write_text(json.dumps(end), encoding="utf-8")
     (place / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     summary = finish(scenario, place, [scenario.law], 0.0, figures=False).summary

@@ -115,6 +115,7 @@ def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsy
     assert main(["recover", str(folder), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found == summary(folder) and found["status"] == "safe" and found["reason"]
+    assert found["run"] and found["controller"] == "gfmhil"  # as agreed at the handshake
     recorded = signals(folder)
     assert len(recorded["t"]) == found["ticks"] >= 300
     assert np.isfinite(recorded["true_p"]).all()
@@ -192,7 +193,7 @@ def test_a_run_in_process_that_was_killed_is_recovered(start, tmp_path):
     process.communicate()
     found = recover(folder)
     assert (found.summary["status"], found.summary["reason"]) == (
-        "safe", "both sides ended without a word",
+        "safe", "the run was cut off: no process recorded its end",
     )  # fmt: skip
     assert found.summary["ticks"] >= 1000
     assert names(folder) == DRAWN

@@ -47,6 +47,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "unknown law": ({"law": "vsg-99"}, ["law 'vsg-99'", "unknown", "vsg-12"]),
     "unknown law in an event": (event(type="law", law="vsg-99"), ["law 'vsg-99'", "unknown"]),
     "unknown law to compare": ({"compare": ["vsg-99"]}, ["law 'vsg-99'", "unknown"]),
+    "law file without its ending": ({"law": "law"}, ["law 'law'", "did you mean 'law.toml'?"]),
     "law file that is not there": ({"law": "nowhere.toml"}, ["nowhere.toml", "No such file"]),
     "improper element": ({"law": "law.toml"}, ["phi_22", "proper"]),
     "negative inductance": ({"plant": {"factors": {"L_f": -1.0}}}, ["factors.L_f = -1.0", "> 0"]),
@@ -83,7 +84,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "event of no type": (event(P_ref=1.0), ["events.0.type", "missing"]),
     "event of unknown type": (event(type="tea"), ["events.0.type = 'tea'", "'grid-frequency'"]),
     "wrong type": ({"duration": "3"}, ["duration", "number", "not '3'"]),
-    "number in place of a table": ({"link": 3}, ["link", "not 3"]),
+    "number in place of a table": ({"link": 3}, ["link: must be a table, not 3"]),
     "not a number": ({"duration": float("nan")}, ["duration", "finite", "nan"]),
     "no tick": ({"duration": 1e-5}, ["duration = 1e-05", "T_s = 0.0001"]),
     "reference out of range": ({"references": {"P_ref": 10.0}}, ["P_ref = 10.0", "[-2, 2]"]),
@@ -208,6 +209,12 @@ def test_a_file_that_is_not_toml(text, part, here):
     with pytest.raises(UserError, match=part) as found:
         load_scenario("bad.toml")
     assert str(found.value).startswith("bad.toml: ")
+
+
+def test_a_law_file_in_place_of_a_scenario_is_told(here):
+    with pytest.raises(UserError, match=r"law\.toml: is a law file") as found:
+        load_scenario("law.toml")
+    assert len(str(found.value).splitlines()) == 1
 
 
 def test_a_scenario_that_is_not_there_names_what_ships():

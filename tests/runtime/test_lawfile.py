@@ -167,6 +167,11 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "gigantic parameter": ("value = 90.0", "value = 1" + 400 * "0", ("parameters.k_p.value",)),
     "absurd gain": ("k_i = 400", "k_i = 1e300", ("phi_11.k_i", "1e+300", "1e+12")),
     "nan parameter": ("value = 90.0", "value = nan", ("parameters.k_p.value", "nan", "finite")),
+    "number in place of a parameter": (
+        'D_p = { value = 0.01, unit = "p.u.", source = "Table III" }',
+        "D_p = 0.01",
+        ("parameters.D_p: must be a table with value, unit, source, not 0.01",),
+    ),
     "unknown parameter": ('k = "D_p"', 'k = "D_q"', ("phi_22.k", "'D_q'", "D_p")),
     "bad parameter name": ("k_p = {", '"k p" = {', ("parameters.k p", "pattern")),
     "parameter without source": (

@@ -19,10 +19,10 @@ from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
-_LOWEST = 1e-3  # rad/s; below it a loop behaves as at rest, unless it has a pole there
+_LOWEST = 1e-3  # rad/s; below it H hardly changes, unless the loop has a pole there
 _STRAIGHT = 0.01
 _ROUNDS = 12
-_GONE = 1e-9  # |z| of an emptied delay line, which has no effect on H
+_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 ``gfm_runtime.realisation`` builds one law with all checks, in some milliseconds; a search asks for
 thousands. This module multiplies the same elements for a whole population in one pass: every
-coefficient is a column of N numbers. Row 0 decides which factors are shared and which cancel; at
-its gains no two factors agree by chance.
+coefficient is a column of N numbers. Row 0 decides which factors are shared and which cancel, so
+its gains must not make two different factors equal.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class _Builder:
 def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
     """The law at N sets of parameters: as ``realise``, every matrix with a leading axis of N.
 
-    Rows whose numbers make no law are nan. Row 0 must be a law at which different factors have
+    Rows in which an element is out of its bounds are NaN. In row 0 different factors must have
     different values.
     """
     count = max(len(c) for c in numbers.values())

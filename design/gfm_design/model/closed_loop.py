@@ -1,13 +1,13 @@
-"""The closed loop of a law and a plant, which all analysis and synthesis uses.
+"""The closed loop of a law and a plant, on which all analysis and synthesis works.
 
 The loop is continuous, as in the paper (Section III), or sampled exactly, as on the bench. Around
 its operating point it maps w = (references r, grid d) to the true y, before the sensors:
 
     x' = A x + B w,    y = C x + D w,    x = (plant, its delay lines, law),
 
-where x' is dx/dt or the x of the next tick. All other quantities (modes, margins, gamma, step
-responses) follow from these matrices. One object may hold many loops: plants, laws or both have
-leading axes.
+where x' is dx/dt or the x of the next tick. Every other quantity (modes, margins, gamma, step)
+follows from these matrices. A ``ClosedLoop`` may hold many loops: plants, laws or both on leading
+axes.
 """
 
 from __future__ import annotations
@@ -59,8 +59,9 @@ REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # (V_dcref, P_ref, omega_g, Q_ref, V_ref
 #: the loop's inputs w: the references, and the grid as Eq. (15) has it
 INPUTS = (*REF_NAMES, "grid.omega_g", "grid.V_g")
 
+#: distances from a resonance at which to look, as multiples of its damping
 _ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
-_GONE = 1e-9  # |z| below this belongs to a delay line: no mode
+_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 _P_REF, _OMEGA_G = INPUTS.index("P_ref"), INPUTS.index("grid.omega_g")
 _V_C, _I_O = 2, 4  # where v_d and i_od are in the plant's state; v_q and i_oq follow
 _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
@@ -73,10 +74,10 @@ class Origin:
     Attributes:
         plant: its options.
         law: at its sampling time.
-        ideal: the loop uses the continuous law.
+        ideal: the loop is continuous and has the law before it was discretised.
         ref: references, shape (5,), p.u.
         par: the plant's record.
-        op: the common operating point of plant and law.
+        op: the operating point.
     """
 
     plant: Plant
@@ -129,7 +130,7 @@ class ClosedLoop:
         T_s: float = T_S,
         ideal: bool = False,
     ) -> Self:
-        """The loop of a law on a plant, around their common operating point.
+        """The loop of a law on a plant, around their operating point.
 
         Args:
             law: catalogue name, path of a law file (of a scheduled law its first stage), a law, or
@@ -141,8 +142,8 @@ class ClosedLoop:
             ideal: build the continuous loop, which ignores the plant's delay.
 
         Raises:
-            LawError: the law does not exist or cannot be discretised.
-            NoEquilibrium: plant and law have no common operating point.
+            LawError: no such law, or it cannot be discretised.
+            NoEquilibrium: there is no operating point.
         """
         if not isinstance(law, DiscreteLaw):
             law = discretise(get_law(law) if isinstance(law, str) else law, T_s)
@@ -212,7 +213,7 @@ class ClosedLoop:
         """The loop with elements multiplied by factors, around its new operating point.
 
         Raises:
-            NoEquilibrium: plant and law have no common operating point then.
+            NoEquilibrium: there is none with these elements.
         """
         of = self.made_of
         par, nominal = of.par.copy(), load_converter(of.plant.converter).pu()
@@ -312,7 +313,7 @@ class ClosedLoop:
             return np.log(np.abs(values).max(axis=-1)) / self.T_s
 
     def poles(self) -> Response:
-        """Poles s of a single loop, 1/s; of a sampled one log(z)/T_s, without delay lines."""
+        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without delay lines."""
         values = np.linalg.eigvals(self.A).astype(complex)
         return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
 
@@ -344,7 +345,7 @@ class ClosedLoop:
         """Gain, phase, disk and delay margins of a sampled loop; takes a second.
 
         Raises:
-            UnstableLoop: the loop is not stable and has no margins.
+            UnstableLoop: the loop is unstable and has no margins.
         """
         from gfm_design.margins.all_margins import loop_margins  # it imports this module
 

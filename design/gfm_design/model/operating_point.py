@@ -95,9 +95,11 @@ def operating_point(
                 break
             x, u, y, x_law = _unpack(z, par, law, omega_g, kept)
             return OperatingPoint(x, u, y, x_law)
+    idle = controlled and not (law.C[0].any() or law.D_y[0].any())
+    cause = "; nothing holds v_dc: row 1 answers to no measurement" if idle else ""
     raise NoEquilibrium(
         f"{law.law.name} has no steady state at P_ref = {ref[1]:g} p.u., V_ref = {ref[4]:g} p.u., "
-        f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."
+        f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u.{cause}"
     )
 
 

@@ -82,7 +82,7 @@ class Loop:
     """A bench that can be reset to its start, and files for its recording."""
 
     def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
-        bench = make_bench(load_scenario(scenario, law=law, link__type="inproc", mode="lockstep"))
+        bench = make_bench(load_scenario(scenario, law=law, in_process=True))
         bench.controller.set("P_ref", 0.8)
         self.bench, self.ticks = bench, ticks
         self.T_s = bench.scenario.T_s

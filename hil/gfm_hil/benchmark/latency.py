@@ -55,7 +55,12 @@ class Plan:
 
 @dataclass
 class _Cell:
-    """One contender in one mode under one load."""
+    """One contender in one mode under one load.
+
+    Attributes:
+        rounds: round trips of each round, ns.
+        silent: rounds in which no answer came.
+    """
 
     contender: Contender
     mode: Mode

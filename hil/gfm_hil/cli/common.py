@@ -23,7 +23,7 @@ from gfm_hil.results.runner import Progress as TellProgress
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
-
+_ENDS = 3  # events shown from each end of a long run
 
 #: what the command line calls the overrides of ``load_scenario``
 _OPTIONS = {
@@ -62,18 +62,15 @@ def _link_option(text: str) -> tuple[str, Any]:
 
 
 def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
-    """The scenario with its overrides; --link inproc alone implies lockstep.
+    """The scenario with its overrides; ``more`` goes to ``load_scenario``.
 
     Raises:
         UserError: as ``load_scenario``.
     """
-    mode = options.mode
-    if mode is None and options.link == "inproc":
-        mode = "lockstep"
     return load_scenario(
         options.scenario,
         _OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
-        mode=mode,
+        mode=options.mode,
         link__type=options.link,
         link__endpoint=options.endpoint,
         duration=options.duration,
@@ -148,8 +145,16 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         console.print(escape(f"round trip [µs]: {text}"), highlight=False)
-    for table in fitting(console, summary["events"], events_table):
+    events = summary["events"]
+    shown = events if len(events) <= 2 * _ENDS else [*events[:_ENDS], *events[-_ENDS:]]
+    for table in fitting(console, shown, events_table):
         console.print(table)
+    if left_out := len(events) - len(shown):
+        console.print(
+            f"{left_out} events between {shown[_ENDS - 1]['t']:g} s and {shown[_ENDS]['t']:g} s "
+            "are not shown; summary.json has all of them",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
     console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
 
 

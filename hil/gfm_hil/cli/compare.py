@@ -26,7 +26,7 @@ from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.scenario.model import INPROC, find_scenario
+from gfm_hil.scenario.model import find_scenario
 
 
 def add(commands: Any) -> None:
@@ -46,13 +46,14 @@ def add(commands: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
-    if not (options.link or options.endpoint or options.option or options.mode == "realtime"):
-        options.link = INPROC
-    base = resolve(options)
+    asked = options.link or options.endpoint or options.option or options.mode == "realtime"
+    base = resolve(options, in_process=not asked)
     names = split_laws(options.laws) if options.laws else base.compare
     if not names:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
-    scenarios = {name: resolve(options, law=name) for name in dict.fromkeys(names)}
+    scenarios = {
+        name: resolve(options, in_process=not asked, law=name) for name in dict.fromkeys(names)
+    }
     folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
     check_free(folder, base.ticks * len(scenarios))
     runs: dict[str, Run] = {}

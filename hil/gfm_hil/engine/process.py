@@ -130,6 +130,8 @@ def _meet_and_run(
         no_collector_pauses()
         notify(f"STATUS=waiting for the other side at {endpoint}")
         start = shake_hands(role, good, scenario, stopped, notice)
+        met = {"controller": start.controller, "run": start.run, "one_clock": start.one_clock}
+        timeline.write(0, "handshake", role=role, **met)  # in the log: a kill does not lose it
         with Watched(scenario, part.progress):
             reader = run_loop(role, bench, link, part, timeline, start.t0_ns, stopped, flags)
     finally:
@@ -138,8 +140,7 @@ def _meet_and_run(
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link in several frames a message
     faults = {**reader.faults, **counted, "refused_greetings": start.refused}
-    met = {"one_clock": start.one_clock, "run": start.run, "controller": start.controller}
-    return {"faults": faults, "e2e": reader.e2e, **met, **injected}
+    return {"faults": faults, "e2e": reader.e2e, **injected}
 
 
 def compile_role(role: Role, bench: Bench, part: Part) -> None:

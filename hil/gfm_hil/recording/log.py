@@ -90,5 +90,5 @@ def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
     found = [outside, *ends] if outside else ends
     if not found:
-        return Outcome("safe", "both sides ended without a word", 0)
+        return Outcome("safe", "the run was cut off: no process recorded its end", 0)
     return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))

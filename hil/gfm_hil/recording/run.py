@@ -78,6 +78,8 @@ class RecordedRun:
         events: lines of events.jsonl.
         folder: where it is; None for a run in memory.
         timing: columns of timing.npz, likewise; empty for a run in one process.
+        law_text: the law file of a run in memory whose law was an object, so that it has no file;
+            empty otherwise.
     """
 
     scenario: Scenario
@@ -87,6 +89,7 @@ class RecordedRun:
     events: list[dict[str, Any]] = field(default_factory=list)
     folder: Path | None = None
     timing: Columns = field(default_factory=dict)
+    law_text: str = ""
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:

@@ -38,7 +38,7 @@ EVENT_COLUMNS = (
     ("v_min", "V min [p.u.]"),
     ("v_max", "V max [p.u.]"),
     ("damping_ratio", "damping ratio"),
-    ("oscillation_hz", "at [Hz]"),
+    ("oscillation_hz", "oscillation [Hz]"),
     ("bump_pu", "bump [p.u.]"),
     ("cut_short", "cut short by"),
 )

@@ -62,6 +62,8 @@ class Run(RecordedRun):
     def save(self, folder: str | Path) -> Path:
         """Write the run folder, with figures and report; returns it.
 
+        A law that was an object is there as ``law.toml``, which the scenario names.
+
         Raises:
             UserError: the folder holds something already, or cannot be written.
         """
@@ -77,7 +79,12 @@ class Run(RecordedRun):
                 shutil.copytree(self.folder, folder, dirs_exist_ok=True)
                 return folder
             arrays = {name: np.asarray(column[:]) for name, column in self.columns.items()}
-            write_text(folder / "scenario.toml", scenario_toml(self.scenario))
+            scenario = self.scenario
+            if self.law_text:
+                law = folder.absolute() / "law.toml"
+                write_text(law, self.law_text)
+                scenario = scenario.model_copy(update={"law": str(law)})
+            write_text(folder / "scenario.toml", scenario_toml(scenario))
             laws = Table.of(laws=np.array(self.laws))
             write_npz(folder / "signals.npz", [laws, Table.of(**arrays)])
             write_npz(folder / "timing.npz", [])

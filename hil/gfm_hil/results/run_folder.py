@@ -193,7 +193,6 @@ def _complete(
     links = _link_ends(folder)
     summary = summarise(scenario, signals, timing, log, worst(log, outside), links, wall_s)
     summary |= origin(scenario, (folder / "scenario.toml").stat().st_mtime)
-    summary["run"] = next((end["run"] for end in links.values() if "run" in end), None)
     run = Run(scenario, summary, signals, labels, log, folder, timing)
     _conclude(run, figures)
     return run
@@ -201,8 +200,7 @@ def _complete(
 
 def _link_ends(folder: Path) -> dict[Role, dict[str, Any]]:
     """What each side wrote about its end of the link: the faults that it counted, the state of the
-    end-to-end protection, whether both sides share a clock, the number of the run, what the
-    controller calls itself, and the faults injected on purpose."""
+    end-to-end protection, and the faults injected on purpose."""
     ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
     return {end["role"]: end for end in ends}
 
@@ -255,7 +253,7 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
         signals, timing, labels = read_recording(folder)
         wall_s = plant.summary["wall_s"]
         summary = summarise(plant.scenario, signals, timing, log, worst(log, None), links, wall_s)
-        summary |= {key: plant.summary[key] for key in ("date", "version", "run")}
+        summary |= {key: plant.summary[key] for key in ("date", "version")}
         summary["machines"] = controller.summary["machines"] | plant.summary["machines"]
         whole = Run(plant.scenario, summary, signals, labels, log, folder, timing)
         _conclude(whole, figures=True)
@@ -268,9 +266,7 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
 def _link_end(role: Role, summary: dict[str, Any]) -> dict[str, Any]:
     """What ``_link_ends`` gives of a side, from the summary of that side alone."""
     keys = ("faults", "e2e", "injected")
-    kept = {key: summary[key][role] for key in keys if role in summary.get(key, {})}
-    one_clock = "clock_drift_ppm" not in summary
-    return {**kept, "one_clock": one_clock, "controller": summary["controller"]}
+    return {key: summary[key][role] for key in keys if role in summary.get(key, {})}
 
 
 def _padded(columns: Columns, rows: int, missing: float) -> Table:

@@ -64,9 +64,8 @@ def summarise(
         wall_s: how long the run took, s.
     """
     done = len(signals["tick"])
-    controller: str | None = OUR_CONTROLLER
-    for end in links.values():
-        controller = end.get("controller", OUR_CONTROLLER)
+    met = [e for e in log if e["event"] == "handshake"]
+    controller: str | None = met[0]["controller"] if met else OUR_CONTROLLER
     plant, ours = "true_p" in signals, "ref_P_ref" in signals
     trips = _trips(log, outcome, done, scenario.T_s)
     changes = [e for e in log if e["event"] == "law-active"]
@@ -117,12 +116,12 @@ def summarise(
         "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
         "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
         "events": events,
+        "run": met[0]["run"] if met else None,
     }
     injected = {role: end["injected"] for role, end in links.items() if "injected" in end}
     if injected:
         summary["injected"] = injected
-    one_clock = all(end["one_clock"] for end in links.values())
-    if not one_clock and scenario.mode == "realtime":
+    if scenario.mode == "realtime" and not all(e["one_clock"] for e in met):
         summary["clock_drift_ppm"] = clock_drift(timing, scenario.T_s)
     return summary
 

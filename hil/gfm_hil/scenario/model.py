@@ -291,17 +291,21 @@ def shipped_scenarios() -> list[str]:
 def load_scenario(
     given: str | Path | Scenario | dict[str, Any],
     options: Mapping[str, str] = MappingProxyType({}),
+    in_process: bool = False,
     **changed: Any,
 ) -> Scenario:
     """Read, override and check a scenario, its laws and its plant.
 
     Args:
         given: path or shipped name; content of a file; or a checked scenario.
+        options: what the user calls an override, by its name in ``changed``, e.g.
+            ``{"link__type": "--link"}``; messages name it in place of the file.
+        in_process: the caller runs it in this process: the link is ``inproc`` unless ``changed``
+            names another one. Messages do not mention this choice, because the user did not make
+            it.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
             None leaves the file's value. A link other than the file's drops the file's endpoint
-            and options.
-        options: what a person calls an override, by its name in ``changed``, e.g.
-            ``{"link__type": "--link"}``; messages name it in place of the file.
+            and options. The link ``inproc`` implies lockstep unless a ``mode`` is given.
 
     Raises:
         UserError: one line per mistake, each with its path, the value and what is allowed.
@@ -313,28 +317,32 @@ def load_scenario(
             content = read_toml(where)
         except ValueError as problem:
             raise UserError(f"{where}: {problem}") from None
+        if "phi" in content:
+            raise UserError(f"{where}: is a law file; give it to a scenario as its law")
     elif isinstance(given, Scenario):
         content = given.model_dump(mode="json", exclude_none=True)
     else:
         content = copy.deepcopy(given)
-    link, chosen = content.get("link"), changed.get("link__type")
+    overrides = {key: value for key, value in changed.items() if value is not None}
+    implied: dict[str, Any] = {}
+    if in_process or overrides.get("link__type") == INPROC:
+        implied = {"link__type": INPROC, "mode": "lockstep"}
+    link, chosen = content.get("link"), overrides.get("link__type")
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
         link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
-    for key, value in changed.items():
-        if value is not None:
-            table: Any = content
-            *parents, last = key.split("__")
-            for parent in parents:
-                table = table.setdefault(parent, {}) if isinstance(table, dict) else None
-            if isinstance(table, dict):  # else the check reports what the file has instead
-                table[last] = value
-    overrides = {
+    for key, value in (implied | overrides).items():
+        table: Any = content
+        *parents, last = key.split("__")
+        for parent in parents:
+            table = table.setdefault(parent, {}) if isinstance(table, dict) else None
+        if isinstance(table, dict):  # else the check reports what the file has instead
+            table[last] = value
+    named = {
         tuple(key.split("__")): f"{options.get(key, key.replace('__', '.'))} {value}"
-        for key, value in changed.items()
-        if value is not None
+        for key, value in overrides.items()
     }
-    return check_scenario(content, where, overrides)
+    return check_scenario(content, where, named)
 
 
 def check_scenario(

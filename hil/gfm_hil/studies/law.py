@@ -171,6 +171,10 @@ class Law:
         except NoEquilibrium as problem:
             raise UserError(str(problem)) from None
 
+    def to_toml(self) -> str:
+        """The text of its law file."""
+        return toml_text(self.file.model_dump(mode="json", exclude_none=True))
+
     def save(self, path: str | Path) -> Path:
         """Write a law file; returns its path.
 
@@ -181,7 +185,7 @@ class Law:
         if path.exists():
             raise UserError(f"{path}: is there already; choose another name")
         try:
-            write_text(path, toml_text(self.file.model_dump(mode="json", exclude_none=True)))
+            write_text(path, self.to_toml())
         except OSError as problem:
             raise UserError(f"{path}: {problem.strerror}") from None
         return path

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,13 +49,24 @@ def run(
     with _law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
-        here = {"mode": "lockstep", "link__type": "inproc", **changes}
-        return run_in_memory(load_scenario(scenario, **here))
+        made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
+    return _named(made, law) if isinstance(law, Law) else made
+
+
+def _named(made: Run, law: Law) -> Run:
+    """The run of a ``Law``: its name in place of its temporary file, and its text."""
+    content = json.dumps([made.summary, made.laws, made.events])
+    summary, laws, events = json.loads(content.replace(made.scenario.law, law.name))
+    scenario = made.scenario.model_copy(update={"law": law.name})
+    return replace(
+        made, scenario=scenario, summary=summary, laws=laws, events=events, law_text=law.to_toml()
+    )
 
 
 @contextmanager
 def _law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
-    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts."""
+    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts, which
+    messages call by the name of the law."""
     with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
         files: dict[str, str] = {}
         for k, law in enumerate(laws):
@@ -62,7 +74,13 @@ def _law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
                 files[law.name] = str(law.save(Path(place) / f"{k}.toml"))
             else:
                 files[str(law)] = str(law)
-        yield files
+        try:
+            yield files
+        except UserError as problem:
+            text = str(problem)
+            for name, file in files.items():
+                text = text.replace(file, name)
+            raise UserError(text) from None
 
 
 @dataclass(frozen=True, repr=False)

@@ -34,7 +34,7 @@ class Format:
 FORMATS = {
     "mf4": Format("MDF 4.11, with events and attachments", "mf4:write_mf4", "asammdf"),
     "csv": Format("text, every number exactly", "writers:write_csv"),
-    "mat": Format("MATLAB 5", "writers:write_mat", "scipy"),
+    "mat": Format("MATLAB 5", "writers:write_mat"),
     "parquet": Format("Apache Parquet", "writers:write_parquet", "pyarrow"),
     "blf": Format(
         "CAN frames and their DBC, for Vector's tools", "blf:write_blf",

@@ -87,7 +87,7 @@ def check_campaign(
         raise UserError("\n".join(f"{path}: {line}" for line in wrong)) from None
     if text is None:
         text = toml_text(content)
-    base = load_scenario(_beside(path, file.scenario), mode="lockstep", link__type="inproc")
+    base = load_scenario(_beside(path, file.scenario), in_process=True)
     content = base.model_dump(mode="json")
     content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
     _check_paths(path, file, content)
