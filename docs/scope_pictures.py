@@ -13,7 +13,8 @@ from tempfile import TemporaryDirectory
 from PIL import Image
 
 from benchmarks.scope_server import measure
-from tests.support.scope import RIG, Browser, Rig, rig, wait_for
+from tests.support.processes import wait_for
+from tests.support.scope import RIG, Browser, Rig, rig
 
 HERE = Path(__file__).resolve().parent
 IN_THE_LAB = RIG.replace("that is told what to do", "in the lab")

@@ -39,9 +39,9 @@ def test_observers() -> None:
 
 
 @pytest.mark.full
-def test_keep_awake() -> None:
-    rows = rows_of("keep_awake", "--links", "shm", "--rounds", "1", "--seconds", "0.3")
-    assert [(row["keep_awake"], row["ticks"]) for row in rows] == [
+def test_prevent_idle() -> None:
+    rows = rows_of("prevent_idle", "--links", "shm", "--rounds", "1", "--seconds", "0.3")
+    assert [(row["prevent_idle"], row["ticks"]) for row in rows] == [
         ("never", 3000),
         ("always", 3000),
     ]

@@ -16,7 +16,7 @@ import pytest
 
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE
 from gfm_hil.cli.main import parser
-from gfm_hil.links.can.options import CanOptions
+from gfm_hil.links.can import CanOptions
 from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.scenario.model import Link
 from gfm_hil.scenario.toml_out import toml_text

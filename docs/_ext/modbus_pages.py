@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gfm_hil.core.terminal import markdown
 from gfm_hil.modbus.device import Device
-from gfm_hil.modbus.gains import Gains
+from gfm_hil.modbus.droops import Gains
 from gfm_hil.modbus.image import Point, definition
 from gfm_hil.modbus.view import Slack, View
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS

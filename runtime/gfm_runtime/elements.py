@@ -17,7 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial.polynomial import polydiv
+from numpy.polynomial.polynomial import polydiv, polyval
+from numpy.polynomial.polyutils import trimseq
 
 from gfm_runtime.errors import LawError
 
@@ -42,13 +43,6 @@ def poly_add(a: Sequence[float], b: Sequence[float]) -> Polynomial:
     out[: len(a)] += a
     out[: len(b)] += b
     return tuple(float(c) for c in out)
-
-
-def _trim(a: Sequence[float]) -> Polynomial:
-    end = len(a)
-    while end > 1 and a[end - 1] == 0.0:
-        end -= 1
-    return tuple(a[:end])
 
 
 def _divide(a: Polynomial, factor: Factor) -> Polynomial | None:
@@ -85,7 +79,7 @@ class Element:
     def of(num: Sequence[float], den: Sequence[Factor] = ()) -> Element:
         """Build in lowest terms: factors that the numerator contains are cancelled."""
         rest: list[Factor] = []
-        top = _trim(tuple(float(c) for c in num))
+        top: Polynomial = trimseq(tuple(float(c) for c in num))
         if all(c == 0.0 for c in top):
             return Element((0.0,))
         for factor in den:
@@ -93,7 +87,7 @@ class Element:
             if quotient is None:
                 rest.append(factor)
             else:
-                top = _trim(quotient)
+                top = trimseq(quotient)
         return Element(top, tuple(sorted(rest)))
 
     @property
@@ -124,17 +118,8 @@ class Element:
 
     def __call__(self, s: complex) -> complex:
         """Value at the complex frequency s [rad/s]."""
-        value = _at(self.num, s)
-        for factor in self.den:
-            value /= _at(factor, s)
-        return value
-
-
-def _at(a: Sequence[float], s: complex) -> complex:
-    value = 0j
-    for c in reversed(a):
-        value = value * s + c
-    return value
+        below = math.prod(complex(polyval(s, factor)) for factor in self.den)
+        return complex(polyval(s, self.num)) / below
 
 
 def union(dens: Sequence[tuple[Factor, ...]]) -> tuple[Factor, ...]:

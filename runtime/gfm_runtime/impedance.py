@@ -23,6 +23,10 @@ from numpy.typing import NDArray
 from gfm_runtime.compiled import compiled
 
 COHERENT = 0.7
+EXCITATION = 1e-7  # rad^2: least mean square of the washed-out angle that may move X
+SMOOTH = 2 * math.pi * 20.0  # rad/s: corner of the low-pass on p and on omega_u
+WASHOUT = 2 * math.pi * 0.5  # rad/s: corner of the washout on p and on the angle
+MEMORY_S = 0.5  # time constant of the forgetting sums
 X_MIN = 1e-3  # p.u.; no line is shorter
 SETTLED = 5.0  # time constants of the washout; before, it still shows where it was started
 
@@ -31,12 +35,9 @@ impedance_dtype = np.dtype(
         ("T_s", "f8"),
         ("omega_b", "f8"),
         ("X_f", "f8"),  # reactance of the converter's own filter, p.u.
-        ("smooth", "f8"),  # corner of the low-pass, rad/s
         ("p_smooth", "f8"),
         ("omega_smooth", "f8"),
-        ("washout", "f8"),  # rad/s
         ("forget", "f8"),  # per tick
-        ("excitation", "f8"),  # least sum(theta_w^2), rad^2
         ("theta", "f8"),  # washed-out angle, rad
         ("p_slow", "f8"),  # slow part of p that the first washout takes away, p.u.
         ("p_slower", "f8"),  # and the second
@@ -52,14 +53,7 @@ impedance_dtype = np.dtype(
 
 
 def make_impedance(
-    T_s: float,
-    X_0: float,
-    omega_b: float = 100 * math.pi,
-    X_f: float = 0.0,
-    smooth_hz: float = 20.0,
-    washout_hz: float = 0.5,
-    memory_s: float = 0.5,
-    excitation: float = 1e-7,
+    T_s: float, X_0: float, omega_b: float = 100 * math.pi, X_f: float = 0.0
 ) -> NDArray[Any]:
     """Estimator record, one element.
 
@@ -68,34 +62,18 @@ def make_impedance(
         X_0: estimate to start from, p.u.
         omega_b: base frequency, rad/s.
         X_f: reactance between the controlled voltage and the point where p is measured, p.u.
-        smooth_hz: corner of the low-pass on p and on omega_u, Hz.
-        washout_hz: corner of the washout on p and on the angle, Hz.
-        memory_s: time constant of the forgetting sums, s.
-        excitation: least mean square of the washed-out angle that may move X, rad^2.
 
     Raises:
         ValueError: a value that is not positive.
     """
-    values = {
-        "T_s": T_s,
-        "X_0": X_0,
-        "omega_b": omega_b,
-        "smooth_hz": smooth_hz,
-        "washout_hz": washout_hz,
-        "memory_s": memory_s,
-        "excitation": excitation,
-    }
-    for name, value in values.items():
+    for name, value in {"T_s": T_s, "X_0": X_0, "omega_b": omega_b}.items():
         if not value > 0.0:
             raise ValueError(f"{name} = {value} must be > 0")
-    out = np.zeros(1, impedance_dtype)
-    out["T_s"], out["omega_b"], out["X"] = T_s, omega_b, X_0
     if not X_f >= 0.0:
         raise ValueError(f"X_f = {X_f} must be >= 0")
-    out["X_f"], out["smooth"] = X_f, 2 * math.pi * smooth_hz
-    out["washout"] = 2 * math.pi * washout_hz
-    out["forget"] = T_s / memory_s
-    out["excitation"] = excitation
+    out = np.zeros(1, impedance_dtype)
+    out["T_s"], out["omega_b"], out["X"], out["X_f"] = T_s, omega_b, X_0, X_f
+    out["forget"] = T_s / MEMORY_S
     return out
 
 
@@ -106,11 +84,11 @@ def estimate(est, p, omega_u, V):
         est.p_slow, est.omega_slow = p, omega_u
         est.p_smooth, est.omega_smooth = p, omega_u
     est.age += 1
-    b = est.smooth * est.T_s
+    b = SMOOTH * est.T_s
     est.p_smooth += b * (p - est.p_smooth)
     est.omega_smooth += b * (omega_u - est.omega_smooth)
     p, omega_u = est.p_smooth, est.omega_smooth
-    a = est.washout * est.T_s
+    a = WASHOUT * est.T_s
     # twice through the washout, both of them: an angle under a constant omega_g is a ramp
     est.omega_slow += a * (omega_u - est.omega_slow)
     est.theta += est.T_s * est.omega_b * (omega_u - est.omega_slow) - a * est.theta
@@ -121,7 +99,7 @@ def estimate(est, p, omega_u, V):
     est.s_tt += est.forget * (est.theta * est.theta - est.s_tt)
     est.s_pp += est.forget * (p_fast * p_fast - est.s_pp)
     coherent = est.s_pt * est.s_pt > COHERENT * est.s_pp * est.s_tt
-    if est.age * a > SETTLED and est.s_tt > est.excitation and est.s_pt > 0.0 and coherent:
+    if est.age * a > SETTLED and est.s_tt > EXCITATION and est.s_pt > 0.0 and coherent:
         K = est.s_pt / est.s_tt
         est.X = max(V / math.sqrt(K * K + est.p_slow * est.p_slow) - est.X_f, X_MIN)
     return est.X

@@ -26,7 +26,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LawStateSpace:
-    """dx/dt = A x + B_r r + B_y y,  u = u_0 + C x + D_r r + D_y y.
+    """dx/dt (discrete: the next x) = A x + B_r r + B_y y,  u = u_0 + C x + D_r r + D_y y.
 
     r and y are the *mapped* references and measurements (five each), in p.u.; u_0 holds the
     constant part of the set-points (the part that follows a reference is in D_u0, which acts on
@@ -52,7 +52,7 @@ class LawStateSpace:
         return len(self.rows)
 
     def __call__(self, s: complex) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Transfer matrices (r to u, y to u) at s, without u_0; both (3,5)."""
+        """Transfer matrices (r to u, y to u) at s (discrete: at z), without u_0; both (3,5)."""
         A, B_r, B_y, C = (m.astype(np.complex128) for m in (self.A, self.B_r, self.B_y, self.C))
         CX = C @ np.linalg.inv(s * np.eye(self.order) - A)
         return CX @ B_r + self.D_r, CX @ B_y + self.D_y

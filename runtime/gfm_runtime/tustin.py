@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gfm_runtime.errors import LawError
 from gfm_runtime.law import Law, cell_name
-from gfm_runtime.realisation import realise
+from gfm_runtime.realisation import LawStateSpace, realise
 from gfm_runtime.signals import NU, NY
 
 Matrix = NDArray[np.float64]
@@ -27,8 +27,8 @@ _ON_CIRCLE = 1e-9  # |z| beyond 1 + this is unstable; an integrator sits at 1 to
 
 
 @dataclass(frozen=True)
-class DiscreteLaw:
-    """A law at one sampling time; shapes and units as in ``LawStateSpace``, T_s in s.
+class DiscreteLaw(LawStateSpace):
+    """A law at one sampling time T_s, s: its state space from tick to tick.
 
     W (n,3) is the anti-windup gain: x is moved by W (u_clamped - u_raw) before it steps.
     The four maps E_r, E_y (n,5), F, G (n,3) set the state at a bumpless change:
@@ -37,25 +37,11 @@ class DiscreteLaw:
 
     law: Law
     T_s: float
-    A: Matrix
-    B_r: Matrix
-    B_y: Matrix
-    C: Matrix
-    D_r: Matrix
-    D_y: Matrix
-    D_u0: Matrix
-    u_0: Matrix
-    rows: tuple[int, ...]
     W: Matrix
     E_r: Matrix
     E_y: Matrix
     F: Matrix
     G: Matrix
-
-    @property
-    def order(self) -> int:
-        """Number of states."""
-        return len(self.rows)
 
     def closed(self) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix, Matrix]:
         """(A, B_r, B_y, C, D_r, D_y) with the omega_u loop closed; column 3 of B_y, D_y is 0."""
@@ -86,8 +72,8 @@ def tustin(
 ) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Tustin's discretisation of dx/dt = A x + B w, z = C x + D w, any number of w and z.
 
-    The matrices may have leading axes. ``half`` is half the sampling time in s, or what replaces it
-    for prewarping: s = (z - 1)/(z + 1)/half.
+    The matrices may have leading axes. ``half`` is half the sampling time in s:
+    s = (z - 1)/(z + 1)/half.
     """
     eye = np.eye(A.shape[-1])
     backward = np.linalg.inv(eye - half * A)
@@ -99,23 +85,18 @@ def tustin(
     )
 
 
-def discretise(law: Law, T_s: float, prewarp: float | None = None) -> DiscreteLaw:
-    """Discretise a law by Tustin at T_s [s]; ``prewarp`` [rad/s] is matched exactly if given.
+def discretise(law: Law, T_s: float) -> DiscreteLaw:
+    """Discretise a law by Tustin at T_s [s].
 
     Raises:
-        LawError: T_s or prewarp out of range, an omega_u loop without solution or unstable, and
-            as ``realise``.
+        LawError: T_s out of range, an omega_u loop without solution or unstable, and as
+            ``realise``.
     """
     if not (math.isfinite(T_s) and T_s > 0.0):
         raise LawError("T_s", f"{T_s} s must be > 0")
-    half = T_s / 2
-    if prewarp is not None:
-        if not 0.0 < prewarp < math.pi / T_s:
-            raise LawError("prewarp", f"{prewarp} rad/s must lie in (0, {math.pi / T_s:g})")
-        half = math.tan(prewarp * T_s / 2) / prewarp
     ss = realise(law)
     B, D = np.hstack([ss.B_r, ss.B_y]), np.hstack([ss.D_r, ss.D_y])
-    A, B, C, D = tustin(ss.A, B, ss.C, D, half)
+    A, B, C, D = tustin(ss.A, B, ss.C, D, T_s / 2)
     B_r, B_y, D_r, D_y = B[:, :NY], B[:, NY:], D[:, :NY], D[:, NY:]
     W, E_r, E_y, F, G = (np.zeros((ss.order, k)) for k in (NU, NY, NY, NU, NU))
     for i in range(NU):
@@ -129,7 +110,7 @@ def discretise(law: Law, T_s: float, prewarp: float | None = None) -> DiscreteLa
                 A[block], B_r[k], B_y[k], C[i, k], D_r[i], D_y[i]
             )
     discrete = DiscreteLaw(
-        law, T_s, A, B_r, B_y, C, D_r, D_y, ss.D_u0, ss.u_0, ss.rows, W, E_r, E_y, F, G
+        A, B_r, B_y, C, D_r, D_y, ss.D_u0, ss.u_0, ss.rows, law, T_s, W, E_r, E_y, F, G
     )
     _check(discrete)
     return discrete

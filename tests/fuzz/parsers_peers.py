@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.handshake import _what_runs, shake_hands
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
 from gfm_hil.links.can.layout import plan_of
 from gfm_hil.links.can.node import Node, bring, receive
-from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import LONGEST, SegmentSender
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import frame_dtype

@@ -34,6 +34,7 @@ from gfm_hil.scope.access import Access
 from gfm_hil.scope.record import open_record
 
 from ..support.modbus_device import Bench as MadeUp
+from ..support.processes import free_port
 from .conftest import Parser, Take
 from .mutations import blobs, lines, texts
 from .parsers_peers import SCENARIO
@@ -85,9 +86,7 @@ def _modbus(place: Path) -> Iterator[Take]:
 
     block = SimData(BASE, values=device.image.registers, datatype=DataType.REGISTERS)
 
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
 
     async def listen() -> Server:
         server = Server(SimDevice(id=1, simdata=[block], action=action), ("127.0.0.1", port), None)
@@ -159,14 +158,14 @@ def _scope(place: Path) -> Iterator[Take]:
     while not ports:
         assert not task.done()
         time.sleep(0.01)
-    hello = json.dumps({"kind": "hello", "token": access.token})
+    hello = json.dumps({"kind": "hello", "token": access.tokens["operator"]})
 
     def take(script: bytes) -> None:
         with (
             connect(f"ws://127.0.0.1:{ports[0]}/socket") as page,
             contextlib.suppress(ConnectionClosed),
         ):
-            for line in script.replace(b"@token@", access.token.encode()).split(b"\n"):
+            for line in script.replace(b"@token@", access.tokens["operator"].encode()).split(b"\n"):
                 page.send(line, text=True)
             page.send(hello)
             while True:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """A folder with a short path, for an ipc endpoint."""
+    """A folder with a short path, for an ipc endpoint; that of a test's own folder may be long."""
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
         yield Path(folder)
 
@@ -53,21 +54,34 @@ def run(make: Make, tmp_path: Path) -> RunIt:
 
 
 @pytest.fixture
-def endpoint() -> Iterator[str]:
-    """A new ipc endpoint; its path must be short, and that of a test's own folder may be long."""
-    with tempfile.TemporaryDirectory(prefix="gfmhil-") as folder:
-        yield f"ipc://{folder}/link"
+def endpoint(place: Path) -> str:
+    """A new ipc endpoint."""
+    return f"ipc://{place}/link"
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
-    """Starts ``gfmhil …`` in the test's own folder; kills processes that still run at the end."""
+def opened() -> Iterator[Callable[[Any], Any]]:
+    """Takes what a test opens, and closes it at the end, the last first."""
+    with ExitStack() as stack:
+
+        def take(end: Any) -> Any:
+            stack.callback(end.close)
+            return end
+
+        yield take
+
+
+@pytest.fixture
+def spawn(tmp_path: Path) -> Iterator[Start]:
+    """Starts ``python …`` in the test's own folder; kills processes that still run at the end."""
     started = []
 
-    def call(*arguments: str) -> subprocess.Popen[str]:
+    def call(
+        *arguments: str, stdin: int | None = subprocess.PIPE, stderr: int | None = None
+    ) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [sys.executable, "-m", "gfm_hil", *arguments],
-            cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, *arguments],
+            cwd=tmp_path, text=True, stdin=stdin, stdout=subprocess.PIPE, stderr=stderr,
         )  # fmt: skip
         started.append(process)
         return process
@@ -77,6 +91,12 @@ def start(tmp_path: Path) -> Iterator[Start]:
         if process.poll() is None:
             process.kill()
         process.communicate()
+
+
+@pytest.fixture
+def start(spawn: Start) -> Start:
+    """Starts ``gfmhil …``, see ``spawn``."""
+    return lambda *arguments: spawn("-m", "gfm_hil", *arguments, stdin=None, stderr=subprocess.PIPE)
 
 
 _KERNEL: pytest.StashKey[Kernel] = pytest.StashKey()

@@ -6,9 +6,8 @@ import contextlib
 import json
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,22 +28,9 @@ Child = Callable[[str], "subprocess.Popen[str]"]
 
 
 @pytest.fixture
-def child() -> Iterator[Child]:
+def child(spawn) -> Child:
     """Run a program that prints ``ready`` and its endpoint, and then waits for its end."""
-    started = []
-
-    def call(program: str) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-c", program], text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
-        started.append(process)
-        return process
-
-    yield call
-    for process in started:
-        process.kill()
-        process.communicate()
+    return lambda program: spawn("-c", program)
 
 
 def line(process: subprocess.Popen[str]) -> str:

@@ -19,22 +19,21 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import Link, link_kind, open_link
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.layout import load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
-from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import Group, names
 
 from ..support.can_reference import quantised_run
-from ..support.links import in_threads, run_pair
+from ..support.links import PATIENT, in_threads, run_pair
 
 pytestmark = pytest.mark.processes
 
 KIND = link_kind("can")
-PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
 RIG = {
     "delay": {"samples": 1, "fraction": 0.3},
     "adc": "DS2004",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.can.bus_time import classic_time, fd_time
 from gfm_hil.links.can.emulation import (
     PLACES,
     arrive,
@@ -18,7 +19,6 @@ from gfm_hil.links.can.emulation import (
     place_dtype,
     set_bus,
 )
-from gfm_hil.links.can.frame_time import classic_time, fd_time
 from gfm_hil.links.can.wire import ERROR, frame_dtype
 
 from ..support.can import frame_of

@@ -7,9 +7,8 @@ import itertools
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.links.can import KIND
-from gfm_hil.links.can.frame_time import classic_time, fd_time
-from gfm_hil.links.can.options import CanOptions
+from gfm_hil.links.can import KIND, CanOptions
+from gfm_hil.links.can.bus_time import classic_time, fd_time
 
 
 def bits_of(value: int, width: int) -> list[int]:

@@ -20,11 +20,11 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 from websockets.sync.client import ClientConnection, connect
 
-from gfm_hil.core.roles import ROLES
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
-from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, at, wait_for
+from ..support.modbus import MODELS, SCENARIO, at
+from ..support.processes import GFMHIL, PATIENCE_S, takes_commands, wait_for
 from ..support.scope import addresses, mute
 
 pytestmark = pytest.mark.processes
@@ -55,7 +55,7 @@ def lab(tmp_path) -> Iterator[tuple[Path, list[subprocess.Popen[str]]]]:
     started = [run]
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (4096, before[1]))
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
+        wait_for(lambda: takes_commands(folder))
         for server, *options in (["scope"], ["modbus", "--heartbeat", "30000"]):
             command = [server, str(folder), "--port", "0", *options]
             started.append(begin(*command, preexec_fn=few))

@@ -10,7 +10,7 @@ import pytest
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.links.frame import FrameError, FrameReader
+from gfm_hil.links.frame import FrameError, FrameReader, judge
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import names
 from gfm_runtime.states import REASONS, SAFE, STOPPED
@@ -101,7 +101,7 @@ def test_a_peer_that_leaves_is_heard_under_its_last_tick_and_the_next(role, make
         reader = limited(role, make(**REALTIME))
         reader.record["newest"] = 100
         assert fault_of(reader, 1, tick, STOPPED) == fault
-        assert reader.left == (not fault)
+        assert (reader.state >= reader.record["leaving"][0]) == (not fault)
     late = limited(role, make(**REALTIME, after_trip="wait"))
     assert fault_of(late, 1, 90, SAFE) == "tick"  # in this scenario a safe side keeps running
 
@@ -119,14 +119,14 @@ def test_the_states_of_the_protection(make):
     assert reader.e2e == "initial"
     assert (fault_of(reader, 0, FAR), reader.e2e) == ("tick", "initial")
     assert (fault_of(reader, 0, 0), reader.e2e) == ("", "valid")
-    reader.judge(False, False)
+    judge(reader.record, False, False)
     assert reader.e2e == "valid"
-    reader.judge(True, False)
+    judge(reader.record, True, False)
     assert reader.e2e == "invalid"
     assert (fault_of(reader, 1, 1), reader.e2e) == ("", "invalid")  # a frame alone does not re-arm
-    reader.judge(False, True)
+    judge(reader.record, False, True)
     assert reader.e2e == "invalid"
-    reader.judge(False, False)  # the safe state was reset
+    judge(reader.record, False, False)  # the safe state was reset
     assert reader.e2e == "initial"
     assert (fault_of(reader, 2, 2), reader.e2e) == ("", "valid")
 

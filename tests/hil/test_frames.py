@@ -1,4 +1,4 @@
-"""A frame arrives unchanged or not at all, and every fault is counted under its name."""
+"""Frames: each arrives unchanged or not at all, every fault counts under its name; their CRC."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
+from gfm_hil.links.crc import crc32, crc32_by_tables
 from gfm_hil.links.frame import FAULTS, FrameError, FrameReader, FrameWriter, frame_dtype
 from gfm_runtime.signals import TABLE_VERSION, names
 from gfm_runtime.states import REASONS, STOPPED
@@ -134,3 +135,25 @@ def test_the_record_type_for_tools_decodes_a_frame(group):
     assert (record["tick"], record["sequence"], record["state"]) == (2**40, 9, 2)
     assert record["crc"] == zlib.crc32(message[:-4])
     assert [record[name] for name in names(group)] == list(range(1, WIDTH[group] + 1))
+
+
+CHECKED = [bytes(range(44)), bytes(range(60)), b"\xff" * 44, b"\x00" * 60]
+
+
+@pytest.mark.parametrize("crc", [crc32, crc32_by_tables])
+@given(message=st.binary(min_size=1, max_size=300), after=st.binary(max_size=20))
+@example(message=CHECKED[0], after=b"")
+@example(message=CHECKED[1], after=b"\x01")
+@example(message=CHECKED[2], after=b"")
+@example(message=CHECKED[3], after=b"")
+def test_the_crc_is_that_of_zlib(crc, message: bytes, after: bytes) -> None:
+    room = np.frombuffer(message + after, np.uint8)
+    assert crc(room, len(message)) == zlib.crc32(message)
+
+
+@pytest.mark.parametrize("crc", [crc32, crc32_by_tables])
+def test_the_crc_of_every_length_and_the_published_check(crc) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, 600, np.uint8)
+    for count in range(600):
+        assert crc(noise, count) == zlib.crc32(noise[:count].tobytes())
+    assert crc(np.frombuffer(b"123456789", np.uint8), 9) == 0xCBF43926  # of CRC-32/ISO-HDLC

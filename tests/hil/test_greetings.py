@@ -22,6 +22,7 @@ from gfm_hil.scenario.model import Scenario
 from gfm_runtime.signals import NY
 
 from ..support.links import PATIENT
+from ..support.processes import free_port
 from ..support.shm import endpoint as shm_endpoint
 
 pytestmark = pytest.mark.processes
@@ -156,27 +157,22 @@ def test_a_peer_that_says_nothing_is_told_from_none(ends, make):
     "a program connects to the controller's tcp port and says nothing",
     "reported as if no peer had come",
 )
-def test_a_silent_peer_is_told_and_leaves_its_place(make, attack_now):
+def test_a_silent_peer_is_told_and_leaves_its_place(make, attack_now, opened):
     """libzmq takes an HTTP client for a ZeroMQ peer of version 1, as long as it is connected."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     where = f"tcp://127.0.0.1:{port}"
-    controller, scenario = open_link("zmq", "controller", where), make(link=PATIENT)
-    try:
-        with socket.create_connection(("127.0.0.1", port)) as scanner:
-            scanner.sendall(b"GET / HTTP/1.1\r\n\r\n")
-            with pytest.raises(PeerLost, match=r"; a peer is connected but says nothing$"):
-                greet(controller, make(link=SHORT))
-        while controller.connected():
-            time.sleep(0.01)
-        plant = open_link("zmq", "plant", where)
-        for message in (hello(scenario), FrameWriter("y").pack(0, 0, 0, np.ones(NY))):
-            assert plant.send(message)
-        assert greet(controller, scenario).refused == 0
-        plant.close()
-    finally:
-        controller.close()
+    controller, scenario = opened(open_link("zmq", "controller", where)), make(link=PATIENT)
+    with socket.create_connection(("127.0.0.1", port)) as scanner:
+        scanner.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        with pytest.raises(PeerLost, match=r"; a peer is connected but says nothing$"):
+            greet(controller, make(link=SHORT))
+    while controller.connected():
+        time.sleep(0.01)
+    plant = open_link("zmq", "plant", where)
+    for message in (hello(scenario), FrameWriter("y").pack(0, 0, 0, np.ones(NY))):
+        assert plant.send(message)
+    assert greet(controller, scenario).refused == 0
+    plant.close()
     attack_now("named as a peer that says nothing; once it has left the plant gets in")
 
 

@@ -90,56 +90,44 @@ def test_a_misfit_is_refused_on_both_roles_and_named(other, name, make, endpoint
     ("what", "name"),
     [("TABLE_VERSION", "version of the signal table"), ("table_hash", "signal table")],
 )
-def test_a_misfit_of_signal_tables_is_named(what, name, make, endpoint, monkeypatch):
+def test_a_misfit_of_signal_tables_is_named(what, name, make, endpoint, monkeypatch, opened):
     given = iter("ab")
     new = 77 if what == "TABLE_VERSION" else lambda: next(given)
-    link, scenario = ZmqLink("plant", endpoint), make(link=PATIENT)
+    link, scenario = opened(ZmqLink("plant", endpoint)), make(link=PATIENT)
     monkeypatch.setattr(handshake, what, new)
     hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
     monkeypatch.undo()
-    controller = ZmqLink("controller", endpoint)
-    try:
-        link.send(b"GFMHIL " + json.dumps(hello).encode())
-        with pytest.raises(PeerLost, match=f"the plant runs another {name} "):
-            shake_hands("controller", controller, scenario, lambda: False, print)
-        assert len(json.dumps({**hello, "boot": "x" * 36})) < 300
-    finally:
-        link.close()
-        controller.close()
+    controller = opened(ZmqLink("controller", endpoint))
+    link.send(b"GFMHIL " + json.dumps(hello).encode())
+    with pytest.raises(PeerLost, match=f"the plant runs another {name} "):
+        shake_hands("controller", controller, scenario, lambda: False, print)
+    assert len(json.dumps({**hello, "boot": "x" * 36})) < 300
 
 
-def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint):
+def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint, opened):
     """From the first HELLO on, silence means that the peer is lost."""
-    link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
+    link, controller = opened(ZmqLink("plant", endpoint)), opened(ZmqLink("controller", endpoint))
     scenario = make(link={**PATIENT, "peer_timeout_s": 0.3})
     hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
-    try:
-        link.send(b"GFMHIL " + json.dumps(hello).encode())
-        with pytest.raises(PeerLost, match="the plant came but did not start"):
-            shake_hands("controller", controller, scenario, lambda: False, print)
-    finally:
-        link.close()
-        controller.close()
+    link.send(b"GFMHIL " + json.dumps(hello).encode())
+    with pytest.raises(PeerLost, match="the plant came but did not start"):
+        shake_hands("controller", controller, scenario, lambda: False, print)
 
 
-def test_a_frame_says_that_the_plant_has_started(make, endpoint):
+def test_a_frame_says_that_the_plant_has_started(make, endpoint, opened):
     """A frame also tells when, if START was lost; other messages do not."""
-    link, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
+    link, controller = opened(ZmqLink("plant", endpoint)), opened(ZmqLink("controller", endpoint))
     scenario, frames = make(link=PATIENT), FrameWriter("y")
     hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
     k, T_ns, y = 7, 100_000, np.ones(NY)
     spoilt = bytearray(frames.pack(k, 0, 0, y))
     spoilt[30] ^= 1
     messages = [frames.pack(k, 0, 0, y), b"GFMHIL " + json.dumps(hello).encode(), bytes(spoilt)]
-    try:
-        for message in [*messages, FrameWriter("u").pack(k, 0, 0, np.ones(NU))]:
-            link.send(message)
-        before = time.monotonic_ns()
-        link.send(frames.pack(k, 0, 0, y))
-        found = shake_hands("controller", controller, scenario, lambda: False, print)
-    finally:
-        link.close()
-        controller.close()
+    for message in [*messages, FrameWriter("u").pack(k, 0, 0, np.ones(NU))]:
+        link.send(message)
+    before = time.monotonic_ns()
+    link.send(frames.pack(k, 0, 0, y))
+    found = shake_hands("controller", controller, scenario, lambda: False, print)
     assert before - k * T_ns <= found.t0_ns <= time.monotonic_ns() - k * T_ns
 
 
@@ -174,23 +162,17 @@ def test_a_run_does_without_START(kind, end, options, make, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_nobody_comes(role, make, endpoint):
+def test_nobody_comes(role, make, endpoint, opened):
     said: list[str] = []
-    link = ZmqLink(role, endpoint)
+    link = opened(ZmqLink(role, endpoint))
     scenario = make(link={**PATIENT, "start_timeout_s": 0.8, "endpoint": endpoint})
     other = {"controller": "plant", "plant": "controller"}[role]
-    try:
-        with pytest.raises(PeerLost, match=f"the {other} did not come within 0.8 s"):
-            shake_hands(role, link, scenario, lambda: False, said.append)
-    finally:
-        link.close()
+    with pytest.raises(PeerLost, match=f"the {other} did not come within 0.8 s"):
+        shake_hands(role, link, scenario, lambda: False, said.append)
     assert said == [f"waiting for the {other} at {endpoint} …"]
 
 
-def test_an_interrupt_ends_the_waiting(make, endpoint):
-    link = ZmqLink("plant", endpoint)
-    try:
-        with pytest.raises(PeerLost, match="interrupted while waiting for the controller"):
-            shake_hands("plant", link, make(link=PATIENT), lambda: True, print)
-    finally:
-        link.close()
+def test_an_interrupt_ends_the_waiting(make, endpoint, opened):
+    link = opened(ZmqLink("plant", endpoint))
+    with pytest.raises(PeerLost, match="interrupted while waiting for the controller"):
+        shake_hands("plant", link, make(link=PATIENT), lambda: True, print)

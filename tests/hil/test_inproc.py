@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.timeline import Timeline
@@ -46,8 +47,6 @@ def test_the_operating_point_knows_grid_references_and_sensors(run):
 
 
 def test_without_an_equilibrium_nothing_starts(make, tmp_path):
-    from gfm_hil.core.errors import UserError
-
     scenario = make(references={"P_ref": 2.0}, plant={"factors": {"L_g": 100.0}})
     with pytest.raises(UserError, match=r"^references, plant\.grid: P = 2\.0 p\.u\."):
         run_scenario(scenario, tmp_path / "run", figures=False)
@@ -262,8 +261,6 @@ def test_the_folder_of_a_run_holds_what_the_design_says(make, tmp_path):
 
 
 def test_a_folder_that_holds_something_is_left_alone(make, tmp_path):
-    from gfm_hil.core.errors import UserError
-
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="not empty"):
         run_scenario(make(), tmp_path)
@@ -273,8 +270,6 @@ def test_a_folder_that_holds_something_is_left_alone(make, tmp_path):
 
 
 def test_a_recording_that_the_disk_has_no_room_for_is_refused(make, tmp_path):
-    from gfm_hil.core.errors import UserError
-
     with pytest.raises(UserError, match=r"ticks need .* GB, free are"):
         run_scenario(make(duration=86400.0, T_s=1e-6), tmp_path / "run")
     assert not (tmp_path / "run").exists()

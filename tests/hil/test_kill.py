@@ -13,7 +13,6 @@ import os
 import random
 import signal
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +117,7 @@ def test_without_a_survivor_the_next_run_clears_up(start, tmp_path):
     for number in (process.pid, *roles.values()):
         os.kill(number, signal.SIGKILL)
     process.communicate()
-    wait_until(lambda: roles_of(folder) == {})
+    wait_for(lambda: roles_of(folder) == {})
     assert all(path.exists() for path in outside)
     scenario = write(tmp_path, **content, **patient)
     code, *_ = end(start("run", scenario, "--out", str(tmp_path / "next"), "--no-figures"))
@@ -128,14 +127,6 @@ def test_without_a_survivor_the_next_run_clears_up(start, tmp_path):
         f"{role}_{what}.npy" for role in ROLES for what in ("signals", "times", "progress")
     }
     assert np.isfinite(np.load(folder / "parts" / "plant_signals.npy")[:300]).all()
-
-
-def wait_until(what: Any) -> None:
-    """Poll until it is true."""
-    give_up = time.monotonic() + 60
-    while not what():
-        assert time.monotonic() < give_up
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("link", ["shm", "zmq"])

@@ -99,18 +99,14 @@ def test_a_repeated_frame_is_used_once(make, run, tmp_path, endpoint):
     assert_same(apart, run(**content).signals)
 
 
-def test_an_ipc_endpoint_that_lives_is_not_taken_over(endpoint):
-    first = ZmqLink("controller", endpoint)
-    plant = ZmqLink("plant", endpoint)
-    try:
-        with pytest.raises(UserError, match="occupied"):
-            ZmqLink("controller", endpoint)
-        plant.send(FrameWriter("y").pack(0, RUNNING, 0, np.ones(5)))
-        assert first.wait(30)
-        assert FrameReader("y").unpack(first.receive(), np.zeros(5)) == 0  # it still works
-    finally:
-        plant.close()
-        first.close()
+def test_an_ipc_endpoint_that_lives_is_not_taken_over(endpoint, opened):
+    first = opened(ZmqLink("controller", endpoint))
+    plant = opened(ZmqLink("plant", endpoint))
+    with pytest.raises(UserError, match="occupied"):
+        ZmqLink("controller", endpoint)
+    plant.send(FrameWriter("y").pack(0, RUNNING, 0, np.ones(5)))
+    assert first.wait(30)
+    assert FrameReader("y").unpack(first.receive(), np.zeros(5)) == 0  # it still works
 
 
 def test_an_ipc_endpoint_that_a_killed_run_left_is_used_again(endpoint):
@@ -144,42 +140,28 @@ def test_an_unknown_link_names_the_known():
         open_link("pigeon", "plant", "ipc://x")
 
 
-def test_a_link_never_blocks_nor_queues_without_bound(endpoint):
-    link = ZmqLink("plant", endpoint)  # no controller
-    try:
-        sent = [link.send(b"x" * 60) for _ in range(1000)]
-        assert not all(sent)
-        assert link.receive() is None
-        assert not link.wait(0.001)
-    finally:
-        link.close()
+def test_a_link_never_blocks_nor_queues_without_bound(endpoint, opened):
+    link = opened(ZmqLink("plant", endpoint))  # no controller
+    sent = [link.send(b"x" * 60) for _ in range(1000)]
+    assert not all(sent)
+    assert link.receive() is None
+    assert not link.wait(0.001)
 
 
-def test_the_last_word_waits_for_room(endpoint):
+def test_the_last_word_waits_for_room(endpoint, opened):
     """It must, if the peer is a hundred frames behind at the end of a run."""
-    plant, controller = ZmqLink("plant", endpoint), ZmqLink("controller", endpoint)
-    try:
-        while plant.send(b"frame"):
-            pass
-        heard: list[bytes] = []
+    plant, controller = opened(ZmqLink("plant", endpoint)), opened(ZmqLink("controller", endpoint))
+    while plant.send(b"frame"):
+        pass
+    heard: list[bytes] = []
 
-        def listen() -> None:
-            while (not heard or heard[-1] == b"frame") and controller.wait(30):
-                heard.append(controller.receive())
+    def listen() -> None:
+        while (not heard or heard[-1] == b"frame") and controller.wait(30):
+            heard.append(controller.receive())
 
-        thread = threading.Thread(target=listen)
-        thread.start()
-        send_last(plant, FrameWriter("y"), 7, SAFE, 0, np.ones(5))
-        thread.join()
-        reader = FrameReader("y")
-        assert reader.unpack(heard[-1], np.zeros(5)) == 7 and reader.state == SAFE
-    finally:
-        plant.close()
-        controller.close()
-
-
-def test_the_safe_state_travels_in_the_frame():
-    message = FrameWriter("u").pack(9, SAFE, 1, np.ones(3))
-    reader = FrameReader("u")
-    reader.unpack(message, np.zeros(3))
-    assert (reader.state, reader.reason, reader.tick) == (SAFE, 1, 9)
+    thread = threading.Thread(target=listen)
+    thread.start()
+    send_last(plant, FrameWriter("y"), 7, SAFE, 0, np.ones(5))
+    thread.join()
+    reader = FrameReader("y")
+    assert reader.unpack(heard[-1], np.zeros(5)) == 7 and reader.state == SAFE

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import ssl
 import struct
@@ -19,11 +18,11 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP, SunSpecModbusClientException
 from sunspec2.modbus.modbus import ModbusClientException
 
-from gfm_hil.core.roles import ROLES
 from gfm_hil.modbus.image import VENDOR
 from gfm_hil.operator import Operator
 
-from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
+from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
+from ..support.processes import GFMHIL, running, wait_for
 
 pytestmark = pytest.mark.processes
 
@@ -31,17 +30,9 @@ pytestmark = pytest.mark.processes
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Iterator[Path]:
     """The folder of a run that lasts longer than these tests."""
-    place = tmp_path_factory.mktemp("modbus")
-    (place / "served.toml").write_text(SCENARIO, encoding="utf-8")
-    folder = place / "run"
-    command = [*GFMHIL, "run", str(place / "served.toml"), "--out", str(folder)]
-    process = subprocess.Popen([*command, "--quiet", "--no-figures"], stdout=subprocess.DEVNULL)
-    try:
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
+    folder = tmp_path_factory.mktemp("modbus") / "run"
+    with running(folder, SCENARIO):
         yield folder
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.wait(PATIENCE_S)
 
 
 @pytest.fixture(scope="module")

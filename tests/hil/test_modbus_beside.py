@@ -12,10 +12,10 @@ import sunspec2.device as sunspec
 from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 
-from gfm_hil.core.roles import ROLES
 from gfm_hil.modbus.image import VENDOR
 
-from ..support.modbus import GFMHIL, MODELS, PATIENCE_S, SCENARIO, SUNS, at, end, start, wait_for
+from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
+from ..support.processes import GFMHIL, PATIENCE_S, free_port, running
 
 pytestmark = pytest.mark.processes
 
@@ -31,30 +31,22 @@ def test_the_vendor_model_is_a_file_for_clients():
 
 
 def test_stop_ends_the_run_and_the_server_with_it(tmp_path):
-    (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
     folder = tmp_path / "run"
-    command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(folder), "--quiet"]
-    going = subprocess.Popen([*command, "--no-figures"], stdout=subprocess.DEVNULL)
-    try:
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
+    with running(folder, SCENARIO) as run:
         server, port = start(folder)
         with ModbusTcpClient("127.0.0.1", port=port) as plain:
             sunspec.set_model_defs_path([MODELS, sunspec.models_dir])
             device = SunSpecModbusClientDeviceTCP(slave_id=1, ipport=port, timeout=20)
             device.scan()
             plain.write_register(at(device, 715, "OpCtl"), 0, device_id=1)
-        assert going.wait(PATIENCE_S) == 130
+        assert run.wait(PATIENCE_S) == 130
         assert server.wait(PATIENCE_S) == 0
-    finally:
-        end(going)
     assert json.loads((folder / "summary.json").read_text())["status"] == "interrupted"
 
 
 def test_a_server_beside_a_run_begins_and_ends_with_it(tmp_path):
     (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(tmp_path / "run")]
     options = ["--modbus", str(port), "--no-figures", "--quiet"]
     run = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

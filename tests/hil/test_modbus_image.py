@@ -30,7 +30,7 @@ def test_the_image_is_a_sunspec_map():
 
 @pytest.mark.parametrize("law", every_law())
 def test_the_droops_of_every_law_are_those_of_its_file_or_none(law):
-    from gfm_hil.modbus.gains import Gains
+    from gfm_hil.modbus.droops import Gains
 
     gains = Gains([law])
     found = gains.droops(law, {})

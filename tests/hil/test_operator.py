@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,11 @@ import pytest
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.announcement import present
 from gfm_hil.operator import Operator
 from gfm_hil.recording.log import read_log
+
+from ..support.processes import PATIENCE_S, running, wait_for
 
 pytestmark = pytest.mark.processes
 
@@ -34,7 +34,6 @@ type = "law"
 t = 599.0
 law = "vsg-2"
 """
-PATIENCE_S = 100.0
 
 
 @pytest.fixture(
@@ -43,24 +42,9 @@ PATIENCE_S = 100.0
 )
 def going(request, tmp_path):
     """The folder of a long run in progress."""
-    file, folder = tmp_path / "told.toml", tmp_path / "run"
-    link, options = request.param
-    file.write_text(SCENARIO.format(link=link, options=options), encoding="utf-8")
-    command = [sys.executable, "-m", "gfm_hil", "run", str(file), "--out", str(folder)]
-    process = subprocess.Popen([*command, "--quiet", "--no-figures"], stdout=subprocess.DEVNULL)
-    try:
-        wait_for(lambda: all((folder / f"commands_{s}.json").exists() for s in ROLES))
+    folder, (link, options) = tmp_path / "run", request.param
+    with running(folder, SCENARIO.format(link=link, options=options)) as process:
         yield process, folder
-    finally:
-        process.kill()
-        process.wait()
-
-
-def wait_for(condition) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.02)
 
 
 def rows(folder: Path) -> dict[str, np.ndarray]:

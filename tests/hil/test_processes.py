@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,8 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import Part
 
 from ..support.processes import (
-    PATIENCE_S,
     end,
+    free_port,
     has_run,
     roles_of,
     signals,
@@ -29,13 +28,6 @@ from ..support.processes import (
 pytestmark = pytest.mark.processes
 
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
-
-
-def free_endpoint() -> str:
-    """A tcp endpoint that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
 
 
 def assert_same(one: Path, other: Path) -> None:
@@ -84,7 +76,7 @@ def test_both_roles_started_by_hand_over_tcp(start, tmp_path):
         law="vsg-2",
         duration=0.1,
         events=[{"t": 0.05, "type": "reference", "P_ref": 0.6}],
-        link={"peer_timeout_s": 20.0, "endpoint": free_endpoint()},
+        link={"peer_timeout_s": 20.0, "endpoint": f"tcp://127.0.0.1:{free_port()}"},
     )
     processes = {role: start(role, scenario, "--out", role) for role in reversed(ROLES)}
     for role, process in processes.items():
@@ -189,17 +181,14 @@ def test_without_the_command_that_started_them_both_roles_end_too(start, tmp_pat
     wait_for(lambda: has_run(folder, 200), process)
     process.kill()
     process.communicate()
-    end_at = time.monotonic() + PATIENCE_S
-    while roles_of(folder) and time.monotonic() < end_at:
-        time.sleep(0.02)
-    assert roles_of(folder) == {}
+    wait_for(lambda: roles_of(folder) == {})
     for role in ROLES:
         part = Part.open(folder, role)
         assert not np.isnan(part.signals[:200]).any()
 
 
 def test_a_plant_that_never_comes(start, tmp_path):
-    endpoint = free_endpoint()
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
     scenario = write(tmp_path, link={"start_timeout_s": 1.2, "endpoint": endpoint})
     code, out, err = end(start("controller", scenario, "--out", "alone"))
     assert code == 3

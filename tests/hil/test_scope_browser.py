@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from websockets.sync.client import connect
 
-from ..support.scope import HAS_BROWSER, Browser, Rig, rig, wait_for
+from ..support.processes import wait_for
+from ..support.scope import HAS_BROWSER, Browser, Rig, rig
 
 pytestmark = [
     pytest.mark.systems,

@@ -20,7 +20,8 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope
 from gfm_hil.scope.view import View
 
-from ..support.scope import Rig, mute, rig, serving, wait_for
+from ..support.processes import takes_commands, wait_for
+from ..support.scope import Rig, mute, rig, serving, words
 
 pytestmark = pytest.mark.processes
 
@@ -41,14 +42,6 @@ def port(scope) -> Iterator[int]:
 
 def address(port: int, query: str = "") -> str:
     return f"ws://127.0.0.1:{port}/socket{query}"
-
-
-def words(socket: ClientConnection, kind: str) -> dict[str, Any]:
-    """The next message of that kind."""
-    while True:
-        message = socket.recv(60)
-        if isinstance(message, str) and json.loads(message)["kind"] == kind:
-            return dict(json.loads(message))
 
 
 def say(socket: ClientConnection, **content: Any) -> None:
@@ -154,7 +147,7 @@ def test_the_token_s_holder_gets_in_among_mute_pages(port, scope, attack_now) ->
         with pytest.raises(InvalidStatus), connect(address(port)):
             pass
         with connect(address(port, "?control")) as page:
-            say(page, kind="hello", token=scope.access.token)
+            say(page, kind="hello", token=scope.access.tokens["operator"])
             assert words(page, "control")["granted"] is True
             assert words(page, "about")["title"] == "test"
         with connect(address(port, "?control")) as page:
@@ -202,7 +195,7 @@ def test_half_open_connections_end_by_themselves(scope, monkeypatch) -> None:
 def lab(tmp_path_factory) -> Iterator[Rig]:
     """A run in progress with its scope."""
     with rig(tmp_path_factory.mktemp("crowd")) as found:
-        wait_for(lambda: len(list(found.folder.glob("commands_*.json"))) == 2)
+        wait_for(lambda: takes_commands(found.folder))
         yield found
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from gfm_hil.cli import main
 from gfm_hil.scope.access import Access
@@ -25,7 +25,7 @@ from gfm_hil.scope.record import open_record
 from gfm_hil.scope.server import Scope, static_files
 from gfm_hil.scope.view import HEAD
 
-from ..support.scope import addresses, serving
+from ..support.scope import addresses, serving, words
 
 pytestmark = pytest.mark.processes
 
@@ -49,14 +49,6 @@ def fetch(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, st
             return answer.status, dict(answer.headers), answer.read()
     except urllib.error.HTTPError as problem:
         return problem.code, dict(problem.headers), problem.read()
-
-
-def words(socket: ClientConnection, kind: str) -> dict[str, Any]:
-    """The next message of that kind."""
-    while True:
-        message = socket.recv(10)
-        if isinstance(message, str) and json.loads(message)["kind"] == kind:
-            return dict(json.loads(message))
 
 
 def test_page_with_its_policy(served) -> None:
@@ -159,7 +151,7 @@ def test_a_run_that_is_over_can_be_played(served) -> None:
         (json.dumps({**LOOK, "span": 0.1, "bins": 10**9}), "bins"),
         (json.dumps({**LOOK, "span": -1.0}), "span"),
         (json.dumps({**LOOK, "span": 0.1, "channels": ["p"] * 100}), "channels"),
-        (json.dumps({**LOOK, "span": 0.1, "channels": ["__class__"]}), "none of that name"),
+        (json.dumps({**LOOK, "span": 0.1, "channels": ["__class__"]}), "unknown"),
         (json.dumps({**LOOK, "span": 0.1, "mode": "trigger"}), "trigger"),
         ('{"kind": "look", "span": NaN}', "span"),
     ],
@@ -186,12 +178,12 @@ def test_control_needs_the_token(served) -> None:
     port, access, _ = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         tell = json.dumps({"kind": "tell", "id": 1, "event": {"type": "reset"}})
-        for token in ("", "wrong", access.token[:-1], "é"):
+        for token in ("", "wrong", access.tokens["operator"][:-1], "é"):
             socket.send(json.dumps({"kind": "hello", "token": token}))
             assert words(socket, "control")["granted"] is False
             socket.send(tell)
             assert "may look, not touch" in words(socket, "answer")["text"]
-        socket.send(json.dumps({"kind": "hello", "token": access.token}))
+        socket.send(json.dumps({"kind": "hello", "token": access.tokens["operator"]}))
         assert words(socket, "control")["granted"] is True
         socket.send(tell)
         assert words(socket, "answer") == {

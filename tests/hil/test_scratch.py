@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,8 @@ import pytest
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.recording import parts as recording
+
+from ..support.processes import kill
 
 pytestmark = pytest.mark.processes
 
@@ -40,9 +41,8 @@ def memory(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.fixture
-def record(memory) -> Iterator[Record]:
+def record(memory, spawn) -> Record:
     """A process that has recorded 60 of 100 ticks and then sleeps."""
-    started = []
 
     def call(folder: Path, role: str) -> subprocess.Popen[str]:
         folder.mkdir(exist_ok=True)
@@ -50,24 +50,11 @@ def record(memory) -> Iterator[Record]:
             "import gfm_hil.recording.parts as r, pathlib; "
             f"r._MEMORY = pathlib.Path({str(memory)!r})"
         )
-        process = subprocess.Popen(
-            [sys.executable, "-c", where + HOLD, str(folder), role],
-            text=True,
-            stdout=subprocess.PIPE,
-        )
-        started.append(process)
-        assert process.stdout is not None
+        process = spawn("-c", where + HOLD, str(folder), role)
         assert process.stdout.readline() == "ready\n"
         return process
 
-    yield call
-    for process in started:
-        kill(process)
-
-
-def kill(process: subprocess.Popen[str]) -> None:
-    process.kill()
-    process.wait()
+    return call
 
 
 def another_run(tmp_path: Path) -> list[str]:

@@ -110,17 +110,15 @@ def test_a_closed_end_is_deaf_and_dumb(pair):
     assert ring.take(plant.port.handle, np.ones(4, np.uint8)) == 0
 
 
-def test_a_plant_that_comes_first_waits_for_the_controller(endpoint):
-    plant = ShmLink("plant", endpoint)
+def test_a_plant_that_comes_first_waits_for_the_controller(endpoint, opened):
+    plant = opened(ShmLink("plant", endpoint))
     assert not plant.send(b"x")
     assert plant.receive() is None
     assert not plant.wait(0.001)
-    controller = ShmLink("controller", endpoint)
+    controller = opened(ShmLink("controller", endpoint))
     assert plant.send(b"hello")
     assert controller.wait(0.001)
     assert controller.receive() == b"hello"
-    plant.close()
-    controller.close()
 
 
 def test_waiting_ends_when_a_message_comes(pair):
@@ -133,21 +131,19 @@ def test_waiting_ends_when_a_message_comes(pair):
     thread.join()
 
 
-def test_the_next_plant_goes_on_where_the_last_one_stopped(endpoint):
-    controller, plant = ShmLink("controller", endpoint), ShmLink("plant", endpoint)
+def test_the_next_plant_goes_on_where_the_last_one_stopped(endpoint, opened):
+    controller, plant = opened(ShmLink("controller", endpoint)), ShmLink("plant", endpoint)
     for k in range(100):
         assert plant.send(b"%d" % k)
         assert controller.send(b"%d" % k)
         assert (controller.receive(), plant.receive()) == (b"%d" % k,) * 2
     plant.send(b"by the first")
     plant.close()
-    plant = ShmLink("plant", endpoint)
+    plant = opened(ShmLink("plant", endpoint))
     assert plant.send(b"by the second")
     assert [controller.receive() for _ in range(3)] == [b"by the first", b"by the second", None]
     assert controller.send(b"x")
     assert plant.receive() == b"x"
-    plant.close()
-    controller.close()
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../x", "a b", "ä", "x" * 201, "x\n"])
@@ -160,7 +156,7 @@ def test_a_name_that_is_none(role, name):
 def test_the_longest_name_and_a_fresh_one_are_good(tmp_path):
     kind = link_kind("shm")
     for name in ("shm://" + "x" * 200, kind.fresh(tmp_path)):
-        kind.check_endpoint(name)
+        kind.checked(name, {})
         open_link("shm", "controller", name).close()
         assert not segment_of(name).exists()
 

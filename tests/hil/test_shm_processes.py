@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm.link import ShmLink
 
+from ..support.processes import kill
 from ..support.shm import endpoint, segment_of
 
 pytestmark = pytest.mark.processes
@@ -22,30 +22,16 @@ Peer = Callable[..., "subprocess.Popen[str]"]
 
 
 @pytest.fixture
-def peer(endpoint: str) -> Iterator[Peer]:
+def peer(endpoint: str, spawn: Peer) -> Peer:
     """Start a side as a process and wait until it has opened its end."""
-    started = []
 
     def call(role: str, what: str = "hold", n: int = 0) -> subprocess.Popen[str]:
         script = Path(__file__).parents[1] / "support" / "shm_peer.py"
-        process = subprocess.Popen(
-            [sys.executable, str(script), role, endpoint, what, str(n)],
-            text=True,
-            stdout=subprocess.PIPE,
-        )
-        started.append(process)
-        assert process.stdout is not None
+        process = spawn(str(script), role, endpoint, what, str(n))
         assert process.stdout.readline() == "ready\n"
         return process
 
-    yield call
-    for process in started:
-        kill(process)
-
-
-def kill(process: subprocess.Popen[str]) -> None:
-    process.kill()
-    process.wait()
+    return call
 
 
 def test_nothing_is_torn_lost_or_doubled_in_a_million_messages_each_way(peer):
@@ -69,16 +55,14 @@ def test_a_name_is_had_by_one_controller_and_one_plant(peer, endpoint):
     ShmLink("controller", endpoint).close()
 
 
-def test_a_killed_controller_is_not_joined_and_its_name_is_free(peer, endpoint):
+def test_a_killed_controller_is_not_joined_and_its_name_is_free(peer, endpoint, opened):
     kill(peer("controller"))
     assert segment_of(endpoint).exists()
-    plant = ShmLink("plant", endpoint)
+    plant = opened(ShmLink("plant", endpoint))
     assert not plant.send(b"to the dead")
-    controller = ShmLink("controller", endpoint)
+    controller = opened(ShmLink("controller", endpoint))
     assert plant.send(b"to the living")
     assert controller.receive() == b"to the living"
-    plant.close()
-    controller.close()
 
 
 def test_what_a_killed_controller_left_is_removed_by_its_plant(peer, endpoint):
@@ -89,24 +73,22 @@ def test_what_a_killed_controller_left_is_removed_by_its_plant(peer, endpoint):
     assert not segment_of(endpoint).exists()
 
 
-def test_a_killed_plant_leaves_its_place_to_the_next(peer, endpoint):
+def test_a_killed_plant_leaves_its_place_to_the_next(peer, endpoint, opened):
     controller = ShmLink("controller", endpoint)
     kill(peer("plant"))
-    plant = ShmLink("plant", endpoint)
+    plant = opened(ShmLink("plant", endpoint))
     assert controller.send(b"hello")
     assert plant.receive() == b"hello"
     controller.close()
     assert not segment_of(endpoint).exists()
-    plant.close()
 
 
-def test_what_killed_runs_left_is_swept_by_a_run_of_another_name(peer, endpoint):
+def test_what_killed_runs_left_is_swept_by_a_run_of_another_name(peer, endpoint, opened):
     controller, plant = peer("controller"), peer("plant")
     kill(controller)
     kill(plant)
-    other = ShmLink("controller", endpoint + "-other")
+    opened(ShmLink("controller", endpoint + "-other"))
     assert not segment_of(endpoint).exists()
-    other.close()
 
 
 def test_a_living_run_is_not_swept(peer, endpoint):

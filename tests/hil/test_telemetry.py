@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from gfm_hil.cli import main
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.operator import Operator
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
@@ -25,6 +26,8 @@ from gfm_hil.telemetry.blocks import block_dtype, messages
 from gfm_hil.telemetry.follow import Follower, Rows
 from gfm_hil.telemetry.publish import Ports, Publisher
 from gfm_hil.telemetry.samples import Sampler
+
+from ..support.processes import PATIENCE_S, takes_commands, wait_for
 
 pytestmark = pytest.mark.processes
 
@@ -37,7 +40,6 @@ late_policy = {{ hold = 100000 }}
 type = "shm"
 peer_timeout_s = 30.0
 """
-PATIENCE_S = 100.0
 
 
 class PlotJuggler:
@@ -61,6 +63,12 @@ class PlotJuggler:
         sample = json.loads(parts[-1], parse_constant=pytest.fail)  # NaN is not JSON
         self._flatten(topic, sample, sample["timestamp"])
         return True
+
+    def receive_until(self, done: Callable[[], object]) -> None:
+        until = time.monotonic() + PATIENCE_S
+        while not done():
+            assert time.monotonic() < until
+            self.receive(1.0)
 
     def _flatten(self, path: str, value: object, t: float) -> None:
         if isinstance(value, dict):
@@ -96,14 +104,9 @@ def run_and_stream(start, folder: Path, mode: str, *options: str):
 
 def stop(folder: Path, run: subprocess.Popen, stream: subprocess.Popen) -> dict[str, np.ndarray]:
     """Stop the run; returns its recording."""
-    until = time.monotonic() + PATIENCE_S
-    while not all((folder / f"commands_{role}.json").exists() for role in ROLES):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_for(lambda: takes_commands(folder))
     operator = Operator(folder)
-    while operator.snapshot().get("tick", 0) < 10:
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_for(lambda: operator.snapshot().get("tick", 0) >= 10)
     operator.stop()
     operator.close()
     run.communicate(timeout=PATIENCE_S)
@@ -118,10 +121,8 @@ def test_plotjuggler_reads_what_was_recorded(start, listen, tmp_path):
     folder = tmp_path / "run"
     run, stream, (port, _) = run_and_stream(start, folder, "lockstep", "--rate", "500")
     juggler = listen(port)
-    until = time.monotonic() + PATIENCE_S
-    while any(len(juggler.series[f"gfmhil/{s}/tick"]) < 200 for s in ("plant", "controller")):
-        assert time.monotonic() < until
-        juggler.receive(1.0)
+    ticks = [juggler.series[f"gfmhil/{role}/tick"] for role in ROLES]
+    juggler.receive_until(lambda: all(len(found) >= 200 for found in ticks))
     recorded = stop(folder, run, stream)
     ticks = {role: [int(k) for _, k in juggler.series[f"gfmhil/{role}/tick"]]
              for role in ("plant", "controller")}  # fmt: skip
@@ -165,10 +166,7 @@ def test_samples_of_a_run_in_real_time_tell_misses_and_slack(start, listen, tmp_
     folder = tmp_path / "run"
     run, stream, (port, _) = run_and_stream(start, folder, "realtime")
     juggler = listen(port)
-    until = time.monotonic() + PATIENCE_S
-    while len(juggler.series["gfmhil/plant/slack_us"]) < 100:
-        assert time.monotonic() < until
-        juggler.receive(1.0)
+    juggler.receive_until(lambda: len(juggler.series["gfmhil/plant/slack_us"]) >= 100)
     recorded = stop(folder, run, stream)
     due, received = recorded["plant_scheduled"], recorded["plant_received"]
     misses = np.cumsum((due >= 0) & (received < 0))
@@ -268,10 +266,7 @@ def test_a_run_streams_itself(start, listen, tmp_path):
     assert (refused.returncode, (tmp_path / "run").exists()) == (2, False)
     run = start(*words, "0")
     juggler = listen(run.stderr.readline().split()[1].rpartition(":")[2])
-    until = time.monotonic() + PATIENCE_S
-    while not juggler.series:
-        assert time.monotonic() < until
-        juggler.receive(1.0)
+    juggler.receive_until(lambda: juggler.series)
     run.terminate()
     _, said = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 130
@@ -285,10 +280,7 @@ def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint)
     roles = [start(role, *words, role) for role in ("controller", "plant")]
     stream = start("stream", "controller", "--wait", "--port", "0")
     juggler = listen(stream.stdout.readline().split()[1].rpartition(":")[2])
-    until = time.monotonic() + PATIENCE_S
-    while not juggler.series:
-        assert time.monotonic() < until
-        juggler.receive(1.0)
+    juggler.receive_until(lambda: juggler.series)
     assert {path.split("/")[1] for path in juggler.series} == {"controller"}
     roles[0].terminate()
     for process in (*roles, stream):
@@ -296,14 +288,12 @@ def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint)
     assert [process.returncode for process in (*roles, stream)] == [130, 130, 0]
 
 
-def test_a_port_that_is_taken_is_named(start, tmp_path):
-    folder = tmp_path / "run"
-    run, stream, (port, _) = run_and_stream(start, folder, "lockstep")
-    again = start("stream", str(folder), "--wait", "--port", port)
-    _, error = again.communicate(timeout=PATIENCE_S)
-    assert again.returncode == 2
-    assert f"--port {port}: tcp://127.0.0.1:{port}: Address already in use" in error
-    stop(folder, run, stream)
+def test_a_port_that_is_taken_is_named():
+    with Publisher(Ports("127.0.0.1", 0, 0)) as first:
+        port = int(first.samples.rpartition(":")[2])
+        taken = f"--port {port}: tcp://127.0.0.1:{port}: Address already in use"
+        with pytest.raises(UserError, match=taken):
+            Publisher(Ports("127.0.0.1", port, 0))
 
 
 @pytest.mark.attack(

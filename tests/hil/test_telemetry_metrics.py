@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import time
 import urllib.request
 from pathlib import Path
 
@@ -19,9 +18,10 @@ from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics
 
+from ..support.processes import PATIENCE_S, wait_for
+
 pytestmark = pytest.mark.processes
 
-PATIENCE_S = 100.0
 SCENARIO = """
 title = "collected"
 duration = 600.0
@@ -50,13 +50,12 @@ def test_a_run_is_collected_while_it_goes_on(start, tmp_path):
     run = start("run", str(file), "--out", str(folder), "--quiet", "--no-figures")
     *_, address = [stream.stdout.readline().split()[1] for _ in range(3)]
     port = address.removesuffix("/metrics").rpartition(":")[2]
-    until = time.monotonic() + PATIENCE_S
-    while (first := scraped(port)).get(("gfmhil_ticks_total", "plant"), 0) < 10:
-        assert time.monotonic() < until
+    wait_for(lambda: scraped(port).get(("gfmhil_ticks_total", "plant"), 0) >= 10)
+    first = scraped(port)
     operator = Operator(folder)
     operator.tell({"type": "law", "law": "vsg-2"})
-    while ("gfmhil_law_info", "vsg-2") not in (second := scraped(port)):
-        assert time.monotonic() < until
+    wait_for(lambda: ("gfmhil_law_info", "vsg-2") in scraped(port))
+    second = scraped(port)
     operator.stop()
     operator.close()
     run.communicate(timeout=PATIENCE_S)

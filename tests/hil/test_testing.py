@@ -147,7 +147,7 @@ def test_what_is_not_looked_at_is_run_all_the_same(pytester: pytest.Pytester) ->
         ("bench.start('nowhere')", "nowhere"),
         ("bench.start(link='tin-can')", "tin-can"),
         ("bench.start(link='inproc', controller_command=['c'])", "needs a link"),
-        ("bench.start(controller_command=['c']); bench.switch('vsg-2')", "laws of its own"),
+        ("bench.start(controller_command=['c']); bench.switch('vsg-2')", "its own laws"),
         ("bench.grid()", "f_hz = None, V_g = None"),
     ],
 )

@@ -20,6 +20,7 @@ from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.links.zeromq.options import ZmqOptions, beyond_loopback
 
 from ..support.links import PATIENT, assert_same, deliver, in_threads, run_pair
+from ..support.processes import free_port
 
 pytestmark = pytest.mark.processes
 
@@ -27,9 +28,7 @@ pytestmark = pytest.mark.processes
 @pytest.fixture
 def tcp() -> str:
     """A loopback endpoint that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp://127.0.0.1:{free_port()}"
 
 
 @pytest.fixture(scope="module")
@@ -117,31 +116,23 @@ def test_frames_are_not_readable_on_the_wire(tcp, keys):
     assert secret not in heard
 
 
-def test_only_the_plant_whose_key_is_known_gets_in(controller, tcp, keys, others, tmp_path):
-    intruder = ZmqLink("plant", tcp, curve(mixed(tmp_path, others, keys)))
-    plain = ZmqLink("plant", tcp)
-    try:
-        intruder.send(b"forged")
-        plain.send(b"forged")
-        assert not controller.wait(1.0)
-        plant = ZmqLink("plant", tcp, curve(keys))  # and the strangers do not take its place
-        try:
-            assert arrives(plant, controller)
-        finally:
-            plant.close()
-    finally:
-        plain.close()
-        intruder.close()
+def test_only_the_plant_whose_key_is_known_gets_in(controller, tcp, keys, others, tmp_path, opened):
+    intruder = opened(ZmqLink("plant", tcp, curve(mixed(tmp_path, others, keys))))
+    plain = opened(ZmqLink("plant", tcp))
+    intruder.send(b"forged")
+    plain.send(b"forged")
+    assert not controller.wait(1.0)
+    plant = opened(ZmqLink("plant", tcp, curve(keys)))  # and the strangers do not take its place
+    assert arrives(plant, controller)
 
 
-def test_nobody_gets_in_while_there_is_nobody_to_ask(controller, tcp, keys, others, tmp_path):
+def test_nobody_gets_in_while_there_is_nobody_to_ask(
+    controller, tcp, keys, others, tmp_path, opened
+):
     """By default libzmq accepts every peer that knows the controller's public key."""
     controller._curve.close()
-    intruder = ZmqLink("plant", tcp, curve(mixed(tmp_path, others, keys)))
-    try:
-        assert not arrives(intruder, controller, seconds=1.0)
-    finally:
-        intruder.close()
+    intruder = opened(ZmqLink("plant", tcp, curve(mixed(tmp_path, others, keys))))
+    assert not arrives(intruder, controller, seconds=1.0)
 
 
 def test_an_abstract_socket_is_refused():
@@ -150,14 +141,10 @@ def test_an_abstract_socket_is_refused():
             open_link("zmq", role, "ipc://@rig")
 
 
-def test_a_plant_talks_to_no_other_controller(tcp, keys, others, tmp_path):
-    false = ZmqLink("controller", tcp, curve(others))
-    plant = ZmqLink("plant", tcp, curve(mixed(tmp_path, keys, keys)))
-    try:
-        assert not arrives(plant, false, seconds=1.0)
-    finally:
-        plant.close()
-        false.close()
+def test_a_plant_talks_to_no_other_controller(tcp, keys, others, tmp_path, opened):
+    false = opened(ZmqLink("controller", tcp, curve(others)))
+    plant = opened(ZmqLink("plant", tcp, curve(mixed(tmp_path, keys, keys))))
+    assert not arrives(plant, false, seconds=1.0)
 
 
 @pytest.mark.parametrize("knows", ["no key", "a wrong key"])

@@ -112,14 +112,11 @@ def test_the_patient_way_to_receive_sleeps_but_not_for_ever(ends):
     assert room[:size].tobytes() == b"late"
 
 
-def test_a_port_with_nobody_there_drops_and_one_that_is_closed_does_nothing(endpoint):
-    link = ZmqLink("plant", endpoint)
+def test_a_port_with_nobody_there_drops_and_one_that_is_closed_does_nothing(endpoint, opened):
+    link = opened(ZmqLink("plant", endpoint))
     by_port = ByPort(link)
-    try:
-        assert not all([by_port.send(b"x" * 60) for _ in range(1000)])
-        assert by_port.receive() is None
-    finally:
-        link.close()
+    assert not all([by_port.send(b"x" * 60) for _ in range(1000)])
+    assert by_port.receive() is None
     assert not by_port.send(b"x")
     assert by_port.receive() is None
 

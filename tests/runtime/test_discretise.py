@@ -131,26 +131,6 @@ def test_sampling_time(T_s: float) -> None:
         discretise(get_law("vsg-2"), T_s)
 
 
-def test_prewarp_is_exact_at_its_frequency() -> None:
-    law, omega = get_law("vsg-7"), 2 * math.pi * 300
-    s, z = 1j * omega, np.exp(1j * omega * T_S)
-
-    def value(prewarp: float | None) -> complex:
-        d = discretise(law, T_S, prewarp)
-        inner = np.linalg.solve(z * np.eye(d.order) - d.A, d.B_r.astype(complex))
-        return complex((d.C @ inner + d.D_r)[1, 1])
-
-    exact = law.phi[1, 1](s)
-    assert value(omega) == pytest.approx(exact, rel=1e-10)
-    assert abs(value(None) - exact) > 1e-4 * abs(exact)
-
-
-@pytest.mark.parametrize("prewarp", [0.0, -1.0, math.pi / T_S, math.nan])
-def test_prewarp_out_of_range(prewarp: float) -> None:
-    with pytest.raises(LawError, match=r"prewarp: .* rad/s must lie in \(0, 31415"):
-        discretise(get_law("vsg-2"), T_S, prewarp)
-
-
 def law_of(**cells: Element) -> Law:
     """A law from cells by name, e.g. phi_22."""
     grids: dict[str, dict[tuple[int, int], Element]] = {"phi": {}, "psi": {}}

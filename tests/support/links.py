@@ -18,7 +18,7 @@ from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
-from gfm_hil.links.impaired import ImpairedLink
+from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.parts import Part

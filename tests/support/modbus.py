@@ -1,14 +1,14 @@
-"""Helpers of the Modbus server's tests: start it, and wait for a condition."""
+"""Helpers of the Modbus server's tests."""
 
 from __future__ import annotations
 
 import re
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import gfm_hil.modbus
+
+from .processes import GFMHIL
 
 SCENARIO = """
 title = "served"
@@ -24,19 +24,8 @@ peer_timeout_s = 30.0
 [late_policy]
 hold = 10000000
 """
-PATIENCE_S = 100.0
-GFMHIL = [sys.executable, "-m", "gfm_hil"]
 MODELS = str(Path(gfm_hil.modbus.__file__).parent / "models")
 SUNS = 40000
-
-
-def wait_for(condition):
-    """Poll the condition until its result is true; returns the result."""
-    until = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    return found
 
 
 def end(process: subprocess.Popen) -> None:

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import signal
+import socket
 import subprocess
+import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +30,8 @@ def places(folder: Path) -> set[Path]:
     return found
 
 
-PATIENCE_S = 90.0
+PATIENCE_S = 100.0
+GFMHIL = [sys.executable, "-m", "gfm_hil"]
 
 
 def write(folder: Path, **content: Any) -> str:
@@ -35,16 +41,41 @@ def write(folder: Path, **content: Any) -> str:
     return str(path)
 
 
-def wait_for(what: Any, process: subprocess.Popen[str]) -> Any:
-    """Poll until ``what()`` is true; fail if the process ends or the timeout expires."""
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        found = what()
-        if found:
-            return found
-        assert process.poll() is None, process.communicate()
+def wait_for(what: Callable[[], Any], process: subprocess.Popen[str] | None = None) -> Any:
+    """Poll until ``what()`` is true, and return it; fail if the process ends or time runs out."""
+    until = time.monotonic() + PATIENCE_S
+    while not (found := what()):
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < until, "the condition did not come true in time"
         time.sleep(0.02)
-    raise AssertionError("the condition did not come true in time")
+    return found
+
+
+@contextmanager
+def running(folder: Path, scenario: str, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """A run of a scenario's text into ``folder``, which takes commands; ends it as Ctrl-C does."""
+    file = folder.with_suffix(".toml")
+    file.write_text(scenario, encoding="utf-8")
+    command = [*GFMHIL, "run", str(file), "--out", str(folder), "--quiet", "--no-figures"]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL, text=True)
+    try:
+        wait_for(lambda: takes_commands(folder), process)
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(PATIENCE_S)
+
+
+def free_port() -> int:
+    """A TCP port of the loopback device that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def takes_commands(folder: Path) -> bool:
+    """Whether both command servers of a run are announced."""
+    return all((folder / f"commands_{role}.json").exists() for role in ROLES)
 
 
 def has_run(folder: Path, ticks: int) -> bool:
@@ -66,6 +97,11 @@ def roles_of(folder: Path) -> dict[str, int]:
             if str(folder) in words and state != "Z":
                 found.update({role: int(entry.name) for role in ROLES if role in words})
     return found
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:

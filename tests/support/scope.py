@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import shutil
 import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,15 +58,6 @@ class Rig:
         return self.control.partition("#token=")[2]
 
 
-def wait_for(what: Callable[[], Any], patience: float = PATIENCE_S) -> Any:
-    """Poll until the result is true; returns the result."""
-    until = time.monotonic() + patience
-    while not (found := what()):
-        assert time.monotonic() < until, "the condition did not come true in time"
-        time.sleep(0.05)
-    return found
-
-
 def addresses(lines: Iterator[str]) -> tuple[str, str]:
     """The addresses to look and to control, from the output of a scope."""
     found: list[str] = []
@@ -93,6 +84,14 @@ def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
     finally:
         process.terminate()
         process.wait()
+
+
+def words(socket: Any, kind: str) -> dict[str, Any]:
+    """The next message of that kind."""
+    while True:
+        message = socket.recv(60)
+        if isinstance(message, str) and json.loads(message)["kind"] == kind:
+            return dict(json.loads(message))
 
 
 @contextmanager

@@ -1,1 +1,1 @@
-"""The synthesis: free gains, searches, and the box that deployable gains must stabilise."""
+"""The synthesis of gains: free gains, costs, searches, and gains that stabilise a whole box."""

@@ -23,15 +23,15 @@ Vector = NDArray[np.float64]
 
 _JOIN, _JOIN_STEPS = 12, 5  # violated corners that are added after a round
 _TOLERANCE = 1e-3
-LATE = (7.0, 9.0, 11.0)  # samples: the delays at which the nominal loop must hold as well
+LATE = (7.0, 9.0, 11.0)  # samples: delays at which the nominal loop must be stable, too
 
 
 @dataclass(frozen=True)
 class Round:
     """The state of the search after a round: gains, gamma, and the worst over the whole box.
 
-    ``slow`` [1/s] and ``beyond`` (a part of the step) are the worst violations of the limits of
-    sigma and of the overshoot; negative if all corners meet them.
+    ``slow`` [1/s] and ``beyond`` (as a fraction of the step) are the worst violations of the limits
+    of sigma and of the overshoot; they are negative if all corners meet the limits.
     """
 
     values: Vector
@@ -45,7 +45,7 @@ class Round:
 
 
 def steps(box: Box) -> list[Point]:
-    """The points for the step of P_ref: from 0.5 p.u., at the least and the largest delay."""
+    """The points for the step of P_ref: from 0.5 p.u., at the smallest and the largest delay."""
     return replace(box, P_ref=(0.5,), delay=(min(box.delay), max(box.delay))).corners()
 
 
@@ -60,15 +60,16 @@ def deploy(
     starts: int = 2,
     tell: Callable[[Round], None] = lambda found: None,
 ) -> Round:
-    """The last round's gains; the same for a seed.
+    """Tune gains for a box and return the last round; a seed always gives the same gains.
 
     Args:
-        file, gains: the law, with starts that make the paper's own loop stable.
-        box: what to hold in.
+        file, gains: the law and its free gains; their starts must stabilise the paper's loop.
+        box: the loops that the gains must stabilise.
         wanted: the constraints.
         seed: of the search.
-        rounds, evaluations, starts: how often, and as for ``tune`` each time.
-        tell: told of every round.
+        rounds: most rounds.
+        evaluations, starts: of each round, as for ``tune``.
+        tell: called after every round.
     """
     begin = time.perf_counter()
     corners = box.corners() + [Point(delay=late, dc=dc) for dc in box.dc for late in LATE]
@@ -114,7 +115,8 @@ def _worst(all_of: Sequence[Point], broken: Vector, known: list[Point], most: in
 
 
 def _is_extreme(point: Point, box: Box) -> bool:
-    """One of the box's outermost corners; P_ref alternates so that half of them do."""
+    """Whether a point is among the outermost corners with which the search begins: half of them,
+    since P_ref alternates between its two ends."""
     ends = {n: (min(getattr(box, n)), max(getattr(box, n))) for n in ("R_f", "R_g", "L_g", "delay")}
     if any(getattr(point, n) not in ends[n] for n in ends):
         return False

@@ -1,19 +1,19 @@
 """A lower bound of gamma for every law, from controllers of full order.
 
-The diagonal problem, the largest of the norms of W_ij T_ij, is not one standard H-infinity
-problem: each w_j counts separately. But for one w_j alone, the stack of its m channels is one,
-and the stack's norm is at most sqrt(m) times its largest channel. So with gamma_j the least norm
-of the stack over *all* stabilising controllers that see (v_dc, p, q, V) and P_ref,
+gamma is the largest of the norms of the channels W_ij T_ij. To minimise it is no standard
+H-infinity problem, since each input w_j counts separately. For a single w_j, the m channels stacked
+are a standard problem, and the norm of the stack is at most sqrt(m) times that of its largest
+channel. Let gamma_j be the least norm of the stack over *all* stabilising controllers that measure
+(v_dc, p, q, V) and P_ref. Then
 
     gamma of any law  >=  max over j of gamma_j / sqrt(m_j),
 
-and a single channel (m = 1) bounds without the root. Such controllers know no droop D_p and no
-structure; one for each w_j may differ. gamma_j is thus also what one controller reaches for w_j
-at most, with all its channels.
+and a single channel (m = 1) gives a bound without the root. These controllers have neither a droop
+D_p nor a structure, and each w_j may have its own.
 
 The Riccati solution (``control.hinfsyn``, which needs slycot, GPL: never a dependency of this
-project) asks for full rank at every frequency. A small part of all inputs and outputs is added to
-w and z for that, which can only raise gamma_j: the bound holds but for that part, of order 1e-4.
+project) requires full rank at every frequency. For that, small multiples of all inputs and outputs
+are added to w and z. They can only raise gamma_j: the bound holds up to a part of order 1e-4.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Matrix = NDArray[np.float64]
 
 _REGULAR = 1e-4
 _U_SCALE = (1.0, 1e-4, 1.0)  # omega_u moves by 1e-4 p.u. where the others move by one
-# in these units, by j: 1e-2 p.u. on omega_u where W_32 asks for 1, more where W_31 asks for 1e6
+# in these units, by j: 1e-2 p.u. on omega_u where W_32 weights it by 1, more where W_31 has 1e6
 _REGULAR_U = {1: (1e-4, 1e-5, 1e-4), 2: (1e-4, 1e-6, 1e-4)}
 _MEASURED = list(SENSED)
 
@@ -47,7 +47,7 @@ class Missing(ModuleNotFoundError):
 
 @dataclass(frozen=True)
 class FullOrder:
-    """bound: gamma that no law undercuts; columns: gamma_j of w_j's stack, None if not solved."""
+    """bound: no law has a smaller gamma; columns: gamma_j of each stack, None if not solved."""
 
     bound: float
     columns: tuple[float | None, float | None]
@@ -58,8 +58,8 @@ def full_order(
 ) -> FullOrder | None:
     """The bound; None if the solver finished no part of the problem in time.
 
-    The solver runs in a process of its own, with ``seconds`` for each part: it may never return
-    from one close to singular.
+    The solver runs in a separate process, with ``seconds`` for each part: it may never return
+    from a part that is nearly singular.
 
     Raises:
         Missing: python-control or slycot is not installed.
@@ -115,7 +115,7 @@ def generalised_plant(plant: LinearPlant, stack: Sequence[Weight]) -> StateSpace
 
 
 def _in_time(systems: list[StateSpace], seconds: float) -> list[float | None]:
-    """The least norms of the first systems, as far as each came within ``seconds``."""
+    """The least norms of the first systems, up to the first that took longer than ``seconds``."""
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe(duplex=False)
     process = spawn.Process(target=_solve, args=(systems, there), daemon=True)

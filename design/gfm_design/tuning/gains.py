@@ -1,9 +1,9 @@
 """The free gains of a law, and the law as a function of them.
 
 The paper pulls its gains out of the loop into a static K (Section III-B): the law's matrices are
-then affine in the gains. Whether that holds for a law as its file writes it is tried out once; if
-so, a law for new gains costs a few additions, and if not ``model.batch`` builds it from the
-file, a whole population in one pass.
+then affine in the gains. ``GainedLaw`` tests this once for a law file. If it holds, a law for new
+gains costs a few additions; if not, ``model.batch`` builds the laws of a whole population from the
+file in one pass.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class FreeGain:
 
     @property
     def by_ratio(self) -> bool:
-        """Searched by its logarithm: a gain that cannot change its sign."""
+        """Whether its logarithm is searched: for a gain that cannot change its sign."""
         return self.low > 0.0
 
 
@@ -50,11 +50,11 @@ def free_gains(
     start: Mapping[str, float] | None = None,
     only: Sequence[str] | None = None,
 ) -> tuple[FreeGain, ...]:
-    """The gains that the file declares free, with other starts or fewer of them if wanted.
+    """The gains that the file declares free, optionally with other starts or only some of them.
 
     Raises:
-        LawError: an unknown or fixed name, none at all, a start for one that is not wanted or
-            outside its bounds, bounds that are none.
+        LawError: a name is unknown or not free, there is no free gain, a start belongs to none of
+            them or lies outside its bounds, or bounds are not finite and ascending.
     """
     declared = {n: p for n, p in file.parameters.items() if p.free is not None}
     for name in [*(start or {}), *(only or [])]:
@@ -84,7 +84,7 @@ def free_gains(
 
 
 def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
-    """``values`` with every parameter that the file ties to others, e.g. k_35 = k_34 / D_q."""
+    """``values`` and all parameters that the file ties to others, e.g. k_35 = k_34 / D_q."""
     numbers = {n: p.value for n, p in file.parameters.items()} | dict(values)
     out = dict(values)
     for name, p in file.parameters.items():
@@ -94,7 +94,7 @@ def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
 
 
 def _generic(gain: FreeGain, k: int) -> float:
-    """The k-th gain a little off its start, by a share of it that no other gain has."""
+    """The k-th gain slightly away from its start, by a relative amount that no other gain has."""
     share = 1e-3 * (0.5 + (k + 1) * _GOLDEN % 1.0)
     step = share * (abs(gain.start) or min(1.0, abs(gain.low), abs(gain.high)))
     moved = gain.start + step if gain.start + step <= gain.high else gain.start - step
@@ -125,7 +125,7 @@ class GainedLaw:
 
     @property
     def is_affine(self) -> bool:
-        """The law's matrices are affine in the gains, as the paper's G and K need."""
+        """Whether the law's matrices are affine in the gains, as the paper's G and K require."""
         return self._affine is not None
 
     def named(self, values: Vector) -> dict[str, float]:
@@ -134,9 +134,9 @@ class GainedLaw:
         return tied(self.file, free)
 
     def __call__(self, values: Vector) -> LinearLaw:
-        """The law at these gains, shape (n,); or the laws at many, shape (N,n), on a leading axis.
+        """The law at gains of shape (n,), or the laws at gains of shape (N, n) on a leading axis.
 
-        Gains that make no law give matrices of nan.
+        Gains that give no valid law give matrices of nan.
         """
         if self._affine is None:
             many = self._many(np.atleast_2d(values))
@@ -152,13 +152,13 @@ class GainedLaw:
         """The law as the runtime builds it, in lowest terms.
 
         Raises:
-            LawError: the gains make no law.
+            LawError: the gains give no valid law.
         """
         law = build_law(self.file, self.named(values))
         return linearise_law(law, realise(law), self._op, self._ref, self._dc_control)
 
     def _many(self, values: Vector) -> LinearLaw:
-        values = np.vstack([self._off_start, values])  # whose first row tells the structure
+        values = np.vstack([self._off_start, values])  # the first row determines the structure
         numbers = {n: np.full(len(values), p.value) for n, p in self.file.parameters.items()}
         numbers |= {g.name: values[:, k] for k, g in enumerate(self.gains)}
         for name, p in self.file.parameters.items():
@@ -180,7 +180,7 @@ class GainedLaw:
         return (r[0], y[0]) if len(distinct) == 1 else (r[where], y[where])
 
     def _try_affine(self) -> tuple[Vector, Vector] | None:
-        """All matrices in a row at gains of zero (K,), and their slopes (n,K)."""
+        """The elements of all matrices at gains of zero (K,), and their slopes (n, K)."""
         at = np.array([g.start for g in self.gains])
         step = np.array([0.1 * (abs(g.start) or 1.0) for g in self.gains])
         laws = [self.exact(at), self.exact(at + 0.7 * step)]
@@ -196,7 +196,7 @@ class GainedLaw:
         return here - at @ slopes, slopes
 
 
-_LINEAR = 0.01  # share of the bound up to which the coordinate is about linear
+_LINEAR = 0.01  # fraction of the bound up to which the coordinate is nearly linear
 
 
 class Encoding:
@@ -214,7 +214,7 @@ class Encoding:
         self.low, self.high = (self.coordinates(b) for b in self._bounds)
 
     def values(self, point: Vector) -> Vector:
-        """The gains at coordinates, one row a point or a single one, held within the bounds."""
+        """The gains at one point or at rows of points, clipped to the bounds."""
         held = np.clip(point, self.low, self.high)
         ratio = np.exp(np.where(self._by_ratio, held, 0.0))
         other = self._linear * np.sinh(np.where(self._by_ratio, 0.0, held))

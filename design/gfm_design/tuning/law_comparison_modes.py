@@ -1,4 +1,4 @@
-"""The mode that stands in a law's way on the paper's converter, and the states that make it."""
+"""The least stable mode of a law on the paper's converter, and the states that take part in it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _SHOWN = 4
 class Culprit:
     """A mode of a loop, and its largest participation factors by state.
 
-    The factor of state k is |l_k r_k| of the mode's left and right eigenvectors, as a share of
-    their sum (Pérez-Arriaga, Verghese and Schweppe, 1982).
+    The factor of state k is |l_k r_k| of the mode's left and right eigenvectors, divided by the sum
+    over all states (Pérez-Arriaga, Verghese and Schweppe, 1982).
     """
 
     mode: Mode
     states: tuple[tuple[str, float], ...]
 
     def words(self) -> str:
-        """In one line."""
+        """The mode and its states in one line."""
         f = self.mode.frequency_hz
         where = f"at {f:.4g} Hz" if f else "(real)"
         who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.states)
@@ -47,7 +47,7 @@ def culprit(loop: ClosedLoop) -> Culprit:
 
 
 def _states(loop: ClosedLoop) -> list[str]:
-    """What the states of a single loop are, in their order."""
+    """Names of the states of a single loop, in their order."""
     size, acts = len(loop.plant.A) - len(_PLANT), loop.plant.B.any(axis=0)
     names = [*_PLANT, *["integral of the DC source"] * (size % len(_SENSORS))]
     names += _SENSORS if size >= len(_SENSORS) else ()

@@ -1,7 +1,8 @@
-"""The free gains of a law for the least gamma of the paper's problem: what ``design tune`` calls.
+"""``design tune``: choose a law's free gains for the least gamma of the paper's problem.
 
-Many short searches, each with a polish: the problem has several minima (MIMO-GFM one at 1.43 with
-a fast DC loop and one at 1.33 with a slow one), and the polish finds the bottom of each from afar.
+The search is many short ones, each followed by a polish. The problem has several minima (MIMO-GFM
+has one at 1.43 with a fast DC loop and one at 1.33 with a slow one), and the polish converges to
+one from far away.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ Vector = NDArray[np.float64]
 
 EVALUATIONS = 240  # of each start, before its polish
 _STARTS = 6  # and one more for every gain
-_SAME = 1e-6  # relative: of a height that no gain moves, and of two that are one
-_SETTLES = 3  # polishes at the operating point of the gains that the last one came to
+_SAME = 1e-6  # relative: heights this close count as equal, and as independent of a gain
+_SETTLES = 3  # most polishes, each at the operating point of the previous result
 
 
 def starts_for(gains: int) -> int:
-    """How many starts a law of so many free gains is given."""
+    """Number of starts for a law with this number of free gains."""
     return _STARTS + gains
 
 
@@ -41,23 +42,23 @@ def tune_paper(
     starts: int | None = None,
     progress: Callable[[int, float], None] = lambda done, best: None,
 ) -> Tuned:
-    """Choose the gains of ``problem``; the same for a seed, and never worse than its start.
+    """Choose the gains of ``problem``: a seed always gives the same gains, never worse than the
+    starting ones.
 
-    Where no gain moves the highest channel (a droop other than the one that the problem asks for
-    shows in W_41 T_41(0)), gamma cannot tell good gains from bad ones; they are then chosen for
-    the least of the channels that they do move.
+    If no gain changes the highest channel (for example W_41 T_41(0) of a law with another droop
+    than the problem's), gamma does not distinguish good gains from bad ones. The search then
+    minimises the largest of the channels that the gains change.
 
-    The search is made at the operating point of the starting gains; some laws rest elsewhere with
-    other gains, and then the last steps are made there. ``cost`` is gamma with the guarantee of
-    ``norms.hinf``, at the operating point of the gains themselves, to which ``problem`` is
-    moved.
+    The search uses the operating point of the starting gains. If the found gains have another one,
+    the last steps are repeated there, and ``problem`` is moved there. ``cost`` is gamma with the
+    guarantee of ``norms.hinf`` at that point.
 
     Args:
         problem: law, free gains with starts and bounds, weights.
         seed: of the search.
         evaluations: of each start, once it is stable.
         starts: the given one and random ones; by default more for a law with more gains.
-        progress: told the evaluations done and the best gamma so far.
+        progress: called with the evaluations done and the best gamma so far.
 
     Raises:
         NotStabilised: no stable loop was found.
@@ -84,7 +85,7 @@ def tune_paper(
 
 
 def _settled(problem: PaperProblem, found: Tuned) -> Tuned:
-    """The best of start, ``found`` and of what it comes to at its own operating point."""
+    """The best of the start, of ``found``, and of its polish at its own operating point."""
     code = Encoding(problem.gains)
     candidates, at = [code.values(code.start), found.values], found.values
     for _ in range(_SETTLES):
@@ -103,7 +104,7 @@ def _settled(problem: PaperProblem, found: Tuned) -> Tuned:
 
 
 def _fixed(problem: PaperProblem, values: Vector) -> set[Weight]:
-    """The highest channels, if no gain moves them."""
+    """The highest channels, if no gain changes them."""
     code = Encoding(problem.gains)
     at = code.coordinates(values)
 
@@ -116,7 +117,7 @@ def _fixed(problem: PaperProblem, values: Vector) -> set[Weight]:
     nearby = model(loops, problem.weights, at, found)
     still = np.abs(nearby.slope).max(axis=1) < _SAME * nearby.base
     highest = found.height > (1.0 - _SAME) * found.height[0]
-    # where a gain can still lower one of the highest, gamma is what it is for
+    # if a gain can lower one of the highest channels, gamma is the right cost
     return {problem.weights[c] for c in found.channel[highest & still]} if still[0] else set()
 
 

@@ -1,8 +1,8 @@
-"""The last steps to a least gamma: the least of 1/height over all tall peaks, raised step by step.
+"""The last steps to a least gamma: raise the least of 1/height over all high peaks step by step.
 
-Near a minimum several peaks are equally high, and the ridge they share is curved. Each step solves
-the little problem of their second-order models within a trust region, and is taken if the true
-peaks agree. One over the height is used, not the height: a resonance's peak goes as one over its
+Near a minimum several peaks are equally high, along a curved ridge. Each step maximises the least
+of their second-order models within a trust region, and is accepted if the true peaks improve as
+well. The models are of 1/height: the height of a resonance is inversely proportional to its
 damping, which is nearly linear in the gains.
 """
 
@@ -16,10 +16,10 @@ from gfm_design.norms.performance import Weight
 
 Vector = NDArray[np.float64]
 
-_FIRST, _SMALLEST = 0.3, 1e-4  # trust region, in the search's coordinates
-_STEEP = 3.0  # how much a coordinate's reach suffers from the slope of ln(height) along it
-_ACCEPTED = 0.1  # share of the promised improvement
-_WORTH, _PATIENCE = 1e-4, 6  # relative improvement that so many rounds must bring together
+_FIRST, _SMALLEST = 0.3, 1e-4  # first and smallest trust region, in the search's coordinates
+_STEEP = 3.0  # how much the slope of ln(height) along a coordinate reduces the region there
+_ACCEPTED = 0.1  # least fraction of the predicted improvement for a step to be accepted
+_WORTH, _PATIENCE = 1e-4, 6  # least relative improvement over this number of rounds
 
 
 def polish(
@@ -33,10 +33,10 @@ def polish(
     """Coordinates near ``start``, within [low, high], at which the highest peak is least.
 
     Args:
-        loops: T(s) at given coordinates, stacked on axis 0 if they are.
+        loops: T(s) at given coordinates; rows of coordinates give loops stacked on axis 0.
         weights: W_ij.
-        start: a stable point; an unstable one comes back as it is.
-        rounds: steps at most.
+        start: a stable point; an unstable one is returned unchanged.
+        rounds: most steps.
     """
     at, reach = np.clip(start, low, high), _FIRST
     now = peaks(loops(at), weights)
@@ -48,7 +48,7 @@ def polish(
             break
         if nearby is None:
             nearby = model(loops, weights, at, now)
-        # a coordinate on which a height depends steeply is let go less far
+        # a smaller region along coordinates on which a height depends steeply
         far = reach / (1.0 + _STEEP * np.abs(nearby.slope / nearby.base[:, None]).max(axis=0))
         step = _best_step(nearby, np.maximum(low - at, -far), np.minimum(high - at, far))
         least = nearby.base.min()

@@ -1,8 +1,8 @@
-"""Gains that hold in a whole box of real loops: what they must keep, and the cost of a search.
+"""Gains that stabilise a whole box of real loops: the constraints, and the cost of a search.
 
-gamma of the paper's problem is made least under constraints over the box: every mode of every
-sampled loop decays faster than alpha, and p overshoots a step of P_ref by no more than asked. A
-broken constraint costs more than gamma can gain by breaking it.
+The search minimises gamma of the paper's problem under constraints over the box: every mode of
+every sampled loop decays faster than alpha, and the overshoot of p after a step of P_ref stays
+below a limit. The penalty of a violation exceeds what gamma can gain by it.
 """
 
 from __future__ import annotations
@@ -25,25 +25,26 @@ from gfm_runtime.tustin import discretise
 
 Vector = NDArray[np.float64]
 
-_BROKEN = 5.0  # cost of a 1/s too little, and of gamma above its ceiling by 1
-_BEYOND = 100.0  # cost of an overshoot by a whole step too much
-_HOPELESS = 20.0  # 1/s; a loop that grows so fast has no step response worth computing
-_GRIDS = ((10, 16), (120, 16))  # stride in ticks, root of the points: to 0.26 s, to 3.1 s
+_BROKEN = 5.0  # penalty for 1 1/s of decay too little, and for gamma 1 above its ceiling
+_BEYOND = 100.0  # penalty for an overshoot that exceeds its limit by a whole step
+_HOPELESS = 20.0  # 1/s; the step response of a loop that grows faster is not computed
+_GRIDS = ((10, 16), (120, 16))  # stride in ticks, root of the number of points: 0.26 s and 3.1 s
 _P_REF, _P = INPUTS.index("P_ref"), Y_NAMES.index("p")
 _SHORT = 3.0  # L_g up to this factor counts as a strong grid
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What every loop of the box must keep.
+    """The constraints for every loop of the box.
 
     Attributes:
-        gamma: no gain in gamma below this is worth a broken constraint.
-        alpha: every mode decays at least so fast, 1/s.
-        strong, weak: overshoot of p as a part of a step of P_ref, up to and beyond L_g x 3.
-        rig_alpha: as alpha, where the DC source regulates itself; None: alpha and the limits of
-            the overshoot hold there too.
-        rig_weight: with a rig_alpha, the cost of the rig's largest overshoot by a whole step.
+        gamma: ceiling of gamma; above it gamma has a penalty.
+        alpha: least decay rate of every mode, 1/s.
+        strong, weak: largest overshoot of p as a fraction of a step of P_ref, up to and beyond
+            L_g x 3.
+        rig_alpha: as alpha, for a DC source that regulates itself; None: alpha and the limits of
+            the overshoot hold there, too.
+        rig_weight: with a rig_alpha, the cost of an overshoot of 1 (a whole step) on the rig.
     """
 
     gamma: float = 1.49
@@ -58,7 +59,7 @@ class Wanted:
         return -self.alpha if self.rig_alpha is None or not _is_rig(point) else -self.rig_alpha
 
     def overshoot(self, point: Point) -> float:
-        """Largest overshoot allowed at a point; inf where it is weighed instead."""
+        """Largest overshoot allowed at a point; inf where it adds to the cost instead."""
         if self.rig_alpha is not None and _is_rig(point):
             return np.inf
         return self.strong if point.L_g <= _SHORT else self.weak
@@ -71,9 +72,9 @@ def _is_rig(point: Point) -> bool:
 class Loops:
     """The sampled loops of some points as functions of a law's free gains.
 
-    The law's error map must be linear and its rows 1 and 3 integrate, so that the operating point
-    of each point does not move with the gains. What does not depend on the gains, the plant from
-    tick to tick, is computed once, and the loops of one size are one ``ClosedLoop``.
+    The law must have a linear error map and integrators in rows 1 and 3, so that the operating
+    points do not depend on the gains. The sampled plants are computed once, and loops of the same
+    size are stacked into one ``ClosedLoop``.
     """
 
     def __init__(self, file: LawFile, gains: Sequence[FreeGain], points: Sequence[Point]) -> None:
@@ -95,7 +96,7 @@ class Loops:
         return self._each(values, lambda loop: np.asarray(loop.sigma()))
 
     def overshoot(self, values: Vector) -> Vector:
-        """How far p goes beyond a step of P_ref, as a part of the step; inf if it grows."""
+        """Overshoot of p after a step of P_ref, as a fraction of the step; inf if it grows."""
         return self._each(values, overshoot)
 
     def _each(self, values: Vector, of: Callable[[ClosedLoop], Vector]) -> Vector:
@@ -107,12 +108,12 @@ class Loops:
 
 
 def overshoot(loops: ClosedLoop) -> Vector:
-    """How far p goes beyond a unit step of P_ref, shape (N,); inf where it grows.
+    """Overshoot of p after a unit step of P_ref, shape (N,); inf where it grows.
 
-    p = c A^k x_0 on a grid of ticks, of which c A^i and A^(N j) x_0 are the two factors.
+    It is p = c A^k x_0 on a grid of ticks, computed as the products of c A^i and A^(N j) x_0.
 
     Args:
-        loops: N sampled loops in one.
+        loops: N sampled loops, stacked.
     """
     A, B, C, _ = loops.state_space
     rest = np.linalg.solve(np.eye(A.shape[-1]) - A, B[..., [_P_REF]])
@@ -136,7 +137,7 @@ def overshoot(loops: ClosedLoop) -> Vector:
 
 
 def paper_problem(file: LawFile, gains: Sequence[FreeGain], dc: Source) -> PaperProblem:
-    """The paper's problem with a DC source: with the rig's own, row 1 of the law is not in it."""
+    """The paper's problem with a DC source; a source that regulates itself replaces row 1."""
     plant = Plant.model_validate({"dc_source": {"mode": dc}})
     return PaperProblem(file, tuple(gains), plant)
 
@@ -145,9 +146,9 @@ class RobustProblem:
     """The cost of a law's gains over some points of the box; a problem for ``synthesis.tune``.
 
     Args:
-        paper: gamma.
-        points: where the modes are looked at.
-        steps: where the step of P_ref is looked at.
+        paper: computes gamma.
+        points: where the modes are constrained.
+        steps: where the overshoot is constrained.
         wanted: the constraints.
     """
 
@@ -161,7 +162,7 @@ class RobustProblem:
         self._overshoot = np.array([wanted.overshoot(p) for p in steps])
 
     def __call__(self, values: Vector) -> float:
-        """gamma, and what the broken constraints cost."""
+        """gamma plus the penalties."""
         gamma = self._paper(values)
         if gamma >= UNSTABLE:
             return gamma
@@ -176,9 +177,9 @@ class RobustProblem:
         return float(cost + self._wanted.rig_weight * beyond[rig].max(initial=0.0))
 
     def many(self, values: Vector) -> Vector:
-        """Costs of several, one a row."""
+        """Costs of several sets of gains, one a row."""
         return np.array([self(v) for v in values])
 
     def polish(self, code: Encoding, point: Vector) -> Vector:
-        """The point itself: the constraints have kinks that no gradient follows."""
+        """The point itself: the constraints are not smooth enough for a gradient."""
         return point

@@ -1,15 +1,15 @@
-"""Fixed-structure H-infinity synthesis: the free gains that make gamma least.
+"""Fixed-structure H-infinity synthesis: the free gains that minimise gamma.
 
 The problem is neither smooth nor convex: the peak jumps between channels and resonances, and the
-stable set has a hard edge. CMA-ES (N. Hansen, "The CMA evolution strategy", 2016) ranks points and
-asks for no gradient, so both are no trouble to it; it is what did best among the optimisers tried.
-What it comes to is handed to a polish, if there is one, which follows the active peaks.
+cost jumps at the limit of stability. CMA-ES (N. Hansen, "The CMA evolution strategy", 2016) only
+ranks points and needs no gradient; it gave the best results among the optimisers that we tried. A
+problem may have a polish, which improves the result of CMA-ES by following the active peaks.
 
-With a polish that finds its way from afar, many short runs of CMA-ES find lower minima than a few
-long ones in the same time (``tune_paper``); without one, it is the long runs that count (``tune``).
+If the polish converges from far away, many short runs of CMA-ES find lower minima than a few long
+ones in the same time (``tune_paper``); without a polish, long runs are better (``tune``).
 
 An unstable point costs more than any stable one, by its spectral abscissa: the search first
-stabilises, then improves.
+stabilises the loop, then lowers gamma.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from gfm_design.tuning.gains import Encoding, FreeGain
 
 Vector = NDArray[np.float64]
 
-UNSTABLE = 1e6  # what an unusable point costs at least
+UNSTABLE = 1e6  # least cost of an unusable point
 _STEP = 0.5  # CMA-ES's first step, in the coordinates of ``Encoding``
 _POPULATION = 32
-_SAMPLES = 400  # random points, of which the best is the start of a further run
-_HOPELESS = 6  # runs without a usable point after which no more are begun
-_STABILISE = 4000  # costs that a run may ask for, whatever its budget, before one is usable
+_SAMPLES = 400  # random points; the best one starts a further run
+_HOPELESS = 6  # the search ends after this number of runs without a usable point
+_STABILISE = 4000  # evaluations that a run may always use to find a usable point
 
 
 class Problem(Protocol):
-    """What is to be made least."""
+    """A cost to minimise."""
 
     def __call__(self, values: Vector) -> float:
-        """Cost of one set of gains, finite; ``UNSTABLE`` and more if they are of no use."""
+        """Cost of one set of gains, finite; at least ``UNSTABLE`` if they are unusable."""
 
     def many(self, values: Vector) -> Vector:
-        """Costs of several, one a row."""
+        """Costs of several sets of gains, one a row."""
 
     def polish(self, code: Encoding, point: Vector) -> Vector:
         """A better point nearby, in the search's coordinates; may be the point itself."""
@@ -49,13 +49,13 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class Tuned:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
-        values: the free gains, in the order given.
-        cost: what the search's own cost says of them.
-        evaluations, seconds: what it took.
-        seed: what makes it repeatable.
+        values: the free gains, in the given order.
+        cost: of these gains.
+        evaluations, seconds: the effort.
+        seed: of the random numbers; a seed always gives the same result.
     """
 
     values: Vector
@@ -66,7 +66,7 @@ class Tuned:
 
 
 class NotStabilised(ArithmeticError):
-    """No usable gains were found. ``values`` are the best ones tried."""
+    """The search found no usable gains. ``values`` are the best that it tried."""
 
     def __init__(self, values: Vector, evaluations: int, cost: float) -> None:
         self.values = values
@@ -78,7 +78,7 @@ class NotStabilised(ArithmeticError):
 
 def unstable_cost(abscissa: Vector) -> Vector:
     """Cost of points whose largest growth is ``abscissa`` [1/s] >= 0."""
-    # growth in the digits below UNSTABLE, so that it can be read off a cost
+    # the digits below UNSTABLE hold the growth, so that callers can recover it from a cost
     return UNSTABLE + np.clip(abscissa, 0.0, 0.99 * UNSTABLE)
 
 
@@ -90,19 +90,20 @@ def tune(
     starts: int = 2,
     progress: Callable[[int, float], None] = lambda done, best: None,
 ) -> Tuned:
-    """Search the free gains within their bounds for the least cost; the same for a seed.
+    """Search the free gains within their bounds for the least cost; a seed always gives the same
+    gains.
 
     Args:
         problem: the cost.
         gains: with starts and bounds.
         seed: of the search.
-        evaluations: how many costs each start may ask for once one of them is usable.
-        starts: searches; the first from the gains' own start, the others from the best of some
-            random points within the bounds.
-        progress: told the evaluations done and the best cost so far.
+        evaluations: most evaluations of each run after its first usable point.
+        starts: number of runs; the first begins at the gains' own start, the others at the best of
+            some random points within the bounds.
+        progress: called with the evaluations done and the best cost so far.
 
     Raises:
-        NotStabilised: not one point with a cost below ``UNSTABLE``.
+        NotStabilised: no point has a cost below ``UNSTABLE``.
         ModuleNotFoundError: the package cma is missing (extra ``design``).
     """
     begin, done = time.perf_counter(), 0
@@ -145,12 +146,12 @@ def _search(
     evaluations: int,
     tell: Callable[[int, float], None],
 ) -> tuple[Vector, int]:
-    """The best point of one run of CMA-ES, and how many costs it asked for."""
+    """The best point of one run of CMA-ES, and the number of its evaluations."""
     try:
         import cma
     except ModuleNotFoundError:
         raise ModuleNotFoundError("synthesis needs cma: pip install 'gfmhil[design]'") from None
-    # cma has no one-dimensional form: a coordinate that does nothing makes up the second
+    # cma needs two dimensions at least: add a coordinate without effect
     idle = 1 if len(start) == 1 else 0
     search = cma.CMAEvolutionStrategy(
         np.r_[start, np.zeros(idle)],

@@ -46,9 +46,9 @@ def call(options: argparse.Namespace) -> int:
 
 def _budgets(T_s: float) -> Table:
     """Longest frames of y and u by bit rate, and the exchange that fits."""
-    from gfm_hil.links.can.bus_budget import budget
+    from gfm_hil.links.can import CanOptions
+    from gfm_hil.links.can.bus_time import budget
     from gfm_hil.links.can.layout import load_plan
-    from gfm_hil.links.can.options import CanOptions
 
     heads = ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load")
     table = numbers("bus [Mbit/s]", *heads)

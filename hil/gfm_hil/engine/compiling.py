@@ -103,7 +103,7 @@ def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
     return compile_sets(sets, notice), len(sets)
 
 
-_IDLE: Set = ("the thread that keeps a processor awake", prevent_idle.warm_up)
+_IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)
 
 
 def _both(found: list[Bench]) -> Set:

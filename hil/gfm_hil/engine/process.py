@@ -25,9 +25,9 @@ from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
-from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
-from gfm_hil.links.impaired import ImpairedLink
-from gfm_hil.realtime.prevent_idle import kept_awake
+from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
+from gfm_hil.links.impaired.link import ImpairedLink
+from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
@@ -124,8 +124,8 @@ def _meet_and_run(
             if good.port is None:  # a thread in Python pumps its messages, and hardly ever sleeps
                 rights["policy"] = ordinary_priority()
             else:
-                awake = kept_awake(rights["processor"], scenario.keep_awake)
-                rights["kept_awake"] = resources.enter_context(awake)
+                busy = prevent_idle(rights["processor"], scenario.prevent_idle)
+                rights["idle_prevented"] = resources.enter_context(busy)
             timeline.write(0, "scheduling", role=role, **rights)
         no_collector_pauses()
         notify(f"STATUS=waiting for the other side at {endpoint}")
@@ -154,7 +154,7 @@ def compile_role(role: Role, bench: Bench, part: Part) -> None:
         values = np.zeros(len(names(group)))
         reader = FrameReader(group)
         reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
-        reader.judge(False, False)
+        judge(reader.record, False, False)
     compile_loops(role, bench, part)
     pump.warm_up()
     if role == "plant":

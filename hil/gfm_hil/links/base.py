@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
+from gfm_hil.core.errors import lines
 from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
 
@@ -51,18 +52,6 @@ class LinkOptions(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-def _fits(options: Any, T_s: float) -> None:
-    """Accept any options at any sampling time."""
-
-
-def _may(endpoint: str | None, options: Any) -> None:
-    """Accept any endpoint with any options."""
-
-
-def _nothing(options: Any) -> None:
-    """A link that compiles nothing."""
-
-
 @dataclass(frozen=True)
 class LinkKind:
     """What the bench knows of a link before it opens one.
@@ -89,12 +78,23 @@ class LinkKind:
     fresh: Callable[[Path], str]
     open: Callable[[Role, str, Any], Link]
     options: type[LinkOptions] = LinkOptions
-    check: Callable[[Any, float], None] = _fits
-    check_both: Callable[[str | None, Any], None] = _may
-    warm_up: Callable[[Any], None] = _nothing
+    check: Callable[[Any, float], None] = lambda options, T_s: None
+    check_both: Callable[[str | None, Any], None] = lambda endpoint, options: None
+    warm_up: Callable[[Any], None] = lambda options: None
     exact: bool = True
 
-    def check_endpoint(self, endpoint: str) -> None:
-        """Raise ValueError if the endpoint does not have this link's form."""
-        if re.fullmatch(self.pattern, endpoint) is None:
+    def checked(self, endpoint: str | None, options: dict[str, Any]) -> LinkOptions:
+        """The options as a model, if endpoint (None: a fresh one) and options may be used.
+
+        Raises:
+            ValueError: they may not; one line.
+        """
+        if endpoint is not None and re.fullmatch(self.pattern, endpoint) is None:
             raise ValueError(f"endpoint = {endpoint!r}: must be {self.form}")
+        try:
+            found = self.options.model_validate(options)
+        except ValidationError as problem:
+            wrong = lines(problem, self.options)
+            raise ValueError("; ".join(f"options.{line}" for line in wrong)) from None
+        self.check_both(endpoint, found)
+        return found

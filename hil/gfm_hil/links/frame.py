@@ -301,18 +301,9 @@ class FrameReader:
         return int(self.record["reason"][0])
 
     @property
-    def left(self) -> bool:
-        """Whether the last good frame said that its sender leaves."""
-        return bool(self.record["state"][0] >= self.record["leaving"][0])
-
-    @property
     def e2e(self) -> str:
         """State of the end-to-end protection, one of ``gfm_hil.links.frame.E2E``."""
         return E2E[int(self.record["e2e"][0])]
-
-    def judge(self, overdue: bool, latched: bool) -> None:
-        """Update the E2E state; see ``gfm_hil.links.frame.judge``."""
-        judge(self.record, bool(overdue), bool(latched))
 
     def unpack(self, message: bytes, values: NDArray[np.float64]) -> int:
         """Write the values of a good frame into ``values``; returns its tick.

@@ -28,9 +28,6 @@ class PumpedLink:
 
     The thread owns the link from ``start`` to ``stop``; before (in the handshake) and after, the
     link may be called directly.
-
-    Args:
-        link: an end that has no port.
     """
 
     def __init__(self, link: Link) -> None:
@@ -49,7 +46,6 @@ class PumpedLink:
         self._thread = threading.Thread(target=self._run, name="pump", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -58,7 +54,6 @@ class PumpedLink:
         self._thread.join()
 
     def send(self, message: bytes) -> bool:
-        """Pass a message to the thread; False if the ring is full."""
         return bool(ring.put(self._loop, np.frombuffer(bytearray(message), np.uint8)))
 
     def receive(self) -> bytes | None:
@@ -73,7 +68,6 @@ class PumpedLink:
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until the thread has received a message (True) or the timeout expires (False)."""
         until = time.monotonic() + seconds
         while not ring.waiting(self._loop):
             if time.monotonic() >= until or self._problem is not None:
@@ -82,7 +76,6 @@ class PumpedLink:
         return True
 
     def close(self) -> None:
-        """Close the wrapped link."""
         self._link.close()
 
     def _run(self) -> None:

@@ -53,9 +53,7 @@ def open_link(name: str, role: Role, endpoint: str, options: dict[str, Any] | No
     """
     try:
         kind = link_kind(name)
-        kind.check_endpoint(endpoint)
-        checked = kind.options.model_validate(options or {})
-        kind.check_both(endpoint, checked)
+        checked = kind.checked(endpoint, options or {})
     except ValueError as problem:
         raise UserError(f"link: {problem}") from None
     return kind.open(role, endpoint, checked)

@@ -14,10 +14,12 @@ A curve that has not been written reads as the one in force.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from gfm_hil.modbus.droops import Gains
 from gfm_hil.modbus.image import Value
 from gfm_hil.modbus.plan import Plan
 from gfm_hil.modbus.view import View
@@ -27,10 +29,6 @@ COMPLETED, FAILED = 1, 2
 _SPAN = 100.0  # %: the two points that show the droop in force have Var = ± this
 _RESOLUTION = 0.015  # %: largest deviation of the line from the reference
 _MINE = 2  # the curve that a client may write
-
-#: points that a client may write in a curve of model 705, and in a control of model 711
-VOLT_VAR = ("ActPt", "VRef", "Pt1.V", "Pt1.Var", "Pt2.V", "Pt2.Var")
-DROOP = ("DbOf", "DbUf", "KOf", "KUf", "RspTms")
 
 #: meaning of a curve: "V_ref" [p.u.], "D_p", "D_q"
 Meaning = dict[str, float]
@@ -48,42 +46,44 @@ class Adopted:
     law: str = ""
 
 
-class Curves:
-    """The part that both models share.
+class Curves(ABC):
+    """What both models share.
 
-    Args:
-        model, curve: ``705, "Crv"`` or ``711, "Ctl"``.
+    Attributes:
+        model, curve: the model's number and its name of a curve.
         stored: paths within the curve of the points that a client may write.
-        read: converts stored values to a meaning; raises ValueError if they are invalid.
-        write: converts a meaning to stored values.
-        events: commands that bring a meaning into force.
-        in_force: the meaning now in force.
     """
 
-    def __init__(
-        self,
-        model: int,
-        curve: str,
-        stored: Sequence[str],
-        read: Callable[[Mapping[str, Value]], Meaning],
-        write: Callable[[Meaning], dict[str, Value]],
-        events: Callable[[Meaning, View], tuple[dict[str, Any], ...]],
-        in_force: Callable[[View], Meaning],
-    ) -> None:
-        self._head, self._adopt = str(model), f"{model}.Adpt{curve}"
-        self._curve = f"{model}.{curve}"
+    model: int
+    curve: str
+    stored: tuple[str, ...]
+
+    def __init__(self, gains: Gains) -> None:
+        self._gains = gains
+        self._head, self._adopt = str(self.model), f"{self.model}.Adpt{self.curve}"
+        self._curve = f"{self.model}.{self.curve}"
         self._stored: dict[str, Value] = {}
-        self._read, self._write, self._events, self._in_force = read, write, events, in_force
-        own = tuple(f"{self._curve}{_MINE}.{name}" for name in stored)
+        own = tuple(f"{self._curve}{_MINE}.{name}" for name in self.stored)
         self.writable = (f"{self._head}.Ena", f"{self._adopt}Req", *own)
         self.state = Adopted()
 
+    @abstractmethod
+    def read(self, stored: Mapping[str, Value]) -> Meaning:
+        """The meaning of stored values; raises ValueError if they are invalid."""
+
+    @abstractmethod
+    def write(self, meaning: Meaning) -> dict[str, Value]:
+        """The stored values of a meaning."""
+
+    @abstractmethod
+    def in_force(self, view: View) -> Meaning:
+        """The meaning now in force."""
+
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """See ``Function``."""
         prefix = f"{self._curve}{_MINE}."
         stored = {p.removeprefix(prefix): v for p, v in written.items() if p.startswith(prefix)}
         stored = {**self._stored, **stored}
-        whole = {**self._write(self._in_force(view)), **stored}
+        whole = {**self.write(self.in_force(view)), **stored}
         new = old = self.state
         events: tuple[dict[str, Any], ...] = ()
 
@@ -96,7 +96,7 @@ class Curves:
             if written[f"{self._adopt}Req"] != _MINE:
                 raise ValueError(f"{self._adopt}Req: must be {_MINE}, the one that can be written")
             try:
-                meaning = self._read(whole)
+                meaning = self.read(whole)
                 self._events(meaning, view)
             except ValueError:
                 fail()
@@ -105,7 +105,7 @@ class Curves:
         if f"{self._head}.Ena" in written:
             new = replace(new, enabled=bool(written[f"{self._head}.Ena"]))
         if new.enabled and not old.enabled:
-            new = replace(new, before=self._in_force(view), law=view.law)
+            new = replace(new, before=self.in_force(view), law=view.law)
         if new.enabled and new.meaning and (adopts or not old.enabled):
             events = self._events(new.meaning, view)
         elif old.enabled and not new.enabled:
@@ -118,12 +118,10 @@ class Curves:
         return Plan(events, keep, fail)
 
     def forget(self) -> None:
-        """Clear the state after a reset: the run is back at its start, without commands."""
         self.state, self._stored = Adopted(), {}
 
     def show(self, view: View, now: float) -> dict[str, Value]:
-        """See ``Function``."""
-        s, there = self.state, self._write(self._in_force(view))
+        s, there = self.state, self.write(self.in_force(view))
         return {
             f"{self._head}.Ena": float(s.enabled),
             f"{self._adopt}Req": float(s.request),
@@ -139,53 +137,77 @@ class Curves:
             return before
         return {name: value for name, value in before.items() if name == "V_ref"}
 
-
-def read_volt_var(stored: Mapping[str, Value]) -> Meaning:
-    """V_ref and D_q of a curve of model 705."""
-    v_ref = _number(stored, "VRef") / 100.0
-    check_reference("V_ref", v_ref)
-    count = _number(stored, "ActPt")
-    if count == 0:
-        return {"V_ref": v_ref}
-    if count != 2:
-        raise ValueError(f"705: ActPt = {count:g}: must be 2, or 0 for VRef alone")
-    (v_a, var_a), (v_b, var_b) = (
-        (_number(stored, f"Pt{k}.V") - 100.0, _number(stored, f"Pt{k}.Var")) for k in (1, 2)
-    )
-    if var_a <= var_b or v_a >= v_b:
-        raise ValueError("705: V must rise and Var must fall from point 1 to point 2")
-    D_q = (v_b - v_a) / (var_a - var_b)
-    if abs(v_a + D_q * var_a) > _RESOLUTION:
-        raise ValueError("705: the line must pass through V = 100 %, Var = 0")
-    return {"V_ref": v_ref, "D_q": D_q}
+    def _events(self, meaning: Meaning, view: View) -> tuple[dict[str, Any], ...]:
+        """The commands for a meaning; gains first, since the run may refuse them."""
+        events: list[dict[str, Any]] = []
+        droops = {name: value for name, value in meaning.items() if name != "V_ref"}
+        if droops:
+            events.append(self._gains.event(view.law, view.gains, droops))
+        if "V_ref" in meaning:
+            events.append({"type": "reference", "V_ref": meaning["V_ref"]})
+        return tuple(events)
 
 
-def write_volt_var(meaning: Meaning) -> dict[str, Value]:
-    """The curve of model 705 for a law's V_ref and D_q."""
-    D_q = meaning.get("D_q")
-    points: dict[str, Value] = {}
-    for k, var in ((1, _SPAN), (2, -_SPAN)):
-        points[f"Pt{k}.V"] = None if D_q is None else 100.0 - D_q * var
-        points[f"Pt{k}.Var"] = None if D_q is None else var
-    active = 0.0 if D_q is None else 2.0
-    return {"ActPt": active, "VRef": 100.0 * meaning["V_ref"], **points}
+class VoltVar(Curves):
+    """Model 705: V_ref and D_q."""
+
+    model, curve = 705, "Crv"
+    stored = ("ActPt", "VRef", "Pt1.V", "Pt1.Var", "Pt2.V", "Pt2.Var")
+
+    def in_force(self, view: View) -> Meaning:
+        D_q = self._gains.droops(view.law, view.gains).D_q
+        return {"V_ref": view.references["V_ref"], **({} if D_q is None else {"D_q": D_q})}
+
+    def read(self, stored: Mapping[str, Value]) -> Meaning:
+        v_ref = _number(stored, "VRef") / 100.0
+        check_reference("V_ref", v_ref)
+        count = _number(stored, "ActPt")
+        if count == 0:
+            return {"V_ref": v_ref}
+        if count != 2:
+            raise ValueError(f"705: ActPt = {count:g}: must be 2, or 0 for VRef alone")
+        (v_a, var_a), (v_b, var_b) = (
+            (_number(stored, f"Pt{k}.V") - 100.0, _number(stored, f"Pt{k}.Var")) for k in (1, 2)
+        )
+        if var_a <= var_b or v_a >= v_b:
+            raise ValueError("705: V must rise and Var must fall from point 1 to point 2")
+        D_q = (v_b - v_a) / (var_a - var_b)
+        if abs(v_a + D_q * var_a) > _RESOLUTION:
+            raise ValueError("705: the line must pass through V = 100 %, Var = 0")
+        return {"V_ref": v_ref, "D_q": D_q}
+
+    def write(self, meaning: Meaning) -> dict[str, Value]:
+        D_q = meaning.get("D_q")
+        points: dict[str, Value] = {}
+        for k, var in ((1, _SPAN), (2, -_SPAN)):
+            points[f"Pt{k}.V"] = None if D_q is None else 100.0 - D_q * var
+            points[f"Pt{k}.Var"] = None if D_q is None else var
+        active = 0.0 if D_q is None else 2.0
+        return {"ActPt": active, "VRef": 100.0 * meaning["V_ref"], **points}
 
 
-def read_droop(stored: Mapping[str, Value]) -> Meaning:
-    """D_p of a control of model 711."""
-    over, under = _number(stored, "KOf"), _number(stored, "KUf")
-    if over != under:
-        raise ValueError(f"711: KOf = {over:g}, KUf = {under:g}: must be equal")
-    for name in ("DbOf", "DbUf", "RspTms"):
-        if _number(stored, name) != 0:
-            raise ValueError(f"711: {name} = {_number(stored, name):g}: must be 0")
-    return {"D_p": over}
+class Droop(Curves):
+    """Model 711: D_p."""
 
+    model, curve = 711, "Ctl"
+    stored = ("DbOf", "DbUf", "KOf", "KUf", "RspTms")
 
-def write_droop(meaning: Meaning) -> dict[str, Value]:
-    """The control of model 711 for a law's D_p."""
-    D_p = meaning.get("D_p")
-    return {"DbOf": 0.0, "DbUf": 0.0, "KOf": D_p, "KUf": D_p, "RspTms": 0.0}
+    def in_force(self, view: View) -> Meaning:
+        D_p = self._gains.droops(view.law, view.gains).D_p
+        return {} if D_p is None else {"D_p": D_p}
+
+    def read(self, stored: Mapping[str, Value]) -> Meaning:
+        over, under = _number(stored, "KOf"), _number(stored, "KUf")
+        if over != under:
+            raise ValueError(f"711: KOf = {over:g}, KUf = {under:g}: must be equal")
+        for name in ("DbOf", "DbUf", "RspTms"):
+            if _number(stored, name) != 0:
+                raise ValueError(f"711: {name} = {_number(stored, name):g}: must be 0")
+        return {"D_p": over}
+
+    def write(self, meaning: Meaning) -> dict[str, Value]:
+        D_p = meaning.get("D_p")
+        return {"DbOf": 0.0, "DbUf": 0.0, "KOf": D_p, "KUf": D_p, "RspTms": 0.0}
 
 
 def _number(stored: Mapping[str, Value], name: str) -> float:

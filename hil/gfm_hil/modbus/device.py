@@ -15,16 +15,8 @@ from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.modbus.connection import CLIENT
-from gfm_hil.modbus.curves import (
-    DROOP,
-    VOLT_VAR,
-    Curves,
-    read_droop,
-    read_volt_var,
-    write_droop,
-    write_volt_var,
-)
-from gfm_hil.modbus.gains import Gains
+from gfm_hil.modbus.curves import Droop, VoltVar
+from gfm_hil.modbus.droops import Gains
 from gfm_hil.modbus.image import VENDOR, Image, Point, Value
 from gfm_hil.modbus.measures import Measures
 from gfm_hil.modbus.operation import Direct, Heartbeat, Operation
@@ -75,9 +67,8 @@ class Device:
         self._heart = Heartbeat(heartbeat_ms)
         self._functions: tuple[Function, ...] = (
             *self._set_points,
-            Curves(705, "Crv", VOLT_VAR, read_volt_var, write_volt_var, self._events,
-                   self._volt_var),
-            Curves(711, "Ctl", DROOP, read_droop, write_droop, self._events, self._droop),
+            VoltVar(self._gains),
+            Droop(self._gains),
             self._heart,
             Operation(),
             Direct(laws, self._gains),
@@ -168,7 +159,7 @@ class Device:
     async def _write(self, address: int, registers: list[int]) -> None:
         cut = self.image.cut(address, registers)
         if cut is None:
-            raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{address}: cuts a point in two, or is none")
+            raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{address}: no whole points")
         for point, _ in cut:
             if not self.writable(point):
                 raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{point.path}: is not for writing")
@@ -229,24 +220,6 @@ class Device:
         view = self._look()
         if view is not None and view.tick != self._seen:
             self._beats, self._seen = self._beats + 1, view.tick
-
-    def _volt_var(self, view: View) -> dict[str, float]:
-        D_q = self._gains.droops(view.law, view.gains).D_q
-        return {"V_ref": view.references["V_ref"], **({} if D_q is None else {"D_q": D_q})}
-
-    def _droop(self, view: View) -> dict[str, float]:
-        D_p = self._gains.droops(view.law, view.gains).D_p
-        return {} if D_p is None else {"D_p": D_p}
-
-    def _events(self, meaning: dict[str, float], view: View) -> tuple[dict[str, Any], ...]:
-        """The commands for a meaning; gains first, since the run may refuse them."""
-        events: list[dict[str, Any]] = []
-        droops = {name: value for name, value in meaning.items() if name in ("D_p", "D_q")}
-        if droops:
-            events.append(self._gains.event(view.law, view.gains, droops))
-        if "V_ref" in meaning:
-            events.append({"type": "reference", "V_ref": meaning["V_ref"]})
-        return tuple(events)
 
 
 def _count(plans: Sequence[Plan]) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gfm_hil.modbus.gains import Gains
+from gfm_hil.modbus.droops import Gains
 from gfm_hil.modbus.image import VENDOR, Value
-from gfm_hil.modbus.plan import Plan
+from gfm_hil.modbus.plan import Function, Plan
 from gfm_hil.modbus.view import View
 from gfm_hil.scenario.events import check_reference
 from gfm_runtime.states import RUNNING
@@ -33,7 +33,6 @@ class Heartbeat:
         self.missing = False
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """See ``Function``."""
         timeout, value = written.get(f"{VENDOR}.HbTms"), written.get("715.ControllerHb")
         if timeout and not _SHORTEST_MS <= float(timeout) <= _LONGEST_MS:
             raise ValueError(
@@ -63,7 +62,6 @@ class Heartbeat:
         self._last, self.missing = None, False
 
     def show(self, view: View, now: float) -> dict[str, Value]:
-        """See ``Function``."""
         return {
             "715.ControllerHb": self._value or 0.0,
             f"{VENDOR}.HbTms": float(self._timeout_ms),
@@ -72,13 +70,12 @@ class Heartbeat:
         }
 
 
-class Operation:
+class Operation(Function):
     """OpCtl and AlarmReset."""
 
     writable = ("715.AlarmReset", "715.OpCtl")
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """See ``Function``; a value that already holds needs no command."""
         reset, control = written.get("715.AlarmReset", 0), written.get("715.OpCtl")
         if reset not in (0, 1):
             raise ValueError(f"AlarmReset = {reset}: must be 1, to reset")
@@ -92,22 +89,13 @@ class Operation:
             return Plan(({"type": "reset"},))
         return Plan()
 
-    def forget(self) -> None:
-        """It remembers nothing."""
-
     def show(self, view: View, now: float) -> dict[str, Value]:
-        """See ``Function``."""
         running = view.state == RUNNING and not view.safe
         return {"715.AlarmReset": 0.0, "715.OpCtl": float(START if running else STOP)}
 
 
-class Direct:
-    """The vendor model's points that act at once: law, voltage reference and droops.
-
-    Args:
-        laws: names of the laws that are ready.
-        gains: gains of these laws.
-    """
+class Direct(Function):
+    """The vendor model's points that act at once: law, voltage reference and droops."""
 
     writable = tuple(f"{VENDOR}.{name}" for name in ("Law", "VRef", "Dp", "Dq"))
 
@@ -115,7 +103,6 @@ class Direct:
         self._laws, self._gains = laws, gains
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """See ``Function``."""
         given = {
             path.partition(".")[2]: float(value)
             for path, value in written.items()
@@ -134,11 +121,7 @@ class Direct:
             events.append(self._gains.event(view.law, view.gains, wanted))
         return Plan(tuple(events))
 
-    def forget(self) -> None:
-        """It remembers nothing."""
-
     def show(self, view: View, now: float) -> dict[str, Value]:
-        """See ``Function``."""
         droops = self._gains.droops(view.law, view.gains)
         return {
             f"{VENDOR}.Law": float(self._laws.index(view.law) + 1),

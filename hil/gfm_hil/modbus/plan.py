@@ -40,16 +40,13 @@ class Function(Protocol):
     @property
     def writable(self) -> tuple[str, ...]:
         """Paths of the points that clients may write."""
-        ...
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
         """The effect of writing these values at the device's time ``now``, s."""
-        ...
 
     def forget(self) -> None:
-        """Clear the state: the run was reset, or another operator commands it."""
-        ...
+        """Clear the state, if any: the run was reset, or another operator commands it."""
+        return
 
     def show(self, view: View, now: float) -> dict[str, Value]:
         """The values of its points."""
-        ...

@@ -62,7 +62,7 @@ class Address:
             raise UserError(f"--port {self.port}: must lie in [0, 65535]")
         if not (address.is_loopback or self.tls or self.anyone):
             raise UserError(
-                f"--host {self.host}: others can reach it, and Modbus asks nobody who he is; use "
+                f"--host {self.host}: others can reach it, and Modbus has no authentication; use "
                 "--tls CERT KEY CLIENT-CA, or --anyone-may-command"
             )
 

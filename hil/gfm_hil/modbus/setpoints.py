@@ -70,7 +70,6 @@ class SetPoint:
         self.settings = Settings(mode=absolute)
 
     def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
-        """See ``Function``."""
         changes: dict[str, Any] = {self._keys[path]: value for path, value in written.items()}
         new = replace(self.settings, **changes)
         if new.mode not in self._modes:
@@ -103,7 +102,6 @@ class SetPoint:
         self.settings = Settings(mode=self._absolute)
 
     def show(self, view: View, now: float) -> dict[str, Value]:
-        """See ``Function``."""
         s = self.settings
         there = view.references[self.reference]
         back = s.before if s.enabled else there

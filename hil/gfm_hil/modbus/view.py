@@ -63,13 +63,7 @@ class View:
 
 
 class Watcher:
-    """Observes a run in progress without load on its loops.
-
-    Args:
-        operator: of the run.
-        folder: the run folder.
-        scenario: the resolved scenario of that run.
-    """
+    """Observes a run in progress without load on its loops."""
 
     def __init__(self, operator: Operator, folder: Path, scenario: Scenario) -> None:
         self._operator, self._run = operator, LiveRun(folder)

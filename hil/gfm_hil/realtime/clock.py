@@ -1,6 +1,6 @@
 """Time for compiled loops: read CLOCK_MONOTONIC, sleep until a deadline, yield.
 
-They are intrinsics around libc, so that they allocate nothing and numba can cache them.
+They call libc directly, so that they allocate nothing and numba can cache them.
 """
 
 from __future__ import annotations
@@ -9,19 +9,14 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
-from gfm_hil.realtime.atomics import pause as _pause
+from gfm_hil.realtime.atomics import intrinsic
+from gfm_hil.realtime.atomics import pause as pause
 from gfm_runtime.compiled import compiled
 
 _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
 _NS = 1_000_000_000
 _SIGKILL = 9
-
-# numba's annotation counts typingctx among the caller's arguments
-_intrinsic: Any = intrinsic
-
-pause: Any = _pause
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _TIMESPEC = ir.LiteralStructType([_I64, _I64])
@@ -30,6 +25,10 @@ _SPINS_A_YIELD = 16  # polls per yield, once a peer that delivers directly is la
 
 #: wake this long before a deadline and spin the rest: a sleep may end this late
 AHEAD_NS = 40_000
+
+#: give_way(): yield the processor
+give_way: Any = types.ExternalFunction("sched_yield", types.int32())
+_raise: Any = types.ExternalFunction("raise", types.int32(types.int32))
 
 
 def _libc(builder: Any, name: str, arguments: list[ir.Type]) -> Any:
@@ -47,7 +46,7 @@ def _field(builder: Any, timespec: Any, k: int) -> Any:
     return builder.gep(timespec, [_I32(0), _I32(k)], inbounds=True)
 
 
-@_intrinsic
+@intrinsic
 def now_ns(typingctx):
     """CLOCK_MONOTONIC in ns, int64."""
 
@@ -61,7 +60,7 @@ def now_ns(typingctx):
     return types.int64(), make
 
 
-@_intrinsic
+@intrinsic
 def sleep_until(typingctx, deadline_ns):
     """Sleep until a time of CLOCK_MONOTONIC, int64 ns; returns at once if it has passed."""
     if not isinstance(deadline_ns, types.Integer):
@@ -79,24 +78,10 @@ def sleep_until(typingctx, deadline_ns):
     return types.int32(types.int64), make
 
 
-@_intrinsic
-def give_way(typingctx):
-    """Yield the processor: sched_yield."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.call(_libc(builder, "sched_yield", []), [])
-
-    return types.int32(), make
-
-
-@_intrinsic
-def end_this_process(typingctx):
+@compiled
+def end_this_process():
     """Kill this process: send SIGKILL to itself."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.call(_libc(builder, "raise", [_I32]), [_I32(_SIGKILL)])
-
-    return types.int32(), make
+    return _raise(_SIGKILL)
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""The record of a run: the table of its columns, and what writes them.
+"""The recording of a run: the table of its columns, its writers and its readers.
 
-``RecordedRun`` reads a run that is over, ``LiveRun`` one that is going on; nothing else does.
+Only ``RecordedRun`` (finished runs) and ``LiveRun`` (runs in progress) read a recording.
 """

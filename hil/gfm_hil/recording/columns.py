@@ -1,8 +1,8 @@
-"""The one table of what a run records: each column's name, symbol, unit and meaning.
+"""The one table of the columns of a recording: each column's name, symbol, unit and meaning.
 
-The signal table says what measurements, commands and references are; this table adds what the
-plant itself, the controller and the two clocks record. Export files, figures, the scope, streams,
-data frames and the documentation take names and units from here.
+The signal table describes measurements, commands and references; this table adds the columns of
+the plant itself, of the controller and of the two clocks. Export files, figures, the scope,
+streams, data frames and the documentation take names and units from here.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def pieces(column: Rows, first: int, last: int) -> Iterator[Any]:
 
 
 class Shown(NamedTuple):
-    """How people read a column: symbol, unit, and by what to multiply what is recorded."""
+    """How to display a column: symbol, unit, and the factor for recorded values."""
 
     symbol: str
     unit: str
@@ -76,9 +76,9 @@ class Described:
         name: of the column in the run folder.
         symbol: as printed, LaTeX; empty for codes and times.
         unit: of what is recorded, with the base of a per-unit value; empty for codes.
-        quantity: what it is, in a few words.
-        origin: who recorded it, in a few words; empty if ``quantity`` says it all.
-        words: what the values of a code mean.
+        quantity: short description.
+        origin: where it was recorded, in short; may be empty.
+        words: meanings of the values of a code.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Described:
 
 
 _SENSOR, _COMMAND, _REFERENCE, _TRUE = (
-    "as the A/D reads it", "command in hand at this tick", "reference in force",
+    "as the A/D reads it", "newest command at this tick", "reference in force",
     "of the plant itself",
 )  # fmt: skip
 _TIMES = {
@@ -181,7 +181,7 @@ def describe(name: str, laws: list[str]) -> Described:
         UserError: there is no such column.
     """
     if name not in TABLE:
-        raise UserError(f"column {name!r}: is none of a recording; there are {[*TABLE]}")
+        raise UserError(f"column {name!r}: unknown; a recording has {[*TABLE]}")
     row = TABLE[name]
     return replace(row, words=tuple(enumerate(laws))) if name == "law" else row
 

@@ -1,6 +1,6 @@
-"""A run that is going on: what both sides have recorded so far, read as they append to it.
+"""A run in progress: reads what both roles have recorded so far.
 
-Reading takes nothing from the loops, which only ever append rows to files that are mapped.
+Reading does not disturb the loops, which only append rows to memory-mapped files.
 """
 
 from __future__ import annotations
@@ -20,12 +20,7 @@ from gfm_runtime.toml_file import read_toml
 
 
 class LiveRun:
-    """The recording of a run as it grows. A side that has not begun to record has no ticks; it is
-    found when it has.
-
-    Args:
-        folder: of the run.
-    """
+    """The growing recording of a run. A role that has not begun to record has no ticks."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -83,6 +78,6 @@ class LiveRun:
 
 
 def begun(folder: Path) -> bool:
-    """Whether a side of a run has begun to record there, and it is known what."""
+    """Whether a role of a run has begun to record in a folder that has the scenario."""
     recorded = any((folder / f"parts/{role}_progress.npy").is_file() for role in ROLES)
     return recorded and (folder / "scenario.toml").is_file()

@@ -1,4 +1,4 @@
-"""The log of a run: one JSON object a line, and how the run ended by what its two roles wrote."""
+"""The log of a run, one JSON object per line, and the outcome that follows from it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ PLANT_LEFT = "the plant ended before the scenario did"
 
 CONTROLLER_LEFT = "the controller was stopped"
 
-_HEARSAY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
+#: reasons with which a role reports what the other role did
+_SECONDARY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
 
 SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
 
@@ -35,7 +36,7 @@ class Outcome:
 def read_log(*paths: Path) -> list[dict[str, Any]]:
     """The lines of one or more logs, in order of their ticks.
 
-    A line that is damaged, as the last one of a side that was killed may be, is left out.
+    It skips damaged lines: the last line of a process that was killed may be incomplete.
     """
     lines: list[dict[str, Any]] = []
     for path in paths:
@@ -49,13 +50,13 @@ def read_log(*paths: Path) -> list[dict[str, Any]]:
 
 
 def read_events(folder: Path) -> list[dict[str, Any]]:
-    """The log of a run folder; while the run goes on, what its sides have written so far."""
+    """The log of a run folder, or of a run in progress what its roles have written so far."""
     whole = folder / "events.jsonl"
     return read_log(whole) if whole.is_file() else read_log(*folder.glob("events_*.jsonl"))
 
 
 def event_text(event: dict[str, Any]) -> str:
-    """What a line of the log says beyond its kind, in a few words."""
+    """The content of a line of the log besides its kind, as a short text."""
     if "label" in event:
         return str(event["label"])
     rest = {k: v for k, v in event.items() if k not in ("tick", "t", "event")}
@@ -66,8 +67,8 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """The content of a run's summary.json.
 
     Raises:
-        FileNotFoundError: the run is not over, or was cut off.
-        UserError: it is no summary.
+        FileNotFoundError: the run is not over, or was killed.
+        UserError: the file is not a summary.
     """
     path = folder / "summary.json"
     try:
@@ -79,15 +80,15 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def cause(reasons: list[str]) -> str:
-    """The first reason that is not just what one side heard of the other; the first if all are."""
-    return next((reason for reason in reasons if reason not in _HEARSAY), reasons[0])
+    """The first reason that does not only report what the other role did, or else the first."""
+    return next((reason for reason in reasons if reason not in _SECONDARY), reasons[0])
 
 
 def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
-    """The outcome that counts among those the sides wrote and the one seen from outside: the most
-    severe, and of two such the one seen from outside, or of the side that it happened to."""
+    """The most severe of the outcomes that the roles wrote and the one seen from ``outside``. Of
+    equally severe ones, that from outside, or that of the role where the cause occurred."""
     ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
     found = [outside, *ends] if outside else ends
     if not found:
         return Outcome("safe", "the run was cut off: no process recorded its end", 0)
-    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _HEARSAY))
+    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))

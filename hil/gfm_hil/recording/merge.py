@@ -1,4 +1,4 @@
-"""Making signals.npz and timing.npz of the parts that the sides left."""
+"""Makes signals.npz and timing.npz from the parts of both roles."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class _Packed:
         self.add(header.getvalue())
 
     def add(self, plain: bytes) -> None:
-        """Append a block of what np.load is to read."""
+        """Append a block of the bytes that np.load will read."""
         self._size, self._crc = self._size + len(plain), zlib.crc32(plain, self._crc)
         self._spool.write(_deflate(plain))
         self._starts.append(self._spool.tell())
@@ -104,8 +104,8 @@ class _Packed:
     def move(self, archive: zipfile.ZipFile, file: BinaryIO, step: int) -> None:
         """Make it a member of an archive in ``file``, in blocks of ``step`` rows.
 
-        zipfile copies what is compressed already as it is; then the member is declared to be what
-        it is, in its own header here and in the directory when the archive is closed.
+        zipfile stores the compressed bytes unchanged. Then this method corrects the member's type,
+        size and CRC: in its header here, and in the directory when the archive is closed.
         """
         info = zipfile.ZipInfo(f"{self._name}.npy")
         self._spool.write(_LAST)
@@ -122,7 +122,7 @@ class _Packed:
 
 
 def _deflate(plain: bytes) -> bytes:
-    """``plain`` as blocks of a deflate stream that depend on nothing before and end nothing."""
+    """``plain`` as blocks of a deflate stream that a reader can decompress alone."""
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
     return packer.compress(plain) + packer.flush(zlib.Z_FULL_FLUSH)
 

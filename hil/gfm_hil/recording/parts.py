@@ -1,7 +1,7 @@
-"""The parts of a run: what each side records, on disk or in memory, from the first tick on.
+"""The parts of a run: the rows that each role records, on disk or in memory.
 
-A side's rows are arrays that are memory-mapped files in the run folder: what it has written
-survives the process, however that ends. In real time the files lie in memory until they are merged.
+The rows of a role are memory-mapped files in the run folder: they survive the process, however it
+ends. In real time the files lie in memory until they are merged.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that link
 @dataclass
 class Part:
     """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
-    ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress``
-    (ticks done; plant: misses, controller: why it is in SAFE) for those who watch."""
+    ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress`` for
+    observers: ticks done; of the plant the misses, of the controller the reason of SAFE."""
 
     signals: NDArray[np.float64]
     times: NDArray[np.int64]
@@ -51,7 +51,7 @@ class Part:
             path = parts / f"{role}_{what}.npy"
             try:
                 array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-                with path.open("r+b") as file:  # a page that is not to be had would end the process
+                with path.open("r+b") as file:  # else a full disk would kill the process later
                     os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
             except OSError as problem:
                 raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
@@ -66,14 +66,13 @@ class Part:
 
     @staticmethod
     def open(folder: Path, role: Role) -> Part | None:
-        """The files of a side as they are, or None if that side never came so far, or one of them
-        is damaged."""
+        """The files of a role, or None if they do not exist or one of them is damaged."""
         try:
             arrays: list[NDArray[Any]] = [
                 np.asarray(np.load(folder / "parts" / f"{role}_{what}.npy", mmap_mode="r"))
                 for what in ("signals", "times", "progress")
             ]
-        except Exception:  # not there, or just being made; numpy has no common base for its errors
+        except Exception:  # missing or incomplete; numpy has no common base for its errors
             return None
         signals, times, progress = arrays
         columns, names = SIGNALS_OF[role], TIMES_OF[role]
@@ -86,13 +85,13 @@ class Part:
 def keep_in_memory(
     folder: Path, ticks: int, notice: Callable[[str], None] = lambda text: None
 ) -> None:
-    """Have the parts of a run lie in memory until they are merged, if there is room.
+    """Keep the parts of a run in memory until they are merged, if there is room.
 
-    A page of a file on a disk is write-protected while it is written back: a loop that touches it
-    waits for the disk. ``folder``/parts becomes a link. Every process of the run calls this, and
-    then holds the place until it removes the parts or ends. What a run whose processes were
-    all killed has left is first moved to its own folder, or stays, and ``notice`` is told where:
-    nothing recorded is lost.
+    The kernel write-protects a page of a file on a disk while it writes it back: a loop that
+    touches the page waits for the disk. ``folder``/parts becomes a link. Every process of the run
+    calls this, and then holds the place until it removes the parts or ends. Parts of a run whose
+    processes were all killed are first moved to the folder of that run. If that is not possible,
+    they stay, and ``notice`` is called with their place: no recording is lost.
 
     Raises:
         UserError: ``folder``/parts is a link, but not one of our user to a place in memory.
@@ -124,7 +123,7 @@ def keep_in_memory(
 
 
 def _rescue(notice: Callable[[str], None]) -> None:
-    """Move parts that no process uses any more to where their run is, if that can be found."""
+    """Move parts that no process uses any more to the folder of their run, if it exists."""
     for place, hold in scratch.left_behind(_PREFIX, _MEMORY):
         with contextlib.suppress(OSError):  # no room, no rights: they stay
             recorded = sorted(_FILES.intersection(path.name for path in place.iterdir()))
@@ -184,9 +183,9 @@ def _move(names: list[str], source: int, run: int, link: str) -> None:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what the sides recorded, wherever it lies.
+    """Remove the parts from disk and memory.
 
-    A process that is killed meanwhile leaves a rest that the next call finds.
+    If the process is killed meanwhile, the next call removes the rest.
     """
     parts = folder / "parts"
     if parts.is_dir():

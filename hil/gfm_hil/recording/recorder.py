@@ -1,4 +1,4 @@
-"""What the loops record in each tick, compiled."""
+"""Recording of a tick, compiled into the loops."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SOON = 8  # rows; a page that is new to the processor would hold up the tick th
 
 @compiled
 def record_sample(row, y, par, st):
-    """What a row of PLANT_COLUMNS knows when the plant is sampled."""
+    """Fill the part of a row of PLANT_COLUMNS that is known when the plant is sampled."""
     prefetch(row.ctypes.data + _SOON * row.nbytes)
     for j in range(NY):
         row[j] = y[j]
@@ -22,7 +22,7 @@ def record_sample(row, y, par, st):
 
 @compiled
 def record_command(row, u):
-    """The rest of the row, once u is in hand."""
+    """Fill the rest of the row when u has come."""
     for j in range(NU):
         row[NY + j] = u[j]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.errors import UserError, lines, need
 from gfm_hil.core.roles import OUR_CONTROLLER
 from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
 from gfm_hil.recording.log import read_events, read_summary
@@ -73,7 +73,7 @@ class RecordedRun:
         scenario: what was run.
         summary: content of summary.json.
         columns: of signals.npz, each shape (ticks,): an array, or a column of the file, of which
-            a slice is read and nothing more.
+            only slices are read.
         laws: labels of the laws, which the column ``law`` refers to.
         events: lines of events.jsonl.
         folder: where it is; None for a run in memory.
@@ -142,7 +142,7 @@ class RecordedRun:
         """What each column of ``recorded`` is, in its order.
 
         Raises:
-            UserError: one is none of a recording.
+            UserError: a column is unknown.
         """
         return [describe(name, self.laws) for name in self.recorded]
 
@@ -173,10 +173,9 @@ class RecordedRun:
         Raises:
             UserError: pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise UserError("to_pandas: needs pandas: pip install 'gfmhil[notebook]'") from None
+        need("pandas", "pandas", "to_pandas", "notebook")
+        import pandas
+
         content = {name: column[:] for name, column in self.columns.items()}
         return pandas.DataFrame(content).set_index("t")
 
@@ -186,10 +185,9 @@ class RecordedRun:
         Raises:
             UserError: xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError:
-            raise UserError("to_xarray: needs xarray: pip install 'gfmhil[notebook]'") from None
+        need("xarray", "xarray", "to_xarray", "notebook")
+        import xarray
+
         units = self.units
         content = {
             name: ("t", column[:], {"units": units[name]})

@@ -1,6 +1,6 @@
-"""What the time stamps of a run tell: slack, round trip, lateness, misses, and percentiles.
+"""Durations from the time stamps of a run: slack, round trip, lateness, misses, percentiles.
 
-A stamp is ns of CLOCK_MONOTONIC; -1 says that it never happened, as deadlines in lockstep.
+A stamp is in ns of CLOCK_MONOTONIC; -1: it never happened, like deadlines in lockstep.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ MISS_NEEDS = ("plant_scheduled", "plant_received")
 
 @dataclass(frozen=True)
 class Spread:
-    """How many ticks took how long.
+    """A histogram of durations, which takes little memory: many ticks have the same duration.
 
     Attributes:
         ns: the different durations in order.
-        count: how many ticks took each. Both take little memory, as ticks outnumber durations.
+        count: number of ticks with each duration.
     """
 
     ns: NDArray[np.int64]
@@ -31,7 +31,7 @@ class Spread:
 
     @staticmethod
     def of(durations: Iterable[NDArray[np.int64]]) -> Spread:
-        """Of durations in ns, in pieces of any length."""
+        """The histogram of durations in ns, given in pieces of any length."""
         ns, count = np.empty(0, np.int64), np.empty(0, np.int64)
         for piece in durations:
             new, many = np.unique(piece, return_counts=True)
@@ -45,7 +45,7 @@ class Spread:
         return int(self.count.sum())
 
     def percentile(self, q: float) -> float:
-        """The percentile of all durations as ``np.percentile`` has it, ns."""
+        """The percentile of all durations, as ``np.percentile`` computes it, ns."""
         behind = np.cumsum(self.count)
         at = q / 100 * (behind[-1] - 1)
         low, high = self.ns[np.searchsorted(behind, [np.floor(at), np.ceil(at)], side="right")]
@@ -60,13 +60,12 @@ class Spread:
 
 @dataclass(frozen=True)
 class Duration:
-    """A time that the loop took or had left in each tick, from one stamp to another.
+    """A duration in each tick, from one stamp to another.
 
     Attributes:
-        name: for labels.
-        meaning: in a few words.
+        name, meaning: for labels.
         begin, end: columns of timing.npz.
-        periods: T_s to be added: the stamp meant at the end is that of so many ticks later.
+        periods: number of T_s to add: the stamp at the end belongs to that many ticks later.
     """
 
     name: str
@@ -77,13 +76,13 @@ class Duration:
 
     @property
     def needs(self) -> tuple[str, str]:
-        """The columns that it is made of."""
+        """The columns from which it is computed."""
         return self.begin, self.end
 
     def us(
         self, columns: Columns, T_s: float, first: int = 0, last: int | None = None
     ) -> NDArray[np.float64]:
-        """Of each of the ticks [first, last), µs; NaN where a stamp is missing."""
+        """The duration in each of the ticks [first, last), µs; NaN where a stamp is missing."""
         begin, end = (columns[name][first:last] for name in self.needs)
         there = (begin >= 0) & (end >= 0)
         found = np.full(len(there), np.nan)
@@ -93,7 +92,7 @@ class Duration:
     def spread(
         self, columns: Columns, T_s: float, first: int = 0, last: int | None = None
     ) -> Spread:
-        """Of those of the ticks [first, last) that have both stamps; read piece by piece."""
+        """The histogram over the ticks [first, last) with both stamps; read piece by piece."""
         last = len(columns[self.end]) if last is None else last
         both = zip(*(pieces(columns[name], first, last) for name in self.needs), strict=True)
         known = ((a, b, (a >= 0) & (b >= 0)) for a, b in both)
@@ -102,7 +101,7 @@ class Duration:
     def _ns(
         self, begin: NDArray[np.int64], end: NDArray[np.int64], T_s: float
     ) -> NDArray[np.int64]:
-        """From stamps that both happened: those of a run that is going on may appear meanwhile."""
+        """The duration from stamps that were both present; a run in progress may add stamps."""
         return end + self.periods * round(T_s * 1e9) - begin
 
 
@@ -114,7 +113,7 @@ LATE = Duration("late", "start of the tick after its deadline", "plant_scheduled
 
 
 def missed(columns: Columns, first: int = 0, last: int | None = None) -> NDArray[np.bool_]:
-    """Which of the ticks [first, last) had a deadline, and no u that came in time."""
+    """Which of the ticks [first, last) had a deadline but no u in time."""
     due, received = (columns[name][first:last] for name in MISS_NEEDS)
     return np.asarray((due >= 0) & (received < 0))
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.links import link_kind, link_names
-from gfm_hil.links.impaired.settings import Impairment
+from gfm_hil.links.impaired import Impairment
 from gfm_hil.scenario.events import (
     Breaker,
     Event,
@@ -72,15 +72,7 @@ class Link(_Model):
             raise ValueError(
                 f"type = {self.type!r}: must be one of {known}{meant(self.type, known)}"
             )
-        kind = link_kind(self.type)
-        if self.endpoint is not None:
-            kind.check_endpoint(self.endpoint)
-        try:
-            options = kind.options.model_validate(self.options)
-        except ValidationError as problem:
-            wrong = lines(problem, kind.options)
-            raise ValueError("; ".join(f"options.{line}" for line in wrong)) from None
-        kind.check_both(self.endpoint, options)
+        link_kind(self.type).checked(self.endpoint, self.options)
         return self
 
 
@@ -158,10 +150,10 @@ class Scenario(_Model):
         description="wait: a trip or a safe state does not end the run; the plant stays blocked "
         "until an event, or an operator, resets both sides to the scenario's start",
     )
-    keep_awake: Literal["auto", "always", "never"] = Field(
+    prevent_idle: Literal["auto", "always", "never"] = Field(
         "auto",
-        description="real time: a thread of idle priority keeps each side's processor from "
-        "resting; auto: on a virtual machine, whose host returns late what has rested",
+        description="real time: a thread of idle priority keeps each side's processor busy; auto: "
+        "on a virtual machine, whose host may return an idle processor late",
     )
     ready_laws: list[str] = Field(
         default_factory=list,

@@ -68,11 +68,6 @@ class Access:
             return host in self._names
         return True
 
-    @property
-    def token(self) -> str:
-        """The first operator's token."""
-        return next(iter(self.tokens.values()))
-
     def operator(self, token: str) -> str:
         """The name of the operator with this token; empty if there is none."""
         given = token.encode()

@@ -22,12 +22,7 @@ Extremes = NDArray[np.float32]
 
 
 class Pyramid:
-    """The extremes of a recording.
-
-    Args:
-        record: the recording.
-        channels: all channels that can be requested.
-    """
+    """The extremes of a recording."""
 
     def __init__(self, record: Record, channels: Sequence[Channel]) -> None:
         self.record, self.channels = record, tuple(channels)

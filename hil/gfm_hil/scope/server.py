@@ -67,12 +67,7 @@ def static_files() -> dict[str, tuple[str, bytes]]:
 
 
 class Scope:
-    """A server for one run.
-
-    Args:
-        record: of the run.
-        access: who may do what.
-    """
+    """A server for one run."""
 
     def __init__(self, record: Record, access: Access) -> None:
         self.record, self.access = record, access

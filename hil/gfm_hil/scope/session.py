@@ -76,12 +76,6 @@ class Session:
     news and of pictures only the newest is kept, and ``run`` sends it when there is room. A page
     that does not read a message within ``SEND_S`` is dropped.
 
-    Args:
-        socket: to the page.
-        pyramid: of the recording.
-        access: the access rules.
-        tell: carries out commands.
-
     Attributes:
         operator: the operator with the page's token; empty: the page may only look.
     """

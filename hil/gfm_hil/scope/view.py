@@ -73,7 +73,7 @@ class View:
             *([look.trigger.channel] if look.trigger else []),
         ]:
             if name not in pyramid:
-                raise ValueError(f"channel = {name!r}: there is none of that name")
+                raise ValueError(f"channel = {name!r}: unknown")
         self._pyramid, self._look = pyramid, look
         self._span = max(2, round(look.span / pyramid.record.T_s))
         self._acquisition = None

@@ -42,9 +42,6 @@ class Rows:
 class Follower:
     """Reads what a run records from now on.
 
-    Args:
-        folder: of a run that has begun.
-
     Attributes:
         run: all that it has recorded.
         over: nothing will be recorded any more.

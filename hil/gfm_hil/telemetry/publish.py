@@ -33,9 +33,6 @@ class Ports:
 class Publisher:
     """Both sockets, bound; use as a context manager.
 
-    Args:
-        ports: to listen on.
-
     Raises:
         UserError: a port cannot be bound.
     """
@@ -59,12 +56,7 @@ class Publisher:
         self._context.destroy(linger=_LINGER_MS)
 
     def follow(self, follower: Follower, rate: float, stopped: Callable[[], bool]) -> int:
-        """Send a run's rows until it ends.
-
-        Args:
-            follower: of the run.
-            rate: samples per second.
-            stopped: whether to end before the run ends.
+        """Send a run's rows, and ``rate`` samples per second, until it ends or ``stopped()``.
 
         Returns:
             How many ticks of the plant (without a plant: of the controller) were sent.

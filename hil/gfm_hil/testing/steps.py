@@ -1,4 +1,8 @@
-"""An experiment's steps as calls, collected until a result is needed, and its results."""
+"""An experiment's steps as calls, collected until a result is needed, and its results.
+
+The steps make a scenario that runs as a whole. So a test is exact: each step belongs to a tick, on
+every link and in real time too, and the scenario file repeats the test's run.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,73 @@ from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, lines
 from gfm_hil.recording.run import Signals
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.testing.plan import Plan
+from gfm_hil.scenario.events import Event
+from gfm_hil.scenario.model import Scenario, check_scenario
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
 from gfm_runtime.signals import REF_NAMES
 
+_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
+
+
+class Plan:
+    """Events and duration of a test, in addition to a scenario's own events."""
+
+    def __init__(self, base: Scenario) -> None:
+        self.base = base
+        self.tick = 0  # of the next step
+        self._steps: list[Any] = []
+
+    def step(self, kind: str, **fields: Any) -> None:
+        """Add an event at the present tick, after the ticks planned so far.
+
+        Raises:
+            UserError: a scenario cannot have such an event.
+        """
+        given = {name: value for name, value in fields.items() if value is not None}
+        try:
+            event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
+        except ValidationError as problem:
+            raise UserError(
+                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, Event))
+            ) from None
+        self._steps.append(event)
+        try:
+            self.scenario(self.tick + 1)  # checks laws, lines and breaker
+        except UserError:
+            self._steps.pop()
+            raise
+
+    def run(self, seconds: float | None) -> None:
+        """Continue for a time, rounded to whole ticks; without one, to the base scenario's end."""
+        T_s = self.base.T_s
+        ticks = self.base.ticks - self.tick if seconds is None else round(seconds / T_s)
+        if ticks < 1:
+            raise UserError(f"seconds = {seconds}: must be at least one tick of {T_s:g} s")
+        self.tick += ticks
+
+    def events(self, ticks: int) -> list[Any]:
+        """The events of the first ``ticks`` ticks in order; within a tick the scenario's first."""
+        T_s = self.base.T_s
+        every = [*self.base.sorted_events(), *self._steps]
+        return sorted((e for e in every if e.at(T_s) < ticks), key=lambda e: e.at(T_s))
+
+    def scenario(self, ticks: int) -> Scenario:
+        """The first ``ticks`` ticks as a scenario.
+
+        Raises:
+            UserError: a step is impossible, for example its law does not exist.
+        """
+        content = self.base.model_dump(exclude_none=True)
+        content["duration"] = ticks * self.base.T_s
+        content["events"] = [e.model_dump(exclude_none=True) for e in self.events(ticks)]
+        return check_scenario(content, self.base.title)
 
 
 class Steps:
@@ -121,19 +182,19 @@ class Steps:
         """Change to another law, of the catalogue or a file, without a bump."""
         plan = self._planned
         if self.setting.controller_command:
-            raise UserError(f"law = {law!r}: a controller of one's own has laws of its own")
+            raise UserError(f"law = {law!r}: the user's controller has its own laws")
         plan.step("law", law=beside(self._near, law))
 
     def gains(self, **values: float) -> None:
         """New gains of the active law, by the names in its file, without a bump: ``D_p=0.02``."""
         if self.setting.controller_command:
-            raise UserError("gains: a controller of one's own has gains of its own")
+            raise UserError("gains: the user's controller has its own gains")
         self._planned.step("gains", values={name: float(v) for name, v in values.items()})
 
     def reset(self) -> None:
         """Return from a trip or the safe state to the start; needs ``after_trip="wait"``."""
         if self.setting.controller_command:
-            raise UserError("reset: a controller of one's own is not ours to reset")
+            raise UserError("reset: gfmhil cannot reset the user's controller")
         self._planned.step("reset")
 
     def run(self, seconds: float | None = None) -> None:
@@ -149,6 +210,11 @@ class Steps:
             self.start()
         assert self._setting is not None
         return self._setting
+
+    @property
+    def _planned(self) -> Plan:
+        _ = self.setting  # starts the experiment
+        return self._plan
 
     @property
     def time(self) -> float:
@@ -207,14 +273,6 @@ class Steps:
             )
         self._run, self._ran = run, plan.tick
         return run
-
-    @property
-    def _planned(self) -> Plan:
-        return self._plan if self._setting is not None else self._begun()
-
-    def _begun(self) -> Plan:
-        self.start()
-        return self._plan
 
 
 def _same(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:

@@ -6,10 +6,40 @@ import secrets
 import socket
 from pathlib import Path
 
+from pydantic import Field
+
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.links.base import Link, LinkKind
-from gfm_hil.links.can.options import LOOPBACK, CanOptions
+from gfm_hil.links.base import Link, LinkKind, LinkOptions
+
+LOOPBACK = "can+udp"  # scheme of endpoints on the loopback bus
+
+
+class CanOptions(LinkOptions):
+    """The table ``link.options``: how to reach the bus and how fast it is.
+
+    SocketCAN uses the bit rates that its interface was set up with (``ip link``); they are
+    repeated here to check the period against the bus time.
+    """
+
+    interface: str = Field("socketcan", description="python-can's name of the backend")
+    fd: bool = Field(True, description="CAN FD, or classic CAN")
+    bitrate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="of arbitration, bit/s")
+    data_bitrate: int = Field(
+        8_000_000, ge=10_000, le=8_000_000, description="of a CAN FD frame's data, bit/s"
+    )
+    every: int = Field(1, ge=1, le=50, description="ticks to an exchange; held in between")
+    dbc: str | None = Field(None, description="DBC file in place of the one of `gfmhil dbc`")
+    heartbeat: int = Field(
+        10_000, ge=1, le=10**9, description="vectors after which a state is said again"
+    )
+    portable: bool = Field(
+        False, description="leave the frames to python-can, where calling the kernel is unwanted"
+    )
+    emulate: bool = Field(
+        False, description="make a virtual bus as late as one of these bit rates; real time only"
+    )
+
 
 _PLACES = 4  # places of a loopback bus: consecutive UDP ports
 
@@ -28,7 +58,7 @@ def _warm_up(options: CanOptions) -> None:
 
 
 def _check(options: CanOptions, T_s: float) -> None:
-    from gfm_hil.links.can.bus_budget import check_budget
+    from gfm_hil.links.can.bus_time import check_budget
 
     check_budget(options, T_s)
 

@@ -2,7 +2,7 @@
 
 Every node computes the same schedule: it knows when it sent, and it sees the others' frames within
 microseconds. While a frame is on the bus, the others wait. The lowest waiting identifier goes
-next; each frame takes its longest time (``frame_time``) and is delivered no earlier than at its
+next; each frame takes its longest time (``bus_time``) and is delivered no earlier than at its
 end. The clock is the wall clock, so the delay matters only in real time: a run in lockstep takes
 longer and gives the same results. Without emulation a frame is delivered as it arrives.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfm_hil.links.can.frame_time import PAYLOADS, classic_time, fd_time
+from gfm_hil.links.can.bus_time import PAYLOADS, frame_time
 from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
 from gfm_hil.realtime.atomics import copy
 from gfm_runtime.compiled import cached
@@ -41,8 +41,7 @@ def set_bus(bus: np.ndarray, fd: bool, bitrate: int, data_bitrate: int) -> None:
     bus["emulate"] = 1
     for length in range(_LONGEST + 1 if fd else 9):
         sent = next(n for n in PAYLOADS if n >= length)
-        time = fd_time(sent, bitrate, data_bitrate) if fd else classic_time(sent, bitrate)
-        bus["time"][0, length] = round(time * 1e9)
+        bus["time"][0, length] = round(frame_time(sent, fd, bitrate, data_bitrate) * 1e9)
 
 
 @cached

@@ -16,6 +16,7 @@ from cantools.database.can import Database, Message
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import (
     COUNTER,
     CRC,
@@ -27,7 +28,6 @@ from gfm_hil.links.can.dbc import (
     read_dbc,
     write_dbc,
 )
-from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.wire import crc8
 from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group, names

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.links.can import LOOPBACK, CanOptions
 from gfm_hil.links.can.emulation import busy, has_room
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
@@ -35,11 +36,8 @@ from gfm_hil.links.can.node import (
     receive,
     room_to_send,
 )
-from gfm_hil.links.can.options import LOOPBACK, CanOptions
 from gfm_hil.links.can.segments import LONGEST, SegmentSender
-from gfm_hil.links.can.sockets import FULL, set_socket
-from gfm_hil.links.can.sockets import LOOPBACK as UDP
-from gfm_hil.links.can.sockets import SOCKETCAN as KERNEL
+from gfm_hil.links.can.sockets import FULL, SOCKETCAN, set_socket
 from gfm_hil.links.can.wire import BRS, FD, frame_dtype, pack, unpack
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
@@ -87,9 +85,9 @@ class CanLink:
     def _reach(self, bus: Any, options: CanOptions) -> None:
         """Let the node use the bus directly, if it is a socket."""
         if isinstance(bus, LoopbackBus):
-            set_socket(self._node.sockets, UDP, bus.fileno(), bus.others())
+            self._node.sockets[:] = bus.record
         elif options.interface == "socketcan":
-            set_socket(self._node.sockets, KERNEL, bus.fileno())
+            set_socket(self._node.sockets, SOCKETCAN, bus.fileno())
         else:
             return
         self.port = can_port(self._node)

@@ -9,20 +9,20 @@ no time and loses frames only when a receiver's buffer overflows; it never leave
 from __future__ import annotations
 
 import contextlib
-import errno
+import os
 import select
 import socket
-import time
 from typing import Any
 
 import can
+import numpy as np
 
-from gfm_hil.links.can.wire import pack, unpack
+from gfm_hil.links.can.sockets import FULL, LOOPBACK, set_socket, socket_dtype, write_frame
+from gfm_hil.links.can.wire import frame_dtype, pack, unpack
 
 NODES = 4
 _HOST = "127.0.0.1"
 _BUFFER = 1 << 20  # bytes; the kernel may grant fewer
-_RECHECK_S = 0.05  # how long to skip a place that was empty
 
 
 class LoopbackBus(can.BusABC):
@@ -43,7 +43,10 @@ class LoopbackBus(can.BusABC):
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         taken = self._take(first, reversed(range(NODES)) if place is None else [place])
-        self._peers = [_Peer(first + k) for k in range(NODES) if k != taken]
+        self._others = [_connected(first + k) for k in range(NODES) if k != taken]
+        self.record = np.zeros(1, socket_dtype)
+        set_socket(self.record, LOOPBACK, self.fileno(), [other.fileno() for other in self._others])
+        self._frame = np.zeros(1, frame_dtype)
         self.channel_info = f"loopback bus at {_HOST}:{first}, place {taken}"
         self._can_protocol = can.CanProtocol.CAN_FD
         super().__init__(channel=channel, **more)
@@ -58,10 +61,13 @@ class LoopbackBus(can.BusABC):
         raise can.CanInitializationError(f"occupied: {_HOST}:{first}")
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame to every other node on the bus."""
-        datagram = pack(msg)
-        for peer in self._peers:
-            peer.send(datagram)
+        """Send a frame to every other node on the bus; a full buffer drops it, like an overrun of
+        a CAN controller."""
+        datagram = np.frombuffer(pack(msg), np.uint8)
+        self._frame.view(np.uint8)[: len(datagram)] = datagram
+        problem = write_frame(self.record, self._frame)
+        if problem and problem not in FULL:
+            raise can.CanOperationError(os.strerror(problem), problem)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         while True:
@@ -77,42 +83,17 @@ class LoopbackBus(can.BusABC):
         """File descriptor for select."""
         return self._socket.fileno()
 
-    def others(self) -> list[int]:
-        """File descriptors of the sockets that are connected to the other places."""
-        return [peer.fileno() for peer in self._peers]
-
     def shutdown(self) -> None:
         """Leave the bus."""
         if not self._is_shutdown:
             super().shutdown()
-            for peer in self._peers:
-                peer.close()
-            self._socket.close()
+            for end in (*self._others, self._socket):
+                end.close()
 
 
-class _Peer:
-    """Another place of the bus; after an empty one, sends are skipped for ``_RECHECK_S``."""
-
-    def __init__(self, port: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._socket.connect((_HOST, port))
-        self._empty_until = 0.0
-
-    def send(self, datagram: bytes) -> None:
-        if self._empty_until and time.monotonic() < self._empty_until:
-            return
-        try:
-            self._socket.send(datagram)
-            self._empty_until = 0.0
-        except ConnectionRefusedError:  # reports the previous datagram, not this one
-            self._empty_until = time.monotonic() + _RECHECK_S
-        except OSError as problem:  # a full buffer is like a CAN controller's overrun: drop
-            if problem.errno not in (errno.EAGAIN, errno.ENOBUFS):
-                raise can.CanOperationError(str(problem), problem.errno) from problem
-
-    def fileno(self) -> int:
-        return self._socket.fileno()
-
-    def close(self) -> None:
-        self._socket.close()
+def _connected(port: int) -> socket.socket:
+    """A socket that sends to another place of the bus."""
+    end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    end.setblocking(False)
+    end.connect((_HOST, port))
+    return end

@@ -7,10 +7,13 @@ and compiled loops use the same node through the same code. The node reads and w
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import Role
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.emulation import (
     PLACES,
     arrive,
@@ -23,7 +26,6 @@ from gfm_hil.links.can.emulation import (
     set_bus,
 )
 from gfm_hil.links.can.layout import Plan
-from gfm_hil.links.can.options import CanOptions
 from gfm_hil.links.can.segments import OTHER_DBC, join, joiner_dtype, set_joiner
 from gfm_hil.links.can.sockets import (
     FULL,
@@ -81,21 +83,13 @@ _SIZES = {
     "into": (frame_dtype, 1),
 }
 _ENDS = np.cumsum([dtype.itemsize * count for dtype, count in _SIZES.values()]) // _WORD
-# where each part after the first begins (the first begins at 0), and the end
-_SOCKETS, _SENDER, _RECEIVER, _JOINER, _SUBRATE, _BUS, _PLACES, _OUT, _INTO, _END = _ENDS.tolist()
 
 
 class Node:
-    """The array and, for Python, views of its parts; see the dtypes.
-
-    Args:
-        plan: of the DBC.
-        role: our side.
-        options: of the link.
-    """
+    """The array and, for Python, views of its parts; see the dtypes."""
 
     def __init__(self, plan: Plan, role: Role, options: CanOptions) -> None:
-        self.handle: NDArray[np.int64] = np.zeros(_END, np.int64)
+        self.handle: NDArray[np.int64] = np.zeros(_ENDS[-1], np.int64)
         parts = np.split(self.handle, _ENDS[:-1])
         views = {
             name: part.view(dtype)
@@ -114,39 +108,21 @@ class Node:
             set_bus(self.bus, options.fd, options.bitrate, options.data_bitrate)
 
 
-@cached
-def _state(handle):
-    return handle[:_SOCKETS].view(state_dtype)
+def _part(name: str) -> Any:
+    """A compiled function that gives a part of the node, as records, from the handle."""
+    k, (dtype, _) = list(_SIZES).index(name), _SIZES[name]
+    first, last = int(_ENDS[k - 1]) if k else 0, int(_ENDS[k])
+
+    @cached
+    def part(handle):
+        return handle[first:last].view(dtype)
+
+    return part
 
 
-@cached
-def _sockets(handle):
-    return handle[_SOCKETS:_SENDER].view(socket_dtype)
-
-
-@cached
-def _subrate(handle):
-    return handle[_SUBRATE:_BUS].view(subrate_dtype)
-
-
-@cached
-def _bus(handle):
-    return handle[_BUS:_PLACES].view(bus_dtype)
-
-
-@cached
-def _places(handle):
-    return handle[_PLACES:_OUT].view(place_dtype)
-
-
-@cached
-def _out(handle):
-    return handle[_OUT:_INTO].view(frame_dtype)
-
-
-@cached
-def _into(handle):
-    return handle[_INTO:_END].view(frame_dtype)
+_state, _sockets, _sender, _receiver, _joiner, _subrate, _bus, _places, _out, _into = map(
+    _part, _SIZES
+)
 
 
 @cached
@@ -156,7 +132,7 @@ def compose(handle, message):
     subrate = _subrate(handle)
     if subrate[0].every > 1 and not goes(subrate, message):
         return 0
-    return encode(handle[_SENDER:_RECEIVER].view(sender_dtype), message, _out(handle))
+    return encode(_sender(handle), message, _out(handle))
 
 
 @cached
@@ -280,8 +256,7 @@ def _from_bus(handle, message):
 @cached
 def _take(handle, state, frame, message):
     """Process a frame; returns the length of the message that it completes, NOTHING, or LOST."""
-    receiver = handle[_RECEIVER:_JOINER].view(receiver_dtype)
-    joiner = handle[_JOINER:_SUBRATE].view(joiner_dtype)
+    receiver, joiner = _receiver(handle), _joiner(handle)
     if frame.id & ERROR:
         state.error_frames += 1
         if frame.id & BUS_OFF:

@@ -44,12 +44,7 @@ joiner_dtype = np.dtype(
 
 
 class SegmentSender:
-    """Cuts one side's messages.
-
-    Args:
-        plan: of the DBC.
-        role: the sender's.
-    """
+    """Cuts one side's messages."""
 
     def __init__(self, plan: Plan, role: Role) -> None:
         self._layout, self._digest, self._number = plan.segment[role], plan.digest, 0

@@ -13,15 +13,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic as _numba_intrinsic
+from numba import carray, types  # type: ignore[attr-defined]
 
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import cached
-
-intrinsic: Any = _numba_intrinsic  # its stubs count typingctx among the caller's arguments
 
 PORTABLE, SOCKETCAN, LOOPBACK = range(3)
 _OTHERS = 3  # places of a loopback bus besides our own
@@ -43,64 +39,18 @@ _NONE_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN)
 _EVENTS = 32  # bit offset of ``events`` in struct pollfd
 
-_I32, _I64 = ir.IntType(32), ir.IntType(64)
-_BYTES = ir.IntType(8).as_pointer()
+# send(2), recv(2) and poll(2) of libc; addresses are int64
+_transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
+_send: Any = types.ExternalFunction("send", _transfer)
+_recv: Any = types.ExternalFunction("recv", _transfer)
+_poll: Any = types.ExternalFunction("poll", types.int32(types.int64, types.int64, types.int32))
+_errno_place: Any = types.ExternalFunction("__errno_location", types.CPointer(types.int32)())
 
 
-def _libc(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
-    known = builder.module.globals.get(name)
-    return known or ir.Function(builder.module, ir.FunctionType(result, arguments), name)
-
-
-def _make_transfer(builder: Any, name: str, arguments: Any) -> Any:
-    fd, address, size = arguments
-    call = _libc(builder, name, _I64, [_I32, _BYTES, _I64, _I32])
-    pointer = builder.inttoptr(address, _BYTES)
-    return builder.call(call, [builder.trunc(fd, _I32), pointer, size, _I32(_DONTWAIT)])
-
-
-@intrinsic
-def _send(typingctx, fd, address, size):
-    """send(2), non-blocking."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _make_transfer(builder, "send", arguments)
-
-    return types.int64(types.int64, types.int64, types.int64), make
-
-
-@intrinsic
-def _recv(typingctx, fd, address, size):
-    """recv(2), non-blocking."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _make_transfer(builder, "recv", arguments)
-
-    return types.int64(types.int64, types.int64, types.int64), make
-
-
-@intrinsic
-def _errno(typingctx):
+@cached
+def _errno():
     """errno of the previous call."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = builder.call(_libc(builder, "__errno_location", _I32.as_pointer(), []), [])
-        return builder.sext(builder.load(place), _I64)
-
-    return types.int64(), make
-
-
-@intrinsic
-def _poll(typingctx, address, ms):
-    """poll(2) of one struct pollfd."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        address, ms = arguments
-        call = _libc(builder, "poll", _I32, [_BYTES, _I64, _I32])
-        pointer = builder.inttoptr(address, _BYTES)
-        return builder.call(call, [pointer, _I64(1), builder.trunc(ms, _I32)])
-
-    return types.int32(types.int64, types.int64), make
+    return np.int64(carray(_errno_place(), 1)[0])
 
 
 def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = ()) -> None:
@@ -115,14 +65,14 @@ def write_frame(sockets, frame):
     s, address = sockets[0], frame.ctypes.data
     if s.kind == SOCKETCAN:
         size = MTU_FD if frame[0].flags & FD else MTU
-        return 0 if _send(s.fd, address, size) == size else _errno()
+        return 0 if _send(s.fd, address, size, _DONTWAIT) == size else _errno()
     problem = 0
     size = HEAD + frame[0].length
     for k in range(_OTHERS):
         if s.empty_until[k] != 0 and now_ns() < s.empty_until[k]:
             continue
         s.empty_until[k] = 0
-        if _send(s.others[k], address, size) != size:
+        if _send(s.others[k], address, size, _DONTWAIT) != size:
             why = _errno()
             if why == errno.ECONNREFUSED:  # reports the previous datagram, not this one
                 s.empty_until[k] = now_ns() + _RECHECK_NS
@@ -135,7 +85,7 @@ def write_frame(sockets, frame):
 def read_frame(sockets, frame):
     """Receive into the frame in an array of ``wire.frame_dtype``; returns 1, 0 if none is there,
     or the negative errno."""
-    got = _recv(sockets[0].fd, frame.ctypes.data, MTU_FD)
+    got = _recv(sockets[0].fd, frame.ctypes.data, MTU_FD, _DONTWAIT)
     if got < 0:
         why = _errno()
         return 0 if why in _NONE_NOW else -why
@@ -147,4 +97,4 @@ def read_frame(sockets, frame):
 @cached
 def sleep_for_frame(sockets, ms):
     """Sleep until the socket is readable, at most ``ms``."""
-    _poll(sockets.ctypes.data + _POLL_AT, ms)
+    _poll(sockets.ctypes.data + _POLL_AT, 1, ms)

@@ -13,18 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from gfm_hil.core.roles import Role
-from gfm_hil.links.can.wire import (
-    MOST,
-    SEQUENCE,
-    STATE,
-    TICK,
-    begins_with,
-    number,
-    put_number,
-    seal,
-    size_and_head,
-    undamaged,
-)
+from gfm_hil.links.can import wire
 from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group
 from gfm_runtime.states import RUNNING, STOPPED
@@ -32,7 +21,7 @@ from gfm_runtime.states import RUNNING, STOPPED
 NOTHING = -1
 
 _KEPT = 4  # commands stored: the one in force, its successor, and early ones
-_ROOM = (MOST + 7) // 8 * 8
+_ROOM = (wire.MOST + 7) // 8 * 8
 _LOW = 0xFFFF_FFFF
 
 subrate_dtype = np.dtype(
@@ -66,16 +55,16 @@ def set_subrate(subrate: np.ndarray, role: Role, every: int) -> None:
     groups: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
     s["every"], s["plant"] = every, plant
     for k, group in enumerate(groups):
-        s["size"][k], s["head"][k] = size_and_head(group)
+        s["size"][k], s["head"][k] = wire.size_and_head(group)
     s["ordinary"] = (0, RUNNING) if plant else (RUNNING, 0)
     s["due"] = s["asked"] = s["given"] = s["ticks"] = NOTHING
 
 
 @cached
 def _good(s, whose, message, size):
-    if size != s.size[whose] or not begins_with(s.head[whose], message):
+    if size != s.size[whose] or not wire.begins_with(s.head[whose], message):
         return False
-    return undamaged(message, size)
+    return wire.undamaged(message, size)
 
 
 @cached
@@ -84,17 +73,17 @@ def goes(subrate, message):
     s = subrate[0]
     if not _good(s, 0, message, len(message)):
         return True
-    tick = s.asked = number(message, TICK, 8)
-    s.due = NOTHING if message[STATE] == STOPPED else tick  # a leaving plant needs no command
-    return tick % s.every == 0 or message[STATE] != s.ordinary[0]
+    tick = s.asked = wire.number(message, wire.TICK, 8)
+    s.due = NOTHING if message[wire.STATE] == STOPPED else tick  # a leaving plant needs no command
+    return tick % s.every == 0 or message[wire.STATE] != s.ordinary[0]
 
 
 @cached
 def _under(message, size, tick, sequence):
     """Rewrite a frame's tick and sequence."""
-    put_number(message, TICK, 8, tick)
-    put_number(message, SEQUENCE, 4, sequence & _LOW)
-    seal(message, size)
+    wire.put_number(message, wire.TICK, 8, tick)
+    wire.put_number(message, wire.SEQUENCE, 4, sequence & _LOW)
+    wire.seal(message, size)
     return size
 
 
@@ -111,7 +100,7 @@ def made(subrate, message):
         s.last[:size] = s.next[:size]
         return size
     message[:size] = s.last[:size]
-    tick, sequence = number(s.next, TICK, 8), number(s.next, SEQUENCE, 4)
+    tick, sequence = wire.number(s.next, wire.TICK, 8), wire.number(s.next, wire.SEQUENCE, 4)
     return _under(message, size, tick - s.left, sequence - s.left)
 
 
@@ -130,7 +119,7 @@ def _measurement(subrate, message, size):
     s = subrate[0]
     missing = 0
     if s.has:
-        missing = number(message, TICK, 8) - number(s.last, TICK, 8) - 1
+        missing = wire.number(message, wire.TICK, 8) - wire.number(s.last, wire.TICK, 8) - 1
     s.has = 1
     if missing <= 0:
         s.last[:size] = message[:size]
@@ -142,7 +131,7 @@ def _measurement(subrate, message, size):
 
 @cached
 def _command(s, message, size):
-    tick, sequence = number(message, TICK, 8), number(message, SEQUENCE, 4)
+    tick, sequence = wire.number(message, wire.TICK, 8), wire.number(message, wire.SEQUENCE, 4)
     free, oldest = -1, 0
     for k in range(_KEPT + 1):
         if s.ticks[k] == tick:  # a repeat: the reader too gets a repeated frame
@@ -150,7 +139,7 @@ def _command(s, message, size):
             return _under(message, size, tick, s.given)
         if s.ticks[k] == NOTHING:
             free = k
-    if message[STATE] != s.ordinary[1] or not s.asked - _KEPT * s.every <= tick <= s.asked:
+    if message[wire.STATE] != s.ordinary[1] or not s.asked - _KEPT * s.every <= tick <= s.asked:
         return _under(message, size, tick, s.given + 1)
     s.ticks[free], s.sequences[free] = tick, sequence - s.again
     s.commands[free * _ROOM : free * _ROOM + size] = message[:size]

@@ -18,28 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfm_hil.links.can import wire
 from gfm_hil.links.can.dbc import SENDERS
 from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
-from gfm_hil.links.can.wire import (
-    BRS,
-    CRC_BYTES,
-    FD,
-    FIRST,
-    REASON,
-    SEQUENCE,
-    SPARE,
-    STATE,
-    TICK,
-    VALUES,
-    begins_with,
-    crc8,
-    frame_dtype,
-    number,
-    put_number,
-    seal,
-    size_and_head,
-    undamaged,
-)
 from gfm_hil.realtime.atomics import copy
 from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Group
@@ -48,7 +29,7 @@ from gfm_runtime.signals import Group
 CanFrame = tuple[int, bytes]
 
 NOTHING = -1
-PARTS = VALUES  # most CAN frames of a vector
+PARTS = wire.VALUES  # most CAN frames of a vector
 
 _SEQUENCES = 64  # range of the counter's six bits
 _LAG, _MARK = 0x40, 0x80  # its other bits
@@ -64,10 +45,10 @@ _TABLE = [
     ("length", "i8", (PARTS,)),
     ("data_id", "i8", (PARTS,)),
     ("first", "i8", (PARTS + 1,)),
-    ("index", "i8", (VALUES,)),
-    ("start", "i8", (VALUES,)),
-    ("scale", "f8", (VALUES,)),
-    ("offset", "f8", (VALUES,)),
+    ("index", "i8", (wire.VALUES,)),
+    ("start", "i8", (wire.VALUES,)),
+    ("scale", "f8", (wire.VALUES,)),
+    ("offset", "f8", (wire.VALUES,)),
     ("status_number", "i8"),
     ("status_length", "i8"),
     ("status_data_id", "i8"),
@@ -86,7 +67,7 @@ sender_dtype = np.dtype(
         ("tick", "i8"),  # sent last
         ("ticks", "i8"),  # number of ticks that still send a status with the values
         ("saturated", "i8"),  # values that lay outside 16 bits
-        ("values", "f8", (VALUES,)),
+        ("values", "f8", (wire.VALUES,)),
     ]
 )
 receiver_dtype = np.dtype(
@@ -99,7 +80,7 @@ receiver_dtype = np.dtype(
         ("counter", "i8"),  # of the vector being assembled
         ("have", "i8"),  # its received parts, a bit mask
         ("incomplete", "i8"),  # vectors without one of their parts or their status
-        ("values", "f8", (VALUES,)),
+        ("values", "f8", (wire.VALUES,)),
     ]
 )
 
@@ -119,8 +100,8 @@ def set_receiver(receiver: np.ndarray, plan: Plan, group: Group) -> None:
 
 def _set_table(record: np.ndarray, plan: Plan, group: Group) -> None:
     r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
-    r["parts"], r["flags"] = len(parts), plan.fd * (FD | BRS)
-    r["size"], r["head"] = size_and_head(group)
+    r["parts"], r["flags"] = len(parts), plan.fd * (wire.FD | wire.BRS)
+    r["size"], r["head"] = wire.size_and_head(group)
     done = 0
     for k, part in enumerate(parts):
         r["number"][k], r["length"][k], r["data_id"][k] = part.number, part.length, part.data_id
@@ -149,13 +130,13 @@ def encode(sender, message, frames):
         How many; NOTHING if the message is not a frame of this vector.
     """
     s, size = sender[0], len(message)
-    if size != s.size or not begins_with(s.head, message):
+    if size != s.size or not wire.begins_with(s.head, message):
         return NOTHING
-    state, reason = np.int64(message[STATE]), np.int64(message[REASON])
-    sequence, tick = number(message, SEQUENCE, 4), number(message, TICK, 8)
+    state, reason = np.int64(message[wire.STATE]), np.int64(message[wire.REASON])
+    sequence, tick = wire.number(message, wire.SEQUENCE, 4), wire.number(message, wire.TICK, 8)
     lag = (sequence - tick) & _LOW
-    copy(s.values.ctypes.data, message.ctypes.data + FIRST, size - FIRST - CRC_BYTES)
-    good = undamaged(message, size)
+    copy(s.values.ctypes.data, message.ctypes.data + wire.FIRST, size - wire.FIRST - wire.CRC_BYTES)
+    good = wire.undamaged(message, size)
     if good:
         if tick != s.tick and s.ticks > 0:
             s.ticks -= 1
@@ -169,11 +150,11 @@ def encode(sender, message, frames):
         _head(frames[0], s.status_number, s.status_length, s.flags)
         data = frames[0].data[: s.status_length]
         data[:] = 0
-        put_number(data, s.status_at[0], s.status_width[0], state)
-        put_number(data, s.status_at[1], s.status_width[1], reason)
-        put_number(data, s.status_at[2], s.status_width[2], tick)
+        wire.put_number(data, s.status_at[0], s.status_width[0], state)
+        wire.put_number(data, s.status_at[1], s.status_width[1], reason)
+        wire.put_number(data, s.status_at[2], s.status_width[2], tick)
         data[1] = counter
-        data[0] = crc8(s.status_data_id, data)
+        data[0] = wire.crc8(s.status_data_id, data)
         count, s.since = 1, 0
     s.since += 1
     for k in range(s.parts):
@@ -223,7 +204,7 @@ def decode(receiver, frame, message):
         if r.number[k] == frame.id:
             part, length, data_id = k, r.length[k], r.data_id[k]
     data = frame.data[: frame.length]
-    if len(data) != length or data[0] != crc8(data_id, data):
+    if len(data) != length or data[0] != wire.crc8(data_id, data):
         message[: r.size] = 0  # a CRC of 0 is wrong for it
         return r.size
     if part < 0:
@@ -238,11 +219,11 @@ def _learn(r, data):
     if sequence < r.sequence:
         return
     tick = r.sequence - r.lag
-    said = number(data, r.status_at[2], r.status_width[2])
+    said = wire.number(data, r.status_at[2], r.status_width[2])
     tick += (said - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
     r.lag, r.said = sequence - tick, sequence
     for k in range(2):
-        r.told[k] = number(data, r.status_at[k], r.status_width[k])
+        r.told[k] = wire.number(data, r.status_at[k], r.status_width[k])
 
 
 @cached
@@ -271,13 +252,15 @@ def _put(r, part, data, message):
         r.incomplete += 1
         return NOTHING
     r.sequence = max(r.sequence, sequence)
-    put_number(message, 0, STATE, r.head)
-    message[STATE], message[REASON] = r.told[0], r.told[1]
-    put_number(message, SPARE, SEQUENCE - SPARE, 0)
-    put_number(message, SEQUENCE, 4, sequence & _LOW)
-    put_number(message, TICK, 8, sequence - r.lag)  # negative: reads as ≥ 2**63, refused
-    copy(message.ctypes.data + FIRST, r.values.ctypes.data, r.size - FIRST - CRC_BYTES)
-    seal(message, r.size)
+    wire.put_number(message, 0, wire.STATE, r.head)
+    message[wire.STATE], message[wire.REASON] = r.told[0], r.told[1]
+    wire.put_number(message, wire.SPARE, wire.SEQUENCE - wire.SPARE, 0)
+    wire.put_number(message, wire.SEQUENCE, 4, sequence & _LOW)
+    wire.put_number(message, wire.TICK, 8, sequence - r.lag)  # negative: reads as ≥ 2**63, refused
+    copy(
+        message.ctypes.data + wire.FIRST, r.values.ctypes.data, r.size - wire.FIRST - wire.CRC_BYTES
+    )
+    wire.seal(message, r.size)
     return r.size
 
 
@@ -293,7 +276,7 @@ class VectorSender:
     def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
         self.record = np.zeros(1, sender_dtype)
         set_sender(self.record, plan, group, heartbeat)
-        self._frames = np.zeros(PARTS + 1, frame_dtype)
+        self._frames = np.zeros(PARTS + 1, wire.frame_dtype)
 
     def frames(self, message: bytes) -> list[CanFrame]:
         """The CAN frames of a frame of the bench, in the order in which to send them."""

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import carray, types  # type: ignore[attr-defined]
-from numba.extending import intrinsic
 
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links.base import Link
-from gfm_hil.links.impaired.settings import Impairment
+from gfm_hil.links.impaired import Impairment
 from gfm_hil.links.impaired.stage import (
     COUNTED,
     INNER,
@@ -25,7 +24,8 @@ from gfm_hil.links.impaired.stage import (
     waiting,
 )
 from gfm_hil.links.port import Port, port_function
-from gfm_hil.links.pump import PumpedLink, ported
+from gfm_hil.links.pump import ported
+from gfm_hil.realtime.atomics import intrinsic
 
 
 class ImpairedLink:
@@ -51,7 +51,6 @@ class ImpairedLink:
         return {**counts, "waiting": int(waiting(self._stage))}
 
     def send(self, message: bytes) -> bool:
-        """Send over the wrapped link; count a message that it has no room for."""
         sent = self._link.send(message)
         self._stage[REFUSED] += not sent
         return sent
@@ -70,19 +69,12 @@ class ImpairedLink:
         """Sleep until the wrapped link has a message, at most 1 ms: a delayed one may be due."""
         return self._link.wait(min(seconds, 0.001))
 
-    def start(self) -> None:
-        """Start the thread of the wrapped link, if it has one."""
-        if isinstance(self._link, PumpedLink):
-            self._link.start()
-
-    def stop(self) -> None:
-        """Stop that thread."""
-        if isinstance(self._link, PumpedLink):
-            self._link.stop()
-
     def close(self) -> None:
-        """Close the wrapped link."""
         self._link.close()
+
+    def __getattr__(self, name: str) -> Any:
+        """Other methods of the wrapped link, see ``Link``."""
+        return getattr(self._link, name)
 
 
 def warm_up() -> None:
@@ -95,16 +87,13 @@ def warm_up() -> None:
 
 
 @intrinsic
-def _pointer(typingctx: Any, address: Any) -> Any:
+def _pointer(typingctx, address):
     """Convert an int64 address to a pointer for ``carray``."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
 
     return types.voidptr(types.int64), make
-
-
-_as_pointer: Any = _pointer
 
 
 def _port(inner: Port, stage: np.ndarray) -> Port:
@@ -121,13 +110,13 @@ def _functions(inner_send: Any, inner_receive: Any) -> tuple[Any, Any]:
     """
 
     def send(handle, message):
-        under = carray(_as_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
+        under = carray(_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
         sent = inner_send(under, message)
         handle[REFUSED] += sent == 0
         return sent
 
     def receive(handle, message):
-        under = carray(_as_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
+        under = carray(_pointer(handle[INNER]), handle[INNER_WORDS], np.int64)
         size = release(handle, message)
         while size == 0:
             came = inner_receive(under, message)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.links.impaired.settings import Impairment
+from gfm_hil.links.impaired import Impairment
 from gfm_hil.realtime.clock import end_this_process, now_ns
 from gfm_runtime.compiled import cached
 

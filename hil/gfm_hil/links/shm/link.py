@@ -42,7 +42,6 @@ class ShmLink:
         self._open()
 
     def send(self, message: bytes) -> bool:
-        """Send a message of 1 to 504 bytes; False if the peer has no room or is not there."""
         if len(message) > LONGEST or not self._there():
             return False
         room = self._message[: len(message)]
@@ -50,13 +49,10 @@ class ShmLink:
         return bool(ring.put(self._handle, room))
 
     def receive(self) -> bytes | None:
-        """The next message, or None."""
         size = self._there() and ring.take(self._handle, self._message)
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a message has arrived, at most ``seconds``; polls at least once a
-        millisecond, and more often at first."""
         until = time.monotonic() + seconds
         step = _FIRST_S
         while not (self._there() and ring.waiting(self._handle)):
@@ -76,7 +72,6 @@ class ShmLink:
             (segment.remove if self._role == "controller" else segment.leave)(mine)
 
     def connected(self) -> bool:
-        """Whether the other side has its end of the memory open."""
         if self._role == "controller":
             return self._segment is not None and segment.has_plant(self._segment)
         return self._there()

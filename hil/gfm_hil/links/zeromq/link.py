@@ -137,7 +137,6 @@ class ZmqLink:
         return self._open and bool(self._socket.poll(0, zmq.POLLOUT))
 
     def send(self, message: bytes) -> bool:
-        """Send a message of at most 504 bytes; False if the peer has no room or is not there."""
         if len(message) > LONGEST or not self._there():
             return False
         try:
@@ -147,14 +146,12 @@ class ZmqLink:
         return True
 
     def receive(self) -> bytes | None:
-        """The next message, or None."""
         if self._there():
             with contextlib.suppress(zmq.Again):
                 return self._socket.recv(zmq.NOBLOCK)
         return None
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a message has arrived, at most ``seconds`` (at least one millisecond)."""
         until = time.monotonic() + seconds
         while not self._there():
             left = until - time.monotonic()

@@ -13,9 +13,9 @@ import numpy as np
 import zmq
 from llvmlite import ir
 from numba import njit, types
-from numba.extending import intrinsic
 
 from gfm_hil.links.port import Port, free_port_function
+from gfm_hil.realtime.atomics import intrinsic
 from gfm_runtime.compiled import FREE
 
 #: elements of a port's handle: zmq_send, zmq_recv and the socket, as addresses; 0 once closed
@@ -60,7 +60,8 @@ def _functions() -> tuple[int, int] | None:
     return (send, receive) if send and receive else None
 
 
-def _make_transfer(typingctx, address, socket, message, size, flags):
+@intrinsic
+def _transfer(typingctx, address, socket, message, size, flags):
     """Call zmq_send or zmq_recv at an address; addresses and sizes are int64; returns int32."""
     int64 = ir.IntType(64)
     pointer = ir.IntType(8).as_pointer()
@@ -73,9 +74,6 @@ def _make_transfer(typingctx, address, socket, message, size, flags):
         return builder.call(function, [*pointers, size, builder.trunc(flags, ir.IntType(32))])
 
     return types.int32(*[types.int64] * 5), make
-
-
-_transfer: Any = intrinsic(_make_transfer)
 
 
 @free_port_function

@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.layout import Plan, load_plan
-from gfm_hil.links.can.options import CanOptions
-from gfm_hil.links.can.vectors import PARTS, CanFrame, encode, sender_dtype, set_sender
-from gfm_hil.links.can.wire import frame_dtype
+from gfm_hil.links.can.vectors import CanFrame, VectorSender
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.recording.run import RecordedRun
 from gfm_runtime.signals import Group, names
@@ -79,41 +78,18 @@ def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
     return heapq.merge(*roles, key=lambda timed: timed[0])
 
 
-class _Sender:
-    """One side's frames, as its node on the bus makes them.
-
-    Args:
-        plan: of the DBC.
-        group: ``"y"`` or ``"u"``.
-        heartbeat: vectors after which the state is said again.
-    """
-
-    def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
-        self._writer = FrameWriter(group)
-        self._record, self._frames = np.zeros(1, sender_dtype), np.zeros(PARTS + 1, frame_dtype)
-        set_sender(self._record, plan, group, heartbeat)
-
-    def pack(self, tick: int, state: int, reason: int, values: NDArray[np.float64]) -> None:
-        """Make the bench's frame of a tick."""
-        self._writer.pack(tick, state, reason, values)
-
-    def frames(self) -> list[CanFrame]:
-        """The CAN frames of the frame packed last, which count as sent."""
-        count = encode(self._record, self._writer.message, self._frames)
-        return [(int(f["id"]), f["data"][: f["length"]].tobytes()) for f in self._frames[:count]]
-
-
 def _measurements(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
-    sender, clock = _Sender(plan, "y", options.heartbeat), _Clock(run, "plant")
+    writer, sender = FrameWriter("y"), VectorSender(plan, "y", options.heartbeat)
+    clock = _Clock(run, "plant")
     for first, last in _pieces(run):
         rows, times = _vector(run, "y", first, last), clock.times(first, last)
         tripped = run.recorded["true_trip"][first:last] != 0
         for k, row in enumerate(rows, first):
             state, reason = (SAFE, PLANT_TRIP) if tripped[k - first] else (INIT, 0)
-            sender.pack(k, state, reason, row)
+            message = writer.pack(k, state, reason, row)
             if k % options.every == 0 and not np.isnan(row[0]):
-                yield from ((times[k - first], frame) for frame in sender.frames())
+                yield from ((times[k - first], frame) for frame in sender.frames(message))
 
 
 def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
@@ -121,7 +97,8 @@ def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Tim
 
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
     """
-    sender, n = _Sender(plan, "u", options.heartbeat), options.every
+    writer, sender = FrameWriter("u"), VectorSender(plan, "u", options.heartbeat)
+    n = options.every
     clock, reasons = _Clock(run, "controller"), _SafeReasons(run)
     for first, last in _pieces(run):
         times, state = clock.times(first, last), run.recorded["state"][first:last]
@@ -133,9 +110,9 @@ def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Tim
             known = at < len(rows) and bool(taken[at])
             now = int(state[j])
             values = rows[at] if known else np.zeros(rows.shape[1])
-            sender.pack(k, now, reasons.at(k) if now == SAFE else 0, values)
+            message = writer.pack(k, now, reasons.at(k) if now == SAFE else 0, values)
             if k % n == 0:
-                frames = sender.frames()
+                frames = sender.frames(message)
                 if known:
                     yield from ((times[j], frame) for frame in frames)
 

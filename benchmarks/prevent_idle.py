@@ -1,6 +1,6 @@
-"""Misses in real time with the processors kept awake and left to rest, in interleaved rounds.
+"""Misses in real time without and with ``prevent_idle`` of the scenario, in interleaved rounds.
 
-Both are the product over a link, two processes at 10 kHz; see ``keep_awake`` of a scenario.
+All are runs of the bench over a link, with two processes at 10 kHz.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ WAYS = ("never", "always")
 def misses(link: str, way: str, seconds: float, folder: Path) -> int:
     """Ticks without a fresh u in one run."""
     content = {
-        "title": f"{link}, keep_awake = {way}",
+        "title": f"{link}, prevent_idle = {way}",
         "duration": seconds,
         "mode": "realtime",
-        "keep_awake": way,
+        "prevent_idle": way,
         "link": {"type": link, "peer_timeout_s": 5.0},
         "late_policy": {"hold": 10**9},
     }
@@ -46,7 +46,7 @@ def measure(links: list[str], seconds: float, rounds: int) -> list[dict[str, obj
     return [
         {
             "link": link,
-            "keep_awake": way,
+            "prevent_idle": way,
             "ticks": ticks * rounds,
             "missed_pct": round(100 * sum(counts) / (ticks * rounds), 4),
             "median_of_a_run_pct": round(100 * statistics.median(counts) / ticks, 4),
@@ -69,7 +69,7 @@ def main() -> None:
         print(json.dumps(rows, indent=2))
         return
     for row in rows:
-        name = f"{row['link']}, {row['keep_awake']}"
+        name = f"{row['link']}, {row['prevent_idle']}"
         print(
             f"{name:12} {row['missed_pct']:8} % of {row['ticks']:,} missed, "
             f"median of a run {row['median_of_a_run_pct']} %"

@@ -1,16 +1,17 @@
-"""A processor is kept from going idle, and released again."""
+"""A thread of idle priority keeps a processor busy, and ends with its context."""
 
 from __future__ import annotations
 
 import os
 import threading
-import time
 from pathlib import Path
 
 import pytest
 
-from gfm_hil.realtime import prevent_idle as awake
-from gfm_hil.realtime.prevent_idle import kept_awake
+from gfm_hil.realtime import prevent_idle as module
+from gfm_hil.realtime.prevent_idle import prevent_idle
+
+from ..support.processes import wait_for
 
 pytestmark = pytest.mark.processes
 
@@ -19,7 +20,7 @@ _IDLE = 5  # SCHED_IDLE
 
 
 def spinner() -> threading.Thread | None:
-    return next((t for t in threading.enumerate() if t.name == "awake"), None)
+    return next((t for t in threading.enumerate() if t.name == "prevent-idle"), None)
 
 
 def used_s(thread: threading.Thread) -> float:
@@ -30,23 +31,20 @@ def used_s(thread: threading.Thread) -> float:
 
 def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
     policy, affinity = os.sched_getscheduler(0), os.sched_getaffinity(0)
-    with kept_awake(HERE, "always") as kept:
-        assert kept
+    with prevent_idle(HERE, "always") as busy:
+        assert busy
         thread = spinner()
         assert thread is not None and thread.native_id is not None
         assert os.sched_getscheduler(thread.native_id) == _IDLE
         assert os.sched_getaffinity(thread.native_id) == {HERE}
-        until = time.monotonic() + 60
-        while used_s(thread) < 0.05:  # on a crowded machine it gets little time
-            assert time.monotonic() < until
-            time.sleep(0.05)
+        wait_for(lambda: used_s(thread) >= 0.05)  # on a crowded machine it gets little time
     thread.join(60)
     assert not thread.is_alive()
     assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == (policy, affinity)
 
 
 @pytest.mark.parametrize(
-    ("processor", "wanted", "machine", "kept"),
+    ("processor", "wanted", "machine", "busy"),
     [
         (HERE, "auto", "KVM", True),
         (HERE, "auto", "no", False),
@@ -54,15 +52,15 @@ def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
         (None, "always", "KVM", False),
     ],
 )
-def test_where_it_is_wanted(processor, wanted, machine, kept, monkeypatch) -> None:
-    monkeypatch.setattr(awake, "virtual_machine", lambda: machine)
-    with kept_awake(processor, wanted) as found:
-        assert found is kept
-        assert (spinner() is not None) is kept
+def test_where_it_is_wanted(processor, wanted, machine, busy, monkeypatch) -> None:
+    monkeypatch.setattr(module, "virtual_machine", lambda: machine)
+    with prevent_idle(processor, wanted) as found:
+        assert found is busy
+        assert (spinner() is not None) is busy
 
 
 def test_without_the_policy_it_goes_on_without(monkeypatch) -> None:
-    monkeypatch.setattr(awake, "_never_rest", lambda flags: None)  # as if refused
-    monkeypatch.setattr(awake, "warm_up", lambda: None)
-    with kept_awake(HERE, "always") as kept:
-        assert kept is False
+    monkeypatch.setattr(module, "_spin", lambda flags: None)  # as if refused
+    monkeypatch.setattr(module, "warm_up", lambda: None)
+    with prevent_idle(HERE, "always") as busy:
+        assert busy is False
