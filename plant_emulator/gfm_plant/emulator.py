@@ -147,6 +147,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         for i in range(r.n_states):
             s.w[i, 0], s.w[i, 1] = s.w_before[i, 0], s.w_before[i, 1]
         trip(r, s, DIVERGED, size)
+        enter(r, s, circuit(s))
     advance_grid(r, s)
     if s.faulted:
         s.fault_left -= r.T_s

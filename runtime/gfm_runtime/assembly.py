@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -44,6 +45,7 @@ class Controller:
         references: Y_ref at the start, shape (5,), p.u.
         hold: ticks in a row without a fresh measurement before the safe state.
         real: float64 or float32 for the laws' arithmetic.
+        omega_b: base frequency of the converter, rad/s, for the estimate of the grid's reactance.
 
     Raises:
         LawError: a law that does not discretise at T_s.
@@ -56,8 +58,9 @@ class Controller:
         references: Sequence[float],
         hold: int = 0,
         real: DTypeLike = np.float64,
+        omega_b: float = 100 * math.pi,
     ) -> None:
-        self.T_s = T_s
+        self.T_s, self._omega_b = T_s, omega_b
         self.sets = {s.name: s for s in sets}
         self.asked, self.gains = "", dict[str, float]()
         self.discrete: list[DiscreteLaw] = []
@@ -77,7 +80,7 @@ class Controller:
         self.states = np.zeros(len(self.laws), state_dtype(real))
         self.ctl = make_controller(hold)
         self.ctl["ref"] = self.ctl["ref_target"] = np.asarray(references, dtype=float)
-        self.est = make_impedance(T_s, 1.0)
+        self.est = make_impedance(T_s, 1.0, omega_b)
         self.select(sets[0].name)
         self.ctl["active"], self.ctl["request"] = self.ctl["request"], -1
         self.ctl["state"] = READY
@@ -111,7 +114,7 @@ class Controller:
             self.ctl["stage_X"][0, :n] = [*X[:-1], X_MAX]
             self.ctl["hysteresis"], self.ctl["since"] = schedule.hysteresis, 0
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
-            self.est[:] = make_impedance(self.T_s, schedule.X_0, X_f=schedule.X_f)
+            self.est[:] = make_impedance(self.T_s, schedule.X_0, self._omega_b, schedule.X_f)
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
 
     def retune(self, discrete: DiscreteLaw, packed: NDArray[Any], gains: dict[str, float]) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_plant import TRIP_REASONS, trip_reason
+from gfm_plant import TRIP_REASONS, grid_voltage, trip_reason
 
 
 def code_of(reason: str) -> int:
@@ -118,3 +118,18 @@ def test_divergence_leaves_finite_values(rest: Callable[..., Any], u: list[float
     assert "diverged: the state left the range of the model" in trip_reason(plant.st, plant.par)
     assert np.isfinite(plant.sample()).all()
     assert np.isfinite(list(plant.truth().values())).all()
+
+
+def test_a_blocked_plant_outlives_a_grid_beyond_the_model(rest: Callable[..., Any]) -> None:
+    """It keeps its last good state meanwhile; then it settles as one that saw none of it."""
+    plant, other = rest(), rest()
+    for one in (plant, other):
+        one.advance(1, np.array([0.5, 1.0, math.nan]))
+    grid_voltage(plant.st, 1e9)
+    plant.advance(20)
+    grid_voltage(plant.st, 1.0)
+    plant.advance(1)
+    assert plant.truth()["V"] < 2.0
+    for one in (plant, other):
+        one.advance(20_000)
+    assert plant.truth()["V"] == pytest.approx(other.truth()["V"], abs=1e-6)

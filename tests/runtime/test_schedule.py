@@ -48,6 +48,12 @@ def at(c: Controller, X: float, ticks: int = 2) -> str:
     return c.active
 
 
+def test_the_estimate_counts_in_the_converters_frequency() -> None:
+    omega_b = 120 * np.pi
+    c = Controller([load_law("mimo-gfm-scheduled")], T_S, list(REF), omega_b=omega_b)
+    assert c.est["omega_b"][0] == omega_b
+
+
 def test_stages_follow_the_estimate_with_hysteresis() -> None:
     c = scheduled()
     walk = [

@@ -85,7 +85,13 @@ def make_bench(scenario: Scenario) -> Bench:
     references = scenario.references.vector()
     # under the name that events use: the name inside a law file may differ
     sets = [replace(load_law(name), name=name) for name in scenario.laws()]
-    controller = Controller(sets, scenario.T_s, references, hold=scenario.late_policy.hold)
+    controller = Controller(
+        sets,
+        scenario.T_s,
+        references,
+        hold=scenario.late_policy.hold,
+        omega_b=float(par[0]["omega_b"]),
+    )
     try:
         start = operating_point(
             par,
