@@ -105,7 +105,7 @@ REFUSED = [
     ({"type": "reference", "P_ref": 9.0}, r"P_ref = 9\.0: must lie in \[-2, 2\]"),
     ({"type": "law", "law": "droop-1"}, "not made ready"),
     ({"type": "reference", "P_ref": 0.6, "t": 1.0}, "t = 1.0: a command is carried out"),
-    ({"type": "grid-impedance", "L_g": 1e-9, "R_g": 1.0}, "too fast"),
+    ({"type": "grid-impedance", "L_g": 1e-9, "R_g": 0.0}, "too fast"),
     ({"type": "grid-breaker", "closed": False}, "load"),
     ({"type": "nonsense"}, "must be one of"),
     ({"type": "gains", "values": {"k_99": 1.0}}, "parameter k_99: unknown"),
