@@ -46,12 +46,12 @@ class Interrupt:
             signal.signal(number, before)
 
 
-def end_with_parent(parent: int | None = None) -> None:
-    """Have Linux send this process SIGTERM when its parent is gone, even if it was killed.
+def end_with_parent(parent: int | None = None, by: signal.Signals = signal.SIGTERM) -> None:
+    """Have Linux send this process a signal when its parent is gone, even if it was killed.
 
     ``parent`` is its process id, to check whether it has already ended.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
+        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, by)
         if parent not in (None, os.getppid()):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), by)
