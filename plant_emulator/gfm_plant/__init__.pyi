@@ -14,6 +14,7 @@ from .grid import (
     grid_frequency,
     grid_impedance,
     grid_load,
+    grid_unbalance,
     grid_voltage,
     phase_jump,
 )
@@ -39,6 +40,7 @@ __all__ = [
     "grid_frequency",
     "grid_impedance",
     "grid_load",
+    "grid_unbalance",
     "grid_voltage",
     "load_converter",
     "make_plant",

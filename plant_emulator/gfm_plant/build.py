@@ -23,7 +23,7 @@ from gfm_plant.records import (
     plant_par_dtype,
     plant_state_dtype,
 )
-from gfm_plant.solution import SOURCES, STATES
+from gfm_plant.solution import BRIDGE, GRID, NEGATIVE, STATES
 
 _DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
@@ -59,7 +59,7 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
 
     st = np.zeros(1, plant_state_dtype)
     st["x"][0, V_DC] = 1.0
-    st["unit"][0, :, 0] = 1.0
+    st["unit"][0, :, 0] = st["sequence"][0, 0, 0] = 1.0
     st["sensed"][0, 0] = 1.0
     st["u"][0, :, 1] = st["u_now"][0, 1] = options.grid.omega_g
     st["closed"] = 1
@@ -90,7 +90,8 @@ def connect(par: PlantRecord, closed: bool) -> None:
         _set(par["modes"][0, circuit, :n], modes.modes)
         par["drive"][0, circuit] = 0.0
         for k, source in enumerate(sources):
-            _set(par["drive"][0, circuit, :n, SOURCES.index(source.name)], modes.drive[:, k])
+            for place in (BRIDGE,) if source.name == "bridge" else (GRID, NEGATIVE):
+                _set(par["drive"][0, circuit, :n, place], modes.drive[:, k])
 
 
 def _modes(r: Any, closed: bool, bridge: int, fault: int) -> tuple[Modes, list[Source]]:

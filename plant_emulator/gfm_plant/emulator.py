@@ -17,7 +17,7 @@ from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.ramps import advance_grid, brought, settle_grid
+from gfm_plant.ramps import advance_grid, brought, brought_now, settle_grid
 from gfm_plant.records import MAX_DELAY, OPERATING, PlantRecord
 from gfm_plant.solution import (
     BRIDGE,
@@ -25,6 +25,7 @@ from gfm_plant.solution import (
     I_F,
     I_LOAD,
     I_O,
+    NEGATIVE,
     V,
     circuit,
     drive,
@@ -120,6 +121,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
     before = (
         s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
         s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
+        s.unit[NEGATIVE, 0], s.unit[NEGATIVE, 1],
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
     )  # fmt: skip
     for i in range(r.n_states):
@@ -142,6 +144,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         (
             s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
             s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
+            s.unit[NEGATIVE, 0], s.unit[NEGATIVE, 1],
             s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
         ) = before  # fmt: skip
         for i in range(r.n_states):
@@ -149,6 +152,11 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
         trip(r, s, DIVERGED, size)
         enter(r, s, circuit(s))
     advance_grid(r, s)
+    if s.unbalance_left > 0.0:
+        s.unbalance_left -= r.T_s
+        if s.unbalance_left < 0.5 * r.T_s:
+            s.unbalance_left = s.sequence[0, 1] = s.sequence[1, 0] = s.sequence[1, 1] = 0.0
+            s.sequence[0, 0] = 1.0
     if s.faulted:
         s.fault_left -= r.T_s
         if s.fault_left < 0.5 * r.T_s:
@@ -206,10 +214,17 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
     if r.filtered:
         a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
-    g_0 = brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1])
+    g_0 = brought_now(r, s)
 
-    m_r, m_i = drive(r, s, c, part, BRIDGE, E, omega_u)
-    n_r, n_i = drive(r, s, c, part, GRID, s.V_g, omega_g)
+    m_r, m_i = drive(r, s, c, part, BRIDGE, E, 0.0, omega_u)
+    p_r, p_i = drive(
+        r, s, c, part, GRID, s.V_g * s.sequence[0, 0], s.V_g * s.sequence[0, 1], omega_g
+    )
+    n_r, n_i = 0.0, 0.0
+    if s.unbalance_left > 0.0:
+        n_r, n_i = drive(
+            r, s, c, part, NEGATIVE, s.V_g * s.sequence[1, 0], s.V_g * s.sequence[1, 1], -omega_g
+        )
     half_step(r, s, c, part, 0)
     if r.filtered or r.H_grid > 0.0:
         read_states(r, s, c)
@@ -217,12 +232,12 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     else:
         s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
     p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
-    g_1 = brought(r, s, n_r, n_i)
+    g_1 = brought(r, s, p_r, p_i, n_r, n_i)
 
     half_step(r, s, c, part, 2)
     read_states(r, s, c)
     p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
-    g_2 = brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1])
+    g_2 = brought_now(r, s)
 
     s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
     v_0 = s.x[V_DC]

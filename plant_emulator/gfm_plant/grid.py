@@ -5,13 +5,15 @@ Frequencies and voltages are in p.u., times in s. An event acts from the coming 
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections.abc import Sequence
 
 from gfm_plant.build import connect
 from gfm_plant.emulator import reconnect
 from gfm_plant.model import DELTA
 from gfm_plant.records import PlantRecord
-from gfm_plant.solution import GRID, I_G, I_O
+from gfm_plant.solution import GRID, I_G, I_O, NEGATIVE
 
 LEAST_FAULT_R = 1e-4
 """p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
@@ -102,13 +104,55 @@ def fault(
     reconnect(par, st)
 
 
+def grid_unbalance(
+    par: PlantRecord,
+    st: PlantRecord,
+    phases: Sequence[complex],
+    duration: float | None = None,
+) -> None:
+    """Multiply the three phase voltages of the grid; (1, 1, 1) makes them equal again.
+
+    Their positive sequence is (a + b + c) / 3 of what it was, and they have a negative sequence of
+    (a + b e^(j 120 deg) + c e^(-j 120 deg)) / 3. A zero sequence finds no path: the converter has
+    three wires.
+
+    Args:
+        phases: Factors of phases a, b, c: their length is the retained voltage, their angle a jump
+            of that phase.
+        duration: Time until they are equal again, s; None: until another call.
+
+    Raises:
+        ValueError: If a value is out of range. The plant is then unchanged.
+    """
+    a, b, c = phases
+    for value in phases:
+        _require("phases", abs(value), True, "finite")
+    if duration is not None:
+        _require("duration", duration, duration > 0, "> 0 s")
+    turn = complex(-0.5, math.sqrt(0.75))
+    positive, negative = (a + b + c) / 3, (a + turn * b + turn.conjugate() * c) / 3
+    st["sequence"][0] = [
+        [positive.real, positive.imag],
+        # of the space vector v = v+ e^(j omega t) + conj(v-) e^(-j omega t)
+        [negative.real, -negative.imag],
+    ]
+    # what turns the other way, in a frame that turns with omega_b
+    r, s = par[0], st[0]
+    angle = 2 * math.remainder(float(r["omega_b"] * r["T_s"]) * int(s["tick"]), math.pi)
+    unit = complex(s["unit"][GRID, 0], -s["unit"][GRID, 1]) * cmath.exp(-1j * angle)
+    st["unit"][0, NEGATIVE] = unit.real, unit.imag
+    balanced = a == b == c == 1
+    st["unbalance_left"] = 0.0 if balanced else math.inf if duration is None else duration
+
+
 def phase_jump(st: PlantRecord, degrees: float) -> None:
     """Advance the grid's angle by `degrees`, so that delta falls by as much."""
     _require("degrees", degrees, True, "finite")
     angle = math.radians(degrees)
     st["x"][0, DELTA] -= angle
-    unit = complex(*st["unit"][0, GRID]) * complex(math.cos(angle), math.sin(angle))
-    st["unit"][0, GRID] = unit.real, unit.imag
+    for place, turn in ((GRID, angle), (NEGATIVE, -angle)):
+        unit = complex(*st["unit"][0, place]) * cmath.exp(1j * turn)
+        st["unit"][0, place] = unit.real, unit.imag
 
 
 def grid_impedance(par: PlantRecord, st: PlantRecord, L_g: float, R_g: float) -> None:

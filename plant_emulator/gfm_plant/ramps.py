@@ -13,24 +13,35 @@ from __future__ import annotations
 
 from typing import Any
 
-from gfm_plant.solution import GRID, I_G, I_LOAD, I_O
+from gfm_plant.solution import GRID, I_G, I_LOAD, I_O, NEGATIVE
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def brought(r: Any, s: Any, unit_r: float, unit_i: float) -> float:
-    """Return the power that reaches the grid, p.u. of the converter; ``unit`` is its phasor."""
+def brought(r: Any, s: Any, p_r: float, p_i: float, n_r: float, n_i: float) -> float:
+    """Return the power that reaches the grid, p.u. of the converter, by the unit phasors p of its
+    positive and n of its negative sequence."""
     if s.closed == 0:
         return 0.0
+    v_r = s.sequence[0, 0] * p_r - s.sequence[0, 1] * p_i
+    v_i = s.sequence[0, 0] * p_i + s.sequence[0, 1] * p_r
+    v_r += s.sequence[1, 0] * n_r - s.sequence[1, 1] * n_i
+    v_i += s.sequence[1, 0] * n_i + s.sequence[1, 1] * n_r
     k = I_G if r.fault_at > 0.0 else I_O
-    return s.V_g * (unit_r * (s.w[k, 0] - s.w[I_LOAD, 0]) + unit_i * (s.w[k, 1] - s.w[I_LOAD, 1]))
+    return s.V_g * (v_r * (s.w[k, 0] - s.w[I_LOAD, 0]) + v_i * (s.w[k, 1] - s.w[I_LOAD, 1]))
+
+
+@compiled
+def brought_now(r: Any, s: Any) -> float:
+    """Return the power that reaches the grid at this instant."""
+    return brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1], s.unit[NEGATIVE, 0], s.unit[NEGATIVE, 1])
 
 
 @compiled
 def settle_grid(r: Any, s: Any) -> None:
     """Put a finite grid at rest at the frequency and the power that it has."""
     off = s.omega_g - 1.0
-    p_g = brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1])
+    p_g = brought_now(r, s)
     s.P_load = 1.0
     s.P_turbine = s.P_load + r.D_grid * off - p_g / r.S_grid
     s.P_set = s.P_turbine + off / r.droop_grid
@@ -67,7 +78,7 @@ def _swing(r: Any, s: Any) -> None:
     w += h / 6.0 * (w_1 + 2.0 * (w_2 + w_3) + w_4)
     P += h / 6.0 * (P_1 + 2.0 * (P_2 + P_3) + P_4)
     s.omega_g, s.P_turbine = 1.0 + w, P
-    now = brought(r, s, s.unit[GRID, 0], s.unit[GRID, 1]) / r.S_grid - s.P_load
+    now = brought_now(r, s) / r.S_grid - s.P_load
     s.omega_g_slope, _ = _slopes(r, s, w, P, now)
 
 

@@ -15,7 +15,7 @@ PlantRecord = NDArray[np.void]
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
 N_W = 5  # states of the circuit, see `solution.STATES`
-N_SOURCES = 2  # the bridge and the grid
+N_SOURCES = 3  # the bridge, and the positive and the negative sequence of the grid
 N_CIRCUITS = 4
 OPERATING, BLOCKED, FAULTED = 0, 1, 2
 """The circuits: with the bridge in operation, or BLOCKED, without the filter inductor; and each of
@@ -126,6 +126,10 @@ plant_state_dtype = np.dtype(
         ("V_g_rate", "f8"),
         ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
         ("V_g_after", "f8"),  # voltage it recovers to
+        # positive and negative sequence over V_g, real and imaginary part, and s until they are
+        # 1 and 0 again
+        ("sequence", "f8", (2, 2)),
+        ("unbalance_left", "f8"),
         ("faulted", "i8"),
         ("fault_left", "f8"),  # s until the fault is cleared
         # a finite grid, p.u. of its rating: power of turbines, set point of governors, load; its

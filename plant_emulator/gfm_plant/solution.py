@@ -23,8 +23,8 @@ STATES = ("i_f", "v", "i_o", "i_load", "i_g")
 """The names of w: currents of filter, line and local load; v is the filter capacitor's voltage, and
 i_g the current of the line's far piece, if the line has a place for a fault."""
 I_F, V, I_O, I_LOAD, I_G = 0, 1, 2, 3, 4
-SOURCES = ("bridge", "grid")
-BRIDGE, GRID = 0, 1
+BRIDGE, GRID, NEGATIVE = 0, 1, 2
+"""Places of the sources: the grid has one for each sequence of an unbalanced voltage."""
 
 
 @compiled
@@ -40,7 +40,9 @@ def turned(x: float) -> tuple[float, float]:
 
 
 @compiled
-def drive(r: Any, s: Any, c: int, part: int, k: int, E: float, omega: float) -> tuple[float, float]:
+def drive(
+    r: Any, s: Any, c: int, part: int, k: int, E_r: float, E_i: float, omega: float
+) -> tuple[float, float]:
     """Add to the forcing of every mode what source k does to it, and turn its phasor.
 
     Returns the unit phasor in the middle of the piece.
@@ -48,12 +50,14 @@ def drive(r: Any, s: Any, c: int, part: int, k: int, E: float, omega: float) -> 
     Args:
         c: the circuit in force.
         part: which stretch of the period, in which a piece lasts twice ``half_h[part]``.
-        E, omega: length and speed of the source's voltage, p.u.
+        E_r, E_i: the source's voltage over its unit phasor, p.u.
+        omega: its speed, p.u.; negative for a negative sequence.
     """
     if s.gain_omega[k] != omega or s.gain_part[k] != part:
         _find_gains(r, s, c, part, k, omega)
     cos, sin = s.turn[k, 0], s.turn[k, 1]
-    s_r, s_i = E * s.unit[k, 0], E * s.unit[k, 1]
+    s_r = E_r * s.unit[k, 0] - E_i * s.unit[k, 1]
+    s_i = E_r * s.unit[k, 1] + E_i * s.unit[k, 0]
     for m in range(r.n_modes[c]):
         g_r, g_i = s.gain[k, m, 0], s.gain[k, m, 1]
         f_r, f_i = g_r * s_r - g_i * s_i, g_r * s_i + g_i * s_r

@@ -6,6 +6,7 @@ the plant all events of the grid; each side selects its own.
 
 from __future__ import annotations
 
+import cmath
 import math
 from typing import Annotated, Any, Literal
 
@@ -170,6 +171,44 @@ class GridLoad(_Event):
         return f"grid load {self.change:+g} p.u."
 
 
+class GridUnbalance(_Event):
+    """The grid's phases a, b, c keep a part of their voltage and jump in angle."""
+
+    type: Literal["grid-unbalance"] = Field(description="kind of event")
+    retained: tuple[float, float, float] = Field(
+        (1.0, 1.0, 1.0), strict=False, description="voltages of a, b, c over what they were"
+    )
+    degrees: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), strict=False, description="by which a, b, c jump ahead"
+    )
+    duration: float | None = Field(
+        None, gt=0, description="s until they are equal again; none: until another such event"
+    )
+
+    @model_validator(mode="after")
+    def _in_bounds(self) -> GridUnbalance:
+        for name, values, limit in (
+            ("retained", self.retained, 1.5),
+            ("degrees", self.degrees, 180),
+        ):
+            low = 0.0 if name == "retained" else -180.0
+            if not all(low <= value <= limit for value in values):
+                raise ValueError(f"{name} = {list(values)}: must lie in [{low:g}, {limit:g}]")
+        return self
+
+    def factors(self) -> tuple[complex, ...]:
+        """Of the phase voltages."""
+        return tuple(
+            size * cmath.exp(1j * math.radians(angle))
+            for size, angle in zip(self.retained, self.degrees, strict=True)
+        )
+
+    def label(self) -> str:
+        sizes = ", ".join(f"{size:g}" for size in self.retained)
+        turns = ", ".join(f"{angle:g}°" for angle in self.degrees) if any(self.degrees) else ""
+        return f"phases at {sizes}" + (f", turned {turns}" if turns else "")
+
+
 class Fault(_Event):
     """A three-phase fault to ground on the line, through ``R`` [p.u.]."""
 
@@ -218,6 +257,7 @@ Event = Annotated[
     | PhaseJump
     | GridImpedance
     | GridLoad
+    | GridUnbalance
     | Fault
     | FaultClear
     | Breaker,
@@ -235,6 +275,7 @@ def apply_grid_event(event: Any, par: Any, st: Any) -> None:
         grid_frequency,
         grid_impedance,
         grid_load,
+        grid_unbalance,
         grid_voltage,
         phase_jump,
     )
@@ -256,6 +297,8 @@ def apply_grid_event(event: Any, par: Any, st: Any) -> None:
             grid_impedance(par, st, event.L_g, event.R_g)
         case GridLoad():
             grid_load(par, st, event.change)
+        case GridUnbalance():
+            grid_unbalance(par, st, event.factors(), event.duration)
         case Fault():
             fault(par, st, event.position, event.R, event.duration)
         case FaultClear():

@@ -165,6 +165,18 @@ class Steps:
         """The load of a finite grid changes, p.u. of the grid's rating."""
         self._planned.step("grid-load", change=change)
 
+    def grid_unbalance(
+        self,
+        retained: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        degrees: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        duration: float | None = None,
+    ) -> None:
+        """The grid's phases a, b, c keep a part of their voltage and jump in angle, for
+        ``duration`` [s] or until another such step."""
+        self._planned.step(
+            "grid-unbalance", retained=list(retained), degrees=list(degrees), duration=duration
+        )
+
     def fault(self, position: float, R: float, duration: float | None = None) -> None:
         """A three-phase fault to ground through ``R`` [p.u.], at 0 (filter) to 1 (grid) of the
         line, for ``duration`` [s] or until ``clear_fault``."""
