@@ -57,7 +57,9 @@ def _line(error: Any, model: Any) -> str:
     if error["type"] in ("model_type", "dict_type"):
         models = _models_at(model, error["loc"])
         keys = [k for m in models for k, field in m.model_fields.items() if field.is_required()]
-        text = "must be a table" + (f" with {', '.join(keys)}" if keys else "")
+        # a file is always a table; only a message as a whole, in JSON, can be something else
+        text = "must be a table" if path else "must be an object"
+        text += f" with {', '.join(keys)}" if keys else ""
     if error["type"] == "literal_error":
         text += meant(error["input"], _quoted(context["expected"]))
     return f"{path}: {text}, not {shown}" if path else f"{text}, not {shown}"

@@ -62,7 +62,7 @@ NO_GREETINGS = {
     "{}": "kind: missing",
     "nonsense": "Invalid JSON",
     '{"kind": "start"}': "start.t0: missing",
-    "[]": "must be a table",
+    "[]": "must be an object",
     "[" * 400: "recursion limit",
     '{"kind": "hello", "si': "Invalid JSON: EOF",
     '{"kind": "hello", "role": "plant", "boot": 1}': "hello.boot: Input should be a valid string",

@@ -185,7 +185,9 @@ def test_wrong_law_fails_with_the_reason_and_figures(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "4 failed, 1 passed" in done.stdout
     assert "p should settle at 0.7 p.u. ± 0.01 within 0.2 s, but it took 0.4" in done.stdout
-    assert re.search(r"strongest oscillation after the step, at 8\.2\d Hz, has 0\.16\d", done.stdout)
+    assert re.search(
+        r"strongest oscillation after the step, at 8\.2\d Hz, has 0\.16\d", done.stdout
+    )
     named = re.findall(r"^tests/.*: (.*\.png)$", done.stdout, re.MULTILINE)
     assert len(named) == 4
     assert all(Path(name).is_file() for name in named)
