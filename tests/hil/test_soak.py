@@ -112,7 +112,7 @@ def test_nothing_grows_and_nothing_is_left(link, capsys, attack_now):
         pids = {name: process.pid for name, process in started.items()} | roles_of(folder)
         outside = places(folder)
         sampler = Sampler(pids)
-        while time.monotonic() - sampler.begin < SOAK_S or clients.rounds < 8:
+        while time.monotonic() - sampler.begin < SOAK_S or clients.rounds < 6:
             assert {name: p.poll() for name, p in started.items()} == dict.fromkeys(started)
             clients.round()
             sampler.take()
