@@ -10,6 +10,7 @@ from .emulator import (
 )
 from .grid import (
     breaker,
+    clear_fault,
     fault,
     grid_frequency,
     grid_impedance,
@@ -36,6 +37,7 @@ __all__ = [
     "NoEquilibrium",
     "Plant",
     "breaker",
+    "clear_fault",
     "fault",
     "grid_frequency",
     "grid_impedance",

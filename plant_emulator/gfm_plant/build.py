@@ -48,7 +48,8 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     par = np.zeros(1, plant_par_dtype)
     par["fault_at"] = -1.0
-    _pack_circuit(par, options, T_s)
+    _pack_circuit(par, options)
+    _pack_grid(par, options, T_s)
     _pack_measurement(par, options)
     _pack_timing(par, options, T_s)
     for k, (name, *_) in enumerate(TRIPS):
@@ -69,15 +70,15 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
 
 
 def connect(par: PlantRecord, closed: bool) -> None:
-    """Set the modes of both circuits, with the grid's breaker closed or open.
+    """Set the modes of all circuits, with the grid's breaker closed or open.
 
     Raises:
         ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast for
             the DC link.
     """
     r = par[0]
-    lacks = (r["fault_at"] <= 0) + (r["fault_at"] <= 0 and r["L_load"] == 0)
-    par["n_states"] = len(STATES) - lacks
+    last = "i_g" if r["fault_at"] > 0 else "i_load" if r["L_load"] > 0 else "i_o"
+    par["n_states"] = STATES.index(last) + 1
     faults = (0, FAULTED) if r["fault_at"] >= 0 else (0,)
     found = {c + f: _modes(r, closed, c, f) for c in (OPERATING, BLOCKED) for f in faults}
     _pack_pieces(par, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
@@ -121,7 +122,7 @@ def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:
     field[..., 0], field[..., 1] = values.real, values.imag
 
 
-def _pack_circuit(par: PlantRecord, options: Plant, T_s: float) -> None:
+def _pack_circuit(par: PlantRecord, options: Plant) -> None:
     converter = load_converter(options.converter)
     bases = converter.bases
     par["omega_b"] = bases.omega_b
@@ -136,19 +137,6 @@ def _pack_circuit(par: PlantRecord, options: Plant, T_s: float) -> None:
     per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
 
-    if grid := options.grid.finite:
-        par["H_grid"], par["D_grid"], par["droop_grid"] = grid.H, grid.D, grid.droop
-        par["T_gov"], par["S_grid"] = grid.T_gov, grid.S
-        r = par[0]
-        swing = math.sqrt(r["omega_b"] / (2 * grid.H * grid.S * (r["L_f"] + r["L_g"])))
-        governor = math.sqrt(1 / (2 * grid.H * grid.droop * grid.T_gov))
-        rate = max(swing, governor, grid.D / (2 * grid.H), 1 / grid.T_gov)
-        if rate * T_s > _SWING_STEP:
-            raise ValueError(
-                f"plant.grid.finite: it swings at {rate:.6g} rad/s; allowed are"
-                f" {_SWING_STEP / T_s:.6g} rad/s at this T_s; raise S, H, T_gov or droop"
-            )
-
     source = options.dc_source
     par["tau_dc"] = source.tau_s or 0.0
     par["i_max"] = math.inf if source.i_max is None else source.i_max
@@ -156,6 +144,23 @@ def _pack_circuit(par: PlantRecord, options: Plant, T_s: float) -> None:
         par["i_u_gain"] = 1.0
     else:
         par["k_p"], par["k_i"] = source.k_p, source.k_i
+
+
+def _pack_grid(par: PlantRecord, options: Plant, T_s: float) -> None:
+    grid = options.grid.finite
+    if grid is None:
+        return
+    par["H_grid"], par["D_grid"], par["droop_grid"] = grid.H, grid.D, grid.droop
+    par["T_gov"], par["S_grid"] = grid.T_gov, grid.S
+    r = par[0]
+    swing = math.sqrt(r["omega_b"] / (2 * grid.H * grid.S * (r["L_f"] + r["L_g"])))
+    governor = math.sqrt(1 / (2 * grid.H * grid.droop * grid.T_gov))
+    rate = max(swing, governor, grid.D / (2 * grid.H), 1 / grid.T_gov)
+    if rate * T_s > _SWING_STEP:
+        raise ValueError(
+            f"plant.grid.finite: it swings at {rate:.6g} rad/s; allowed are"
+            f" {_SWING_STEP / T_s:.6g} rad/s at this T_s; raise S, H, T_gov or droop"
+        )
 
 
 def _pack_measurement(par: PlantRecord, options: Plant) -> None:

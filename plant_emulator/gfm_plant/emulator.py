@@ -214,7 +214,7 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
     if r.filtered:
         a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
-    g_0 = brought_now(r, s)
+    g_0 = brought_now(r, s) if r.H_grid > 0.0 else 0.0
 
     m_r, m_i = drive(r, s, c, part, BRIDGE, E, 0.0, omega_u)
     p_r, p_i = drive(
@@ -232,14 +232,13 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
     else:
         s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
     p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
-    g_1 = brought(r, s, p_r, p_i, n_r, n_i)
+    g_1 = brought(r, s, p_r, p_i, n_r, n_i) if r.H_grid > 0.0 else 0.0
 
     half_step(r, s, c, part, 2)
     read_states(r, s, c)
     p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
-    g_2 = brought_now(r, s)
-
-    s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + g_2)
+    if r.H_grid > 0.0:
+        s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + brought_now(r, s))
     v_0 = s.x[V_DC]
     v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
     if r.filtered:

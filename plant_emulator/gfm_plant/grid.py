@@ -19,8 +19,16 @@ LEAST_FAULT_R = 1e-4
 """p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
 
 
-def grid_frequency(st: PlantRecord, omega_g: float, rate: float | None = None) -> None:
-    """Step the grid frequency to `omega_g`, or ramp it there at `rate` (p.u./s, > 0)."""
+def grid_frequency(
+    par: PlantRecord, st: PlantRecord, omega_g: float, rate: float | None = None
+) -> None:
+    """Step the frequency of an ideal grid to `omega_g`, or ramp it there at `rate` (p.u./s, > 0).
+
+    Raises:
+        ValueError: If a value is out of range, or the grid is finite and has its own frequency.
+    """
+    if par[0]["H_grid"] > 0:
+        raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
     _require("omega_g", omega_g, omega_g > 0, "> 0 p.u.")
     st["omega_g_to"], st["omega_g_rate"] = omega_g, _rate(rate)
     if rate is None:
@@ -73,34 +81,32 @@ def grid_load(par: PlantRecord, st: PlantRecord, change: float) -> None:
 def fault(
     par: PlantRecord, st: PlantRecord, position: float, R: float, duration: float | None = None
 ) -> None:
-    """Short the three phases to ground through `R`, or with `R` = inf clear what is there.
+    """Short the three phases to ground through `R`.
 
     Args:
         position: Place on the line: 0 at the filter capacitor, 1 at the grid.
         R: Resistance of the fault, p.u.; > 0 at the filter capacitor.
-        duration: Time until the fault is cleared, s; None: another call clears it.
+        duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
 
     Raises:
         ValueError: If a value is out of range. The plant is then unchanged.
     """
-    if math.isinf(R):
-        st["fault_left"] = 0.0
-        if st[0]["faulted"]:
-            st["faulted"] = 0
-            reconnect(par, st)
-        return
     _require("position", position, 0 <= position < 1, "in [0, 1)")
     least = 0.0 if position > 0 else LEAST_FAULT_R
     _require("R", R, least <= R, f">= {least:g} p.u. at position {position:g}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    changed = par.copy()
-    changed["fault_at"], changed["fault_R"] = position, R
-    connect(changed, bool(st[0]["closed"]))
-    if par[0]["fault_at"] <= 0:  # the line was in one piece
+    whole = par[0]["fault_at"] <= 0
+    _rebuild(par, bool(st[0]["closed"]), fault_at=position, fault_R=R)
+    if whole:  # the line was in one piece
         st["w"][0, I_G] = st["w"][0, I_O]
-    par[:] = changed
     st["faulted"], st["fault_left"] = 1, math.inf if duration is None else duration
+    reconnect(par, st)
+
+
+def clear_fault(par: PlantRecord, st: PlantRecord) -> None:
+    """Clear the fault, if there is one."""
+    st["faulted"] = 0
     reconnect(par, st)
 
 
@@ -167,10 +173,7 @@ def grid_impedance(par: PlantRecord, st: PlantRecord, L_g: float, R_g: float) ->
     """
     _require("L_g", L_g, L_g > 0, "a factor > 0")
     _require("R_g", R_g, R_g >= 0, "a factor >= 0")
-    changed = par.copy()
-    changed["L_g"], changed["R_g"] = L_g * par["L_line_n"], R_g * par["R_line_n"]
-    connect(changed, bool(st[0]["closed"]))
-    par[:] = changed
+    _rebuild(par, bool(st[0]["closed"]), L_g=L_g * par[0]["L_line_n"], R_g=R_g * par[0]["R_line_n"])
     reconnect(par, st)
 
 
@@ -191,9 +194,18 @@ def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
         raise ValueError(
             "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
         )
+    _rebuild(par, closed)
     st["closed"] = closed
-    connect(par, closed)
     reconnect(par, st)
+
+
+def _rebuild(par: PlantRecord, closed: bool, **elements: float) -> None:
+    """Set elements of the circuit and find its modes; a ValueError leaves `par` as it was."""
+    changed = par.copy()
+    for name, value in elements.items():
+        changed[name] = value
+    connect(changed, closed)
+    par[:] = changed
 
 
 def _rate(rate: float | None) -> float:

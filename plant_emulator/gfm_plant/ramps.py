@@ -56,7 +56,6 @@ def advance_grid(r: Any, s: Any) -> None:
         _swing(r, s)
     else:
         s.omega_g = _towards(s.omega_g, s.omega_g_to, s.omega_g_rate * T_s)
-    s.brought = 0.0
     s.V_g = _towards(s.V_g, s.V_g_to, s.V_g_rate * T_s)
     if s.sag_left > 0.0:
         s.sag_left -= T_s
@@ -77,7 +76,7 @@ def _swing(r: Any, s: Any) -> None:
     w_4, P_4 = _slopes(r, s, w + h * w_3, P + h * P_3, power)
     w += h / 6.0 * (w_1 + 2.0 * (w_2 + w_3) + w_4)
     P += h / 6.0 * (P_1 + 2.0 * (P_2 + P_3) + P_4)
-    s.omega_g, s.P_turbine = 1.0 + w, P
+    s.omega_g, s.P_turbine, s.brought = 1.0 + w, P, 0.0
     now = brought_now(r, s) / r.S_grid - s.P_load
     s.omega_g_slope, _ = _slopes(r, s, w, P, now)
 

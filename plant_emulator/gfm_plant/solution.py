@@ -83,10 +83,15 @@ def _find_gains(r: Any, s: Any, c: int, part: int, k: int, omega: float) -> None
         d_r, d_i = -r.rate[c, m, 0], speed - r.rate[c, m, 1]
         n_r, n_i = cos - r.decay[c, part, m, 0], sin - r.decay[c, part, m, 1]
         size = d_r * d_r + d_i * d_i
-        if size * r.half_h[part] ** 2 > 1e-16:
+        h = r.half_h[part]
+        if size * h * h > 1e-8:
             g_r, g_i = (n_r * d_r + n_i * d_i) / size, (n_i * d_r - n_r * d_i) / size
-        else:  # a mode without losses, driven at its own frequency
-            g_r, g_i = r.half_h[part] * cos, r.half_h[part] * sin
+        else:  # nearly the mode's own frequency: h e^(lambda h) (1 + z/2 + z^2/6), z = d h
+            z_r, z_i = d_r * h, d_i * h
+            f_r = 1.0 + z_r / 2.0 + (z_r * z_r - z_i * z_i) / 6.0
+            f_i = z_i / 2.0 + z_r * z_i / 3.0
+            a_r, a_i = h * r.decay[c, part, m, 0], h * r.decay[c, part, m, 1]
+            g_r, g_i = a_r * f_r - a_i * f_i, a_r * f_i + a_i * f_r
         b_r, b_i = r.drive[c, m, k, 0], r.drive[c, m, k, 1]
         s.gain[k, m, 0], s.gain[k, m, 1] = g_r * b_r - g_i * b_i, g_r * b_i + g_i * b_r
     s.turn[k, 0], s.turn[k, 1] = cos, sin

@@ -83,6 +83,19 @@ def test_fourth_order_of_the_dc_link(rest: Callable[..., Any]) -> None:
     assert orders == pytest.approx([4.0, 4.0], abs=0.3)
 
 
+@pytest.mark.parametrize("omega_u", [0.0, 1e-9, 1e-6, 1e-3])
+def test_a_circuit_without_losses_driven_near_its_own_frequency(
+    rest: Callable[..., Any], omega_u: float
+) -> None:
+    """Without resistance the currents' mean is a mode at 0 Hz, which the bridge then drives."""
+    off = {"over_current": {"enabled": False}, "under_frequency": {"enabled": False}}
+    plant = rest(factors={"R_f": 0.0, "R_g": 0.0}, protection=off, dc_source={"mode": "regulated"})
+    u = np.array([plant.u[0], omega_u, 0.1])
+    x, truth = emulated(plant, [(20, u)]), reference(plant, [(20, u)])
+    assert abs(x[-1, 0]) > 0.1
+    assert np.abs(np.delete(x - truth, V_DC, axis=1)).max() < 1e-9
+
+
 def test_power_balance_of_a_run(rest: Callable[..., Any]) -> None:
     """Energy from C_dc and the DC source is lost, stored or delivered, by Simpson's rule."""
     plant = rest(T_s=1e-5)

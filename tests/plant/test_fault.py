@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from gfm_plant import fault, grid_impedance
+from gfm_plant import clear_fault, fault, grid_impedance
 from gfm_plant.solution import BRIDGE, I_G
 
 WEAK = {"scr": 3.0, "x_over_r": 6.0}
@@ -77,7 +76,7 @@ def test_bolted_fault_in_the_steady_state(rest: Callable[..., Any]) -> None:
     v = plant.u[2] / (1 + Z_f * Y)
     assert complex(*plant.st["x"][0, 2:4]) == pytest.approx(v, abs=1e-6)
     assert complex(*plant.st["x"][0, 4:6]) == pytest.approx(v / Z, abs=1e-6)
-    fault(plant.par, plant.st, 0.0, math.inf)
+    clear_fault(plant.par, plant.st)
     plant.advance(20_000)
     assert plant.st["x"][0, :7] == pytest.approx(plant.x[:7], abs=1e-6)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from gfm_plant import Plant, breaker, grid_load, make_plant
+from gfm_plant import Plant, breaker, grid_frequency, grid_load, make_plant
 from gfm_plant.model import DELTA, f
 
 GRID = {"S": 2.0, "H": 3.0, "D": 1.0, "droop": 0.05, "T_gov": 0.4}
@@ -69,6 +69,9 @@ def test_alone_it_settles_by_its_droop(rest: Callable[..., Any]) -> None:
 
 
 def test_wrong_grids(rest: Callable[..., Any]) -> None:
+    own = rest(grid={"finite": GRID})
+    with pytest.raises(ValueError, match=r"plant.grid.finite: such a grid sets its own frequency"):
+        grid_frequency(own.par, own.st, 0.99)
     with pytest.raises(ValueError, match=r"plant.grid.finite: not set"):
         grid_load(rest().par, rest().st, 0.1)
     fast = Plant.model_validate({"grid": {"finite": {"S": 1.0, "H": 1e-6}}})

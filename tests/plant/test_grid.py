@@ -29,7 +29,7 @@ def test_start_values(rest: Callable[..., Any]) -> None:
 
 def test_frequency_step_turns_the_angle(rest: Callable[..., Any]) -> None:
     plant = rest()
-    grid_frequency(plant.st, 0.999)
+    grid_frequency(plant.par, plant.st, 0.999)
     before = plant.truth()["delta"]
     plant.advance(10)
     # Eq. (7): delta' = omega_b (omega_u - omega_g) = 0.314 rad/s for 1 ms
@@ -39,7 +39,7 @@ def test_frequency_step_turns_the_angle(rest: Callable[..., Any]) -> None:
 @pytest.mark.parametrize(("goal", "sign"), [(0.998, -1), (1.002, 1)])
 def test_frequency_ramp(rest: Callable[..., Any], goal: float, sign: int) -> None:
     plant = rest()
-    grid_frequency(plant.st, goal, rate=0.1)
+    grid_frequency(plant.par, plant.st, goal, rate=0.1)
     values = []
     for _ in range(300):
         values.append(plant.truth()["omega_g"])
@@ -151,7 +151,7 @@ def test_island_runs_at_the_converters_frequency(rest: Callable[..., Any]) -> No
     """Its waveform in a fixed frame rotates at omega_u, independent of the disconnected grid."""
     plant = rest(dc_source={"mode": "regulated"}, grid=LOAD)
     breaker(plant.par, plant.st, closed=False)
-    grid_frequency(plant.st, 0.9)
+    grid_frequency(plant.par, plant.st, 0.9)
     u = plant.near(omega_u=0.02)
     plant.advance(10_000, u)  # 1 s: transients have decayed
     x = plant.st["x"][0]
@@ -179,8 +179,8 @@ def test_impedance_change_of_an_island(rest: Callable[..., Any]) -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (lambda p: grid_frequency(p.st, 0.0), "omega_g = 0.0: must be > 0"),
-        (lambda p: grid_frequency(p.st, 1.0, rate=-1.0), "rate = -1.0: must be > 0"),
+        (lambda p: grid_frequency(p.par, p.st, 0.0), "omega_g = 0.0: must be > 0"),
+        (lambda p: grid_frequency(p.par, p.st, 1.0, rate=-1.0), "rate = -1.0: must be > 0"),
         (lambda p: grid_voltage(p.st, -0.1), "V_g = -0.1: must be >= 0"),
         (lambda p: grid_voltage(p.st, 0.5, duration=0.0), "duration = 0.0: must be > 0"),
         (lambda p: grid_voltage(p.st, 0.5, 1.0, 1.0), "rate = 1.0, duration = 1.0: give one"),

@@ -269,39 +269,26 @@ CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 def apply_grid_event(event: Any, par: Any, st: Any) -> None:
     """Apply one of the plant's events to its records, between two ticks."""
-    from gfm_plant import (
-        breaker,
-        fault,
-        grid_frequency,
-        grid_impedance,
-        grid_load,
-        grid_unbalance,
-        grid_voltage,
-        phase_jump,
-    )
+    from gfm_plant import grid
 
     f_b = float(par[0]["omega_b"]) / (2 * math.pi)
     match event:
         case GridFrequency():
-            if par[0]["H_grid"] > 0:
-                raise ValueError(
-                    "plant.grid.finite: such a grid sets its own frequency; use grid-load"
-                )
             rate = event.rate / f_b if event.rate else None
-            grid_frequency(st, event.f_hz / f_b, rate)
+            grid.grid_frequency(par, st, event.f_hz / f_b, rate)
         case GridVoltage():
-            grid_voltage(st, event.V_g, event.rate, event.duration)
+            grid.grid_voltage(st, event.V_g, event.rate, event.duration)
         case PhaseJump():
-            phase_jump(st, event.degrees)
+            grid.phase_jump(st, event.degrees)
         case GridImpedance():
-            grid_impedance(par, st, event.L_g, event.R_g)
+            grid.grid_impedance(par, st, event.L_g, event.R_g)
         case GridLoad():
-            grid_load(par, st, event.change)
+            grid.grid_load(par, st, event.change)
         case GridUnbalance():
-            grid_unbalance(par, st, event.factors(), event.duration)
+            grid.grid_unbalance(par, st, event.factors(), event.duration)
         case Fault():
-            fault(par, st, event.position, event.R, event.duration)
+            grid.fault(par, st, event.position, event.R, event.duration)
         case FaultClear():
-            fault(par, st, 0.0, math.inf)
+            grid.clear_fault(par, st)
         case Breaker():
-            breaker(par, st, event.closed)
+            grid.breaker(par, st, event.closed)
