@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +19,7 @@ from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.recording.log import read_log, worst
 from gfm_runtime.states import RUNNING, SAFE
 
-from ..support.links import PATIENT, assert_same, run_pair
-
-
-class Tampering:
-    """A link that passes outgoing messages through ``change``; None drops one.
-
-    It has no port, so that every message passes through ``send``.
-    """
-
-    port = None
-
-    def __init__(self, link: Link, change: Callable[[int, bytes], bytes | None]) -> None:
-        self._link, self._change, self._count = link, change, 0
-
-    def send(self, message: bytes) -> bool:
-        changed = self._change(self._count, message)
-        self._count += 1
-        return changed is None or self._link.send(changed)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._link, name)
+from ..support.links import PATIENT, Tampering, assert_same, run_pair
 
 
 @pytest.mark.parametrize("loser", ROLES)

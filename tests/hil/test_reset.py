@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Role
+from gfm_hil.links import Link
+from gfm_hil.links.frame import frame_dtype
 from gfm_hil.recording.log import read_log
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import CONTROLLER_SAFE
 from gfm_runtime.states import READY, RUNNING, SAFE
 
-from ..support.links import PATIENT, run_pair
+from ..support.links import PATIENT, Tampering, assert_same, run_pair
 
 TRIP, RESET = 200, 700
 BASE = {
@@ -152,3 +156,23 @@ def test_answers_that_come_twice_while_it_waits_are_not_taken_for_new_ones(kind,
     for column in ours:
         assert np.array_equal(ours[column], pair.signals[column], equal_nan=True), column
     assert {end[0] for end in pair.ends().values()} == {"completed"}
+
+
+def test_an_answer_lost_just_before_the_reset_is_repeated_as_it_was(tmp_path, endpoint):
+    """The controller has been reset by the time the plant asks again for the tick before."""
+    dropped = []
+
+    def drop(count: int, message: bytes) -> bytes | None:
+        tick = np.frombuffer(message, frame_dtype("u"))["tick"][0]
+        if tick != RESET - 1 or dropped:
+            return message
+        dropped.append(tick)
+        return None
+
+    def touch(role: Role, link: Link) -> Any:
+        return Tampering(link, drop) if role == "controller" else link
+
+    ours = run_scenario(scenario(), tmp_path / "a", figures=False).signals
+    pair = run_pair(scenario(), tmp_path / "b", "zmq", touch=touch, endpoint=endpoint)
+    assert dropped == [RESET - 1]
+    assert_same(pair.signals, ours)

@@ -78,6 +78,26 @@ def deliver(link: Link, message: bytes) -> None:
         time.sleep(0.001)
 
 
+class Tampering:
+    """A link that passes outgoing messages through ``change``; None drops one.
+
+    It has no port, so that every message passes through ``send``.
+    """
+
+    port = None
+
+    def __init__(self, link: Link, change: Callable[[int, bytes], bytes | None]) -> None:
+        self._link, self._change, self._count = link, change, 0
+
+    def send(self, message: bytes) -> bool:
+        changed = self._change(self._count, message)
+        self._count += 1
+        return changed is None or self._link.send(changed)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+
 Touch = Callable[[Role, Link], Link]
 
 

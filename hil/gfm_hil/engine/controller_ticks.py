@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, Why
 from gfm_hil.engine.tick import answer
-from gfm_hil.links.frame import judge, pack, unpack
+from gfm_hil.links.frame import judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import AHEAD_NS, between_looks, give_way, now_ns, sleep_until
 from gfm_hil.recording.recorder import record_controller
 from gfm_runtime.compiled import compiled, inlined
@@ -48,7 +48,7 @@ def controller_ticks(end, records, controller, event):
                 return why
             if r.tick <= before:  # the plant asks again: our answer was lost
                 r.tick = before
-                pack(sequence, frame, message, before, ctl[0].state, ctl[0].reason, u)
+                pack_again(sequence, frame, message)  # a reset may have changed state and u since
                 end.send(end.handle, message)
                 continue
             if r.tick >= event:

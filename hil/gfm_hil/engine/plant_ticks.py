@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, Why
 from gfm_hil.engine.tick import advance, obey, sample
-from gfm_hil.links.frame import INVALID, judge, pack, unpack
+from gfm_hil.links.frame import INVALID, judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
     between_looks,
@@ -89,7 +89,7 @@ def plant_ticks(end, records, plant, last):
                 break
             again = now_ns() + r.repeat
             r.repeats += 1
-            pack(sequence, frame, message, k, state, reason, y)
+            pack_again(sequence, frame, message)
             end.send(end.handle, message)
         if came == CUT_OFF:
             why = Why.GONE

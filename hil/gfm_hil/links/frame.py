@@ -110,10 +110,18 @@ def pack(sequence, frame, message, tick, state, reason, values):
     if f.state != state or f.reason != reason:  # a store right before the CRC's load stalls it
         f.state, f.reason = state, reason
     f.tick = tick
-    f.sequence = sequence[0]
-    sequence[0] = (sequence[0] + 1) % _WRAP
     for j in range(len(values)):
         f.values[j] = values[j]
+    pack_again(sequence, frame, message)
+
+
+@inlined
+def pack_again(sequence, frame, message):
+    """Number the buffer's last frame anew, to send it once more: what it says stays the same,
+    whatever the sender has done since."""
+    f = frame[0]
+    f.sequence = sequence[0]
+    sequence[0] = (sequence[0] + 1) % _WRAP
     f.crc = crc32(message, len(message) - _CRC_BYTES)
 
 
