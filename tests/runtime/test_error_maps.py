@@ -33,7 +33,15 @@ def test_the_half_angle_is_right_to_one_and_a_half_eps(real: type) -> None:
 
 @pytest.mark.parametrize(
     ("x", "y", "degrees"),
-    [(1, 0, 0), (0, 1, 90), (-1, 0, 180), (0, -1, -90), (0, 0, 0), (R_MIN / 2, R_MIN / 2, 0), (1e-9, 1e-9, 45)],
+    [
+        (1, 0, 0),
+        (0, 1, 90),
+        (-1, 0, 180),
+        (0, -1, -90),
+        (0, 0, 0),
+        (R_MIN / 2, R_MIN / 2, 0),
+        (1e-9, 1e-9, 45),
+    ],
 )
 def test_axes_and_the_vector_without_length(x: float, y: float, degrees: float) -> None:
     out = np.empty(1)
