@@ -42,7 +42,7 @@ _PLACES = {
     "gfm_plant": ("",),
     "gfm_hil": ("core", "realtime", "links", "recording", "engine"),
 }
-#: rooms in these folders that generate text, and compile nothing
+#: rooms in these folders that generate text; no compiled function of another room calls theirs
 _TEXT_ONLY = ("firmware",)
 _own_stamp = _SourceFileBackedLocatorMixin.get_source_stamp
 

@@ -10,6 +10,7 @@ end; changes of law. They come from integers of PCG64, so they are the same on e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_runtime.compiled import compiled
 from gfm_runtime.firmware.module import BAD_REF, Module
-from gfm_runtime.kernel import state_dtype, step
-from gfm_runtime.signals import NU, NY, Signal, group
+from gfm_runtime.kernel import N_MAX, state_dtype, step
+from gfm_runtime.signals import NU, NY, group
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into
 
@@ -76,81 +78,98 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     states = max([1, *(m.n for m in modules)])
     names = columns(states)
     word = np.dtype(f"u{real.itemsize}")
-    out = np.zeros((len(modules) * ticks, len(names)), word)
-    records = np.array([m.record for m in modules])
-    bench = _Bench(records, real)
-    row = 0
+    laws = np.array([m.record for m in modules])
+    instances = np.zeros((len(modules), 2), state_dtype(real))
+    ends = [[getattr(s, e) for s in group(v)] for v in ("y", "ref") for e in ("low", "high")]
+    ranges = np.array(ends, real)
+    start = np.array([s.default for s in group("u")], real)
+    now, bump = np.zeros(3, np.int64), np.zeros(1, real)
+    u, new_u, zero = np.zeros(NU, real), np.zeros(NU, real), np.zeros(NU, real)
+    parts = []
     for k in range(len(modules)):
         op, refs, ys = inputs(k, ticks, real)
         op[0] = INIT if k == 0 else SWITCH
-        for i in range(ticks):
-            reals = bench.tick(int(op[i]), k, refs[i], ys[i])
-            out[row, :3] = op[i], k, bench.result
-            values = np.concatenate([refs[i], ys[i], *reals(states)])
-            out[row, 3:] = values.view(word)
-            row += 1
-    return Golden(out, names)
+        result, out = np.zeros(ticks, np.int64), np.zeros((ticks, len(names) - 3), real)
+        _drive(
+            laws, instances, ranges, start, op, k, refs, ys, now, u, new_u, zero, bump, result, out
+        )
+        integers = np.stack([op, np.full(ticks, k), result], axis=1).astype(word)
+        parts.append(np.hstack([integers, out.view(word)]))
+    return Golden(np.vstack(parts), names)
 
 
-class _Bench:
-    """Two instances of each law, as the self-test has them, in the compiled kernel."""
+@compiled
+def _drive(laws, instances, ranges, start, op, k, refs, ys, now, u, new_u, zero, bump, result, out):
+    """The rows of law k, as the self-test has them: two instances of each law, one in use.
 
-    def __init__(self, records: NDArray[Any], real: np.dtype[Any]) -> None:
-        self.laws, self.states = records, np.zeros((len(records), 2), state_dtype(real))
-        self.u, self.bump = np.zeros(NU, real), real.type(0)
-        self.law, self.instance, self.result = 0, 0, OK
-        self._y, self._ref, self._u = (group(name) for name in ("y", "ref", "u"))
-        self._zero = np.zeros(NU, real)
-
-    def tick(self, op: int, law: int, ref: NDArray[Any], y: NDArray[Any]) -> Any:
-        """One row; returns a function that gives its outputs and state for so many states."""
-        u = self.u
-        if op == INIT:
-            self.law, self.instance, self.result = law, 0, OK
-            self.states[law, 0] = np.zeros((), self.states.dtype)
-            self.states[law, 0]["u"] = [s.default for s in self._u]
-        elif op == SWITCH:
-            old, old_state = self.laws[self.law], self.states[self.law, self.instance]
-            self.law, self.instance = law, 1 - self.instance
-            new, new_state = self.laws[law], self.states[law, self.instance]
-            self.bump = u.dtype.type(change_law(old, old_state, new, new_state, ref, y, u))
-        elif op == RESET:
-            self.result = OK
-            state = self.states[self.law, self.instance]
-            u[:] = state["u"]
-            settle_into(self.laws[self.law], state, ref, y, u, self._zero)
-        state = self.states[self.law, self.instance]
-        if self.result == OK:
-            self.result = refusal(ref, y, self._ref, self._y)
-        if self.result == OK:
-            new_u = u.copy()
-            step(self.laws[self.law], state, ref, y, new_u)
-            if np.isfinite(new_u).all():
-                u[:] = new_u
-            else:
-                self.result = BAD_U
-
-        def reals(states: int) -> tuple[NDArray[Any], ...]:
-            return (
-                u,
-                np.array([self.bump]),
-                state["x"][:states],
-                *(state[name] for name in ("offset", "u", "trend")),
-            )
-
-        return reals
+    ``now`` is the law and the instance in use and the result that is latched, ``u`` and ``bump``
+    are the newest; they go on from call to call. ``result`` and ``out`` are what the rows say.
+    """
+    for i in range(len(op)):
+        ref, y = refs[i], ys[i]
+        if op[i] == INIT:
+            now[0], now[1], now[2] = k, 0, OK
+            state = instances[k, 0]
+            for j in range(N_MAX):
+                state.x[j] = 0
+            for j in range(NU):
+                state.offset[j] = state.trend[j] = 0
+                state.u[j] = start[j]
+        elif op[i] == SWITCH:
+            old = now[0]
+            old_state, new_state = instances[old, now[1]], instances[k, 1 - now[1]]
+            bump[0] = change_law(laws[old], old_state, laws[k], new_state, ref, y, u)
+            now[0], now[1] = k, 1 - now[1]
+        elif op[i] == RESET:
+            now[2] = OK
+            for j in range(NU):
+                u[j] = instances[now[0], now[1]].u[j]
+            settle_into(laws[now[0]], instances[now[0], now[1]], ref, y, u, zero)
+        law, state = laws[now[0]], instances[now[0], now[1]]
+        if now[2] == OK:
+            now[2] = _refusal(ranges, ref, y)
+        if now[2] == OK:
+            step(law, state, ref, y, new_u)
+            for j in range(NU):
+                if not math.isfinite(new_u[j]):
+                    now[2] = BAD_U
+        if now[2] == OK:
+            for j in range(NU):
+                u[j] = new_u[j]
+        result[i] = now[2]
+        _write(out[i], state, ref, y, u, bump[0])
 
 
-def refusal(
-    ref: NDArray[Any], y: NDArray[Any], refs: Sequence[Signal], ys: Sequence[Signal]
-) -> int:
+@compiled
+def _refusal(ranges, ref, y):
     """OK, or why a step refuses references and measurements (each (5,), p.u.)."""
-    real = y.dtype.type
-    for code, values, signals in ((BAD_Y, y, ys), (BAD_REF, ref, refs)):
-        for value, s in zip(values, signals, strict=True):
-            if not real(s.low) <= value <= real(s.high):
-                return code
+    for j in range(NY):
+        if not (ranges[0, j] <= y[j] <= ranges[1, j]):
+            return BAD_Y
+    for j in range(NY):
+        if not (ranges[2, j] <= ref[j] <= ranges[3, j]):
+            return BAD_REF
     return OK
+
+
+@compiled
+def _write(out, state, ref, y, u, bump):
+    """The numbers of a row, in the order of the columns."""
+    n = len(out) - 2 * NY - 4 * NU - 1
+    for j in range(NY):
+        out[j], out[NY + j] = ref[j], y[j]
+    at = 2 * NY
+    for j in range(NU):
+        out[at + j] = u[j]
+    out[at + NU] = bump
+    at += NU + 1
+    for j in range(n):
+        out[at + j] = state.x[j]
+    at += n
+    for j in range(NU):
+        out[at + j] = state.offset[j]
+        out[at + NU + j] = state.u[j]
+        out[at + 2 * NU + j] = state.trend[j]
 
 
 def inputs(seed: int, ticks: int, real: np.dtype[Any]) -> Inputs:
