@@ -237,11 +237,14 @@ def _enumerators(guard: str) -> str:
 
 def _checks(vector: str, signals: Sequence[Signal], real: np.dtype[Any]) -> str:
     """An expression up to its last colon: the first signal that is NaN or out of range."""
-    return "\n             : ".join(
-        f"!({vector}[{j}] >= {literal(s.low, real)} && {vector}[{j}] <= {literal(s.high, real)}) "
-        f"? {j}"
-        for j, s in enumerate(signals)
-    )
+    lines = []
+    for j, s in enumerate(signals):
+        low, high, value = literal(s.low, real), literal(s.high, real), f"{vector}[{j}]"
+        inside = f"{value} >= {low} && {value} <= {high}"
+        if s.low == -s.high:
+            inside = f"{'fabsf' if real == np.float32 else 'fabs'}({value}) <= {high}"
+        lines.append(f"!({inside}) ? {j}")
+    return "\n             : ".join(lines)
 
 
 def _codes() -> dict[str, str]:

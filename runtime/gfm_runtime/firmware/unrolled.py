@@ -8,7 +8,7 @@ kernel makes the sums of ``advance`` and ``set_states`` +0 where they are -0. A 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,9 @@ class Unrolled:
         return literal(value, self.real)
 
     def _product(self, coefficient: Any, factor: str) -> str:
-        return factor if coefficient == 1 else f"{self._number(coefficient)} * {factor}"
+        if abs(coefficient) == 1:
+            return factor if coefficient > 0 else f"-{factor}"
+        return f"{self._number(coefficient)} * {factor}"
 
     def _products(self, row: Iterable[Any], factor: str, zeros: bool = False) -> list[str]:
         return [self._product(c, factor.format(j)) for j, c in enumerate(row) if c != 0 or zeros]
@@ -109,7 +111,7 @@ class Unrolled:
             pair = self._products([law["D_u0"][i, j]], f"t->ref[{j}]", zeros)
             pair += self._products([law["D_r"][i, j]], self._r.format(j), zeros)
             if pair:
-                terms.append(pair[0] if len(pair) == 1 else f"({' + '.join(pair)})")
+                terms.append(pair[0] if len(pair) == 1 else f"({_sum(pair)})")
         for j in (0, 1, 3, 4):
             terms += self._products([law["D_y"][i, j]], f"t->y[{j}]", zeros)
         return terms
@@ -117,11 +119,11 @@ class Unrolled:
     def _output(self) -> list[str]:
         law, lines = self.law, []
         for i in (1, 0, 2):  # omega_u first: column 3 feeds it back
-            total = " + ".join(self._row(i))
+            total = _sum(self._row(i))
             if i == 1:
                 total = total if law["loop"] == 1 else f"({total}) * {self._number(law['loop'])}"
             else:
-                total = " + ".join([total, *self._products([law["D_y"][i, 2]], "t->u[1]")])
+                total = _sum([total, *self._products([law["D_y"][i, 2]], "t->u[1]")])
             low, high = self._number(law["low"][i]), self._number(law["high"][i])
             lines.append(f"t->raw[{i}] = {total};")
             lines.append(f"t->u[{i}] = limited(t->raw[{i}], {low}, {high});")
@@ -148,7 +150,7 @@ class Unrolled:
             terms = self._products(law["B_r"][i], self._r)
             terms += self._measured(law["B_y"][i], "t->u[1]")
             terms += self._products(law["A"][i, :n], "s->x[{}]")
-            lines.append(f"x{i} = {' + '.join(terms) or '0'};")
+            lines.append(f"x{i} = {_sum(terms) or '0'};")
         return lines + [f"s->x[{i}] = faded(x{i});" for i in range(n)]
 
     def _set_states(self) -> list[str]:
@@ -168,8 +170,8 @@ class Unrolled:
                 pair = self._products([law["F"][i, j]], f"wanted{j}")
                 pair += self._products([law["G"][i, j]], f"s->trend[{j}]")
                 if pair:
-                    terms.append(pair[0] if len(pair) == 1 else f"({' + '.join(pair)})")
-            total = " + ".join(terms)
+                    terms.append(pair[0] if len(pair) == 1 else f"({_sum(pair)})")
+            total = _sum(terms)
             lines.append(f"s->x[{i}] = {f'{total} + 0' if terms else '0'}; /* never -0 */")
         text = "\n".join(lines)
         unused = [
@@ -178,13 +180,20 @@ class Unrolled:
         return lines + [f"(void){name};" for name in unused]
 
 
+def _sum(terms: Sequence[str]) -> str:
+    """A sum from the left. a - c x is a + (-c) x to the bit, and c is often there already."""
+    return "".join(
+        (f" - {term[1:]}" if term.startswith("-") else f" + {term}") if k else term
+        for k, term in enumerate(terms)
+    )
+
+
 def _body(lines: list[str]) -> list[str]:
     """A function's body; long sums go on over several lines."""
     out = ["{"]
     for line in lines:
-        while len(line) > 92 and " + " in line[20:]:
-            at = line.rfind(" + ", 20, 92)
-            at = at if at > 0 else line.index(" + ", 20)
+        while len(line) > 92:
+            at = max(line.rfind(sign, 20, 92) for sign in (" + ", " - "))
             out.append(f"    {line[:at]}")
             line = f"   {line[at:]}"
         out.append(f"    {line}")

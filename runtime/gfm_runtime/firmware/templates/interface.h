@@ -24,7 +24,7 @@ typedef struct {
     @P@_real u[@GUARD@_NU];      /* the last u, p.u. */
     @P@_real trend[@GUARD@_NU];  /* p.u. per tick, filtered u[k] - u[k-1] */
     int reason;                 /* 0, or why it is in the safe state */
-    int channel;                /* which signal was the reason */
+    int channel;                /* which signal was the reason, or -1 */
 } @P@_t;
 
 /* Makes an instance ready: states 0, the last u as by default in the signal table. */

@@ -31,7 +31,7 @@ void @P@_reset(@P@_t *s)
     for (i = 0; i < @GUARD@_NU; i++)
         s->offset[i] = s->trend[i] = 0;
     s->reason = @GUARD@_OK;
-    s->channel = 0;
+    s->channel = -1;
 }
 
 int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
