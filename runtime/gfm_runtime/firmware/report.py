@@ -20,7 +20,7 @@ from gfm_runtime.firmware.c_text import literal, template
 from gfm_runtime.firmware.module import INTEGERS, Module, Style
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.kernel import law_dtype
-from gfm_runtime.signals import NU, NY, table_hash
+from gfm_runtime.signals import NU, NY, group, table_hash
 
 FORMAT = 1  # of report.json
 
@@ -137,11 +137,12 @@ def operations(m: Module, style: Style) -> dict[str, int]:
     if style == "records":
         products = NU * (n + 3 * NY - 1) + 3 + NU * n + 2 * NU + n * (2 * NY + n)
         sums = NU * (n + 3 * NY) + 2 + NU * n + NU + 3 * NU + n * (2 * NY - 1 + n)
-        text, limits, faded = "", NU, 2 * NU + n
+        text, limits, faded, excess = "", NU, 2 * NU + n, NU
     else:
         text = "\n".join(Unrolled(m.record).step_lines())
         products, sums = 0, 0
-        limits, faded = text.count("limited("), text.count("faded(")
+        limits, faded, excess = (text.count(part) for part in ("limited(", "faded(", "!= 0"))
+    ranges = sum(1 if s.low == -s.high else 2 for s in (*group("y"), *group("ref")))
     for name, code in ERROR_MAPS.items():
         if code and code == m.record["error_map"]:
             text += template("maps.c").split(f"/* @map {name}@ */\n")[1].split("/* @map")[0]
@@ -154,9 +155,9 @@ def operations(m: Module, style: Style) -> dict[str, int]:
         "square_roots": 2 * half_angle,
         "comparisons": 2 * limits
         + faded
-        + NU  # whether a limit clamped
+        + excess  # whether a limit clamped
         + len(re.findall(r" [<>]=? ", said))
-        + 4 * NY  # of the inputs with their ranges
+        + ranges  # of the inputs
         + 1,  # whether u is finite
     }
 
