@@ -78,7 +78,7 @@ class Cascaded(_WithVoltageLoop):
 
 
 class ThresholdImpedance(_WithVoltageLoop):
-    """The cascaded loops behind a virtual impedance that grows with the current beyond a threshold."""
+    """The cascaded loops behind a virtual impedance that grows beyond a threshold of current."""
 
     type: Literal["threshold-impedance"] = Field(description="kind of stage")
     I_thr: Number = Field(1.0, description="threshold, p.u.")

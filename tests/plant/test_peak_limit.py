@@ -12,7 +12,7 @@ T_S, LIMIT = 1e-4, 2.0
 
 
 def current(i_peak: float | None, R: float, modulation: str = "space-vector") -> np.ndarray:
-    """|i| of a bridge that goes on as before while its terminal, or the line, is short-circuited."""
+    """|i| of a bridge that goes on as before while its terminal is short-circuited through R."""
     options = {"i_peak": i_peak, "modulation": modulation, "grid": {"scr": 3.0, "x_over_r": 6}}
     off = {name: {"enabled": False} for name in ("over_current", "under_voltage")}
     par, st = make_plant(Plant.model_validate({**options, "protection": off}), T_S)
