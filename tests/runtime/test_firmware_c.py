@@ -137,7 +137,7 @@ def test_sanitizers_find_nothing_and_the_self_test_passes(
 @pytest.mark.parametrize("real", REALS)
 def test_no_symbol_of_libm_but_sqrt(folders: Any, real: str, tmp_path: Path) -> None:
     folder = folders[real, "unrolled"]
-    sources = [str(p) for p in sorted(folder.glob("gfm_*.c"))]
+    sources = [str(folder / f"gfm_{law}.c") for law in ("vsg_1", "psc_dc", "dvoc", "hybrid_angle")]
     for flags in ("-O0", "-O2"):
         assert cc(tmp_path, *STRICT, flags, "-c", *sources).returncode == 0
         objects = [p.name for p in tmp_path.glob("*.o")]

@@ -19,7 +19,8 @@ from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, HYBRID_ANGLE, R_
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import filled, identifier, literal, literals, plain, template
 from gfm_runtime.firmware.unrolled import Unrolled
-from gfm_runtime.kernel import NEGLIGIBLE, pack_law
+from gfm_runtime.inner import NEGLIGIBLE
+from gfm_runtime.kernel import pack_law
 from gfm_runtime.law import Law
 from gfm_runtime.signals import TABLE_VERSION, Signal, group, table_hash
 from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
@@ -42,8 +43,12 @@ C_TYPES = {
     "float32": {"C_REAL": "float", "BITS": "32", "DIG": "FLT_MANT_DIG", "MANTISSA": "24"},
     "float64": {"C_REAL": "double", "BITS": "64", "DIG": "DBL_MANT_DIG", "MANTISSA": "53"},
 }
-#: fields of a law's record that are integers, not numbers of one precision
+#: fields of a law's record that are integers, and those in its precision
 INTEGERS = ("n", "error_map")
+NUMBERS = (
+    "error_parameters", "A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "loop", "low", "high",
+    "W", "decay", "follow", "E_r", "E_y", "F", "G",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -80,9 +85,12 @@ def make_modules(laws: Mapping[str, Law], T_s: float, real: DTypeLike) -> list[M
     """The laws by name, discretised at T_s [s] and packed in float32 or float64.
 
     Raises:
-        LawError: a law that does not discretise, a name without a letter, or two names that are
-            the same in C.
+        LawError: a law that does not discretise, one with an inner stage, a name without a letter,
+            or two names that are the same in C.
     """
+    for name, law in laws.items():
+        if law.inner is not None:
+            raise LawError(f"law {name!r}", "has an inner stage, which has no C code yet")
     modules = [
         Module(name, law, pack_law(discretise(law, T_s), real)[0]) for name, law in laws.items()
     ]
@@ -269,7 +277,7 @@ def _maps(names: Sequence[str], real: np.dtype[Any]) -> str:
 def _record(m: Module, states: int) -> str:
     """A law's record as an initialiser, for a generic step with room for ``states``."""
     lines = ["{"]
-    for field in m.record.dtype.names or ():
+    for field in (*INTEGERS, *NUMBERS):
         value = m.record[field]
         number = field in INTEGERS
         text = str(int(value)) if number else _braced(_cut(field, value, states), m.real)

@@ -17,7 +17,7 @@ import numpy as np
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal, template
-from gfm_runtime.firmware.module import INTEGERS, Module, Style
+from gfm_runtime.firmware.module import INTEGERS, NUMBERS, Module, Style
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.kernel import law_dtype
 from gfm_runtime.signals import NU, NY, group, table_hash
@@ -45,7 +45,7 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "states": m.n,
             "bytes": sizes(m, style),
             "operations": operations(m, style),
-            "record": {name: _hex(m.record[name]) for name in m.record.dtype.names or ()},
+            "record": {name: _hex(m.record[name]) for name in (*INTEGERS, *NUMBERS)},
         }
         for m in modules
     ]
@@ -102,7 +102,7 @@ def _hex(value: Any) -> str | int:
 
 def _record(fields: Mapping[str, Any], dtype: np.dtype[Any]) -> np.void:
     out = np.zeros(1, dtype)
-    for name in dtype.names or ():
+    for name in (*INTEGERS, *NUMBERS):
         text = fields[name]
         if name in INTEGERS:
             out[0][name] = text
