@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,16 @@ def test_no_symbol_of_libm_but_sqrt(folders: Any, real: str, tmp_path: Path) -> 
 def test_what_would_change_bits_does_not_compile(folders: Any, flag: str, why: str) -> None:
     done = cc(folders["float32", "unrolled"], "-std=c99", flag, "-fsyntax-only", "gfm_vsg_1.c")
     assert done.returncode != 0 and why in done.stderr
+
+
+def test_the_page_s_example_compiles(folders: Any) -> None:
+    page = Path(__file__).parents[2] / "docs" / "firmware.md"
+    code = re.search(r"```c\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert code is not None
+    folder = folders["float32", "unrolled"]
+    (folder / "example.txt").write_text("void block_the_bridge(void);\n" + code[1])
+    done = cc(folder, *STRICT, "-fsyntax-only", "-x", "c", "example.txt")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_cmake_builds_a_folder(folders: Any, tmp_path: Path) -> None:
