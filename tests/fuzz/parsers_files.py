@@ -36,7 +36,6 @@ title = "two runs"
 scenario = "rig_pref_step"
 laws = ["vsg-2"]
 runs = 2
-ripple_max = 0.2
 [set]
 duration = 0.1
 "references.Q_ref" = 0.0

@@ -164,7 +164,7 @@ class RecordedRun:
 
     @property
     def status(self) -> str:
-        """``completed``, ``tripped``, ``safe`` or ``interrupted``."""
+        """``completed``, ``oscillating``, ``tripped``, ``safe`` or ``interrupted``."""
         return str(self.summary["status"])
 
     def to_pandas(self) -> pandas.DataFrame:

@@ -38,6 +38,10 @@ class _Event(BaseModel):
         """The tick of the event; a time is rounded to the nearest tick."""
         return self.tick if self.tick is not None else round((self.t or 0.0) / T_s)
 
+    def lasts(self) -> float:
+        """How long it acts, s, if the event itself says so; 0 for a step and for what stays."""
+        return float(getattr(self, "duration", None) or getattr(self, "ramp_s", 0.0))
+
 
 def reference_field(name: str, default: float | None) -> Any:
     """A field for a reference, described as in the signal table."""

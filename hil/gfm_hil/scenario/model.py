@@ -134,8 +134,15 @@ class Scenario(_Model):
     )
     law: str = Field("mimo-gfm", description="catalogue name or path of a law file")
     seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
-    expect: Literal["completed", "tripped", "safe"] = Field(
+    expect: Literal["completed", "oscillating", "tripped", "safe"] = Field(
         "completed", description="status with which the run counts as passed (exit code 0)"
+    )
+    expect_ripple: float = Field(
+        0.02,
+        gt=0,
+        le=1000,
+        description="p.u.; a run that lasts to its end but whose p, V, omega_u or abs(i) then "
+        "still oscillates by more, peak to peak, ends as oscillating",
     )
     expect_reason: str | None = Field(
         None,
@@ -190,7 +197,7 @@ class Scenario(_Model):
         """Hash of all that both sides must agree on: scenario, signal table, and the content of
         the law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "compare"}
-        about |= {"expect", "expect_reason", "expect_after"}
+        about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
