@@ -29,7 +29,10 @@ FOLDERS = {
 }
 RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
-BESIDE_THE_LOOP = {"lawfile.py": {"pydantic", "pydantic_core"}, "mistakes.py": {"pydantic"}}
+BESIDE_THE_LOOP = {
+    **{key: {"pydantic"} for key in ("lawfile.py", "mistakes.py", "inner_file.py")},
+    "toml_file.py": {"pydantic", "pydantic_core"},
+}
 SOURCES = [
     *FOLDERS.values(),
     *(ROOT / name for name in ("tests", "benchmarks", "docs", "examples")),

@@ -21,7 +21,7 @@
 #include <sys/mman.h>
 #include <time.h>
 
-enum { NY = 5, NU = 3, MAGIC = 0x4647, TABLE_VERSION = 1, Y_ID = 1, U_ID = 2 };
+enum { NY = 5, NU = 3, MAGIC = 0x4647, TABLE_VERSION = 2, Y_ID = 1, U_ID = 2 };
 enum { READY = 1, RUNNING = 2, SAFE = 3, STOPPED = 4 };
 enum { OK = 0, BAD_Y = 1, LOST_PEER = 4, OPERATOR = 6 };
 enum { GREETING_WAIT_MS = 60000, LOCKSTEP_WAIT_MS = 20000, REALTIME_WAIT_MS = 1000 };
@@ -31,7 +31,7 @@ enum { PRIORITY = 50, ANSWER_EVERY_MS = 100, LAST_TIMES = 3 };
 #define NAME "droop in C" /* what the plant's report calls this controller */
 
 /* The signal table that this program was written for; the plant sends its own. */
-#define TABLE "\"3a9e1fff\""
+#define TABLE "\"8aaeb99e\""
 
 typedef struct __attribute__((packed)) {
     uint16_t magic;

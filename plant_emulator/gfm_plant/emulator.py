@@ -18,7 +18,7 @@ from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid, brought, brought_now, settle_grid
-from gfm_plant.records import MAX_DELAY, OPERATING, PlantRecord
+from gfm_plant.records import MAX_DELAY, N_COMMANDS, OPERATING, PlantRecord
 from gfm_plant.solution import (
     BRIDGE,
     GRID,
@@ -43,7 +43,8 @@ _FAR = 1e6  # a state beyond this many p.u. has diverged
 def plant_init(
     par: PlantRecord, st: PlantRecord, x0: NDArray[np.float64], u0: NDArray[np.float64]
 ) -> None:
-    """Put a plant fresh from `make_plant` into the equilibrium x0 (8,), u0 (3,).
+    """Put a plant fresh from `make_plant` into the equilibrium x0 (8,), u0 (3,) or, with the q
+    component of the bridge's voltage, (4,).
 
     Delay line, sensor filters, DC source and local load are filled as if it had been there
     forever; see `gfm_plant.steady_state` for such points.
@@ -62,7 +63,7 @@ def plant_init(
     enter(r, s, OPERATING)
     s.x[DELTA], s.x[V_DC] = delta, x0[V_DC]
     _write_x(s)
-    for j in range(3):
+    for j in range(len(u0)):
         s.u_now[j] = u0[j]
         for k in range(MAX_DELAY + 2):
             s.u[k, j] = u0[j]
@@ -70,14 +71,14 @@ def plant_init(
     s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[V_DC], p, q, v
     if r.i_u_gain == 0.0:
         s.i_reg = u0[0] - r.k_p * (1.0 - x0[V_DC])
-    s.i_source, s.E = u0[0], u0[2]
+    s.i_source, s.E[0], s.E[1] = u0[0], s.u_now[2], s.u_now[3]
     if r.H_grid > 0.0:
         settle_grid(r, s)
 
 
 @compiled
 def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
-    """Take the command u[k] (3,) of this tick and go on to the next.
+    """Take the command u[k] of this tick, (3,) or (4,), and go on to the next.
 
     With a delay of n samples and a fraction of one, u[k-n-1] acts for that fraction of the
     period and u[k-n] for the rest; without delay u[k] acts at once. With at least one sample of
@@ -102,9 +103,9 @@ def plant_is_delayed(par: PlantRecord) -> bool:
 
 @compiled
 def plant_command(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
-    """Put u (3,) through the D/A into the delay line."""
+    """Put u, (3,) or (4,), through the D/A into the delay line."""
     r, s = par[0], st[0]
-    for j in range(3):
+    for j in range(len(u)):
         for k in range(r.delay + 1, 0, -1):
             s.u[k, j] = s.u[k - 1, j]
         if math.isfinite(u[j]):
@@ -190,13 +191,18 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
     """Go on by one stretch of the period under the command at place `age` of the delay line."""
     running = s.trip == 0
     if running:
-        for j in range(3):
+        for j in range(N_COMMANDS):
             s.u_now[j] = s.u[age, j]
     else:
         s.u_now[1] = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # see `trip`
     # the modulator divides by the v_dc that it has at the beginning of its period
     most = r.m_max * s.x[V_DC]
-    s.E = min(max(s.u_now[2], -most), most)
+    s.E[0], s.E[1] = s.u_now[2], s.u_now[3]
+    size = s.E[0] * s.E[0] + s.E[1] * s.E[1]
+    if size > most * most:
+        scale = most / math.sqrt(size)
+        s.E[0] *= scale
+        s.E[1] *= scale
     c = circuit(s)
     for _ in range(r.pieces[part]):
         _piece(r, s, c, part)
@@ -205,18 +211,18 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
 @compiled
 def _piece(r: Any, s: Any, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the command that acts."""
-    omega_u, E = s.u_now[1], s.E
+    omega_u, E_d, E_q = s.u_now[1], s.E[0], s.E[1]
     omega_g = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # in the middle of the tick
     for m in range(r.n_modes[c]):
         s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
 
-    p_0 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
+    p_0 = _drawn(s, s.unit[BRIDGE, 0], s.unit[BRIDGE, 1])
     a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
     if r.filtered:
         a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
     g_0 = brought_now(r, s) if r.H_grid > 0.0 else 0.0
 
-    m_r, m_i = drive(r, s, c, part, BRIDGE, E, 0.0, omega_u)
+    m_r, m_i = drive(r, s, c, part, BRIDGE, E_d, E_q, omega_u)
     p_r, p_i = drive(
         r, s, c, part, GRID, s.V_g * s.sequence[0, 0], s.V_g * s.sequence[0, 1], omega_g
     )
@@ -231,12 +237,12 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
         a_1 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
     else:
         s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
-    p_1 = E * (m_r * s.w[I_F, 0] + m_i * s.w[I_F, 1])
+    p_1 = _drawn(s, m_r, m_i)
     g_1 = brought(r, s, p_r, p_i, n_r, n_i) if r.H_grid > 0.0 else 0.0
 
     half_step(r, s, c, part, 2)
     read_states(r, s, c)
-    p_2 = E * (s.unit[BRIDGE, 0] * s.w[I_F, 0] + s.unit[BRIDGE, 1] * s.w[I_F, 1])
+    p_2 = _drawn(s, s.unit[BRIDGE, 0], s.unit[BRIDGE, 1])
     if r.H_grid > 0.0:
         s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + brought_now(r, s))
     v_0 = s.x[V_DC]
@@ -247,6 +253,13 @@ def _piece(r: Any, s: Any, c: int, part: int) -> None:
         for j in range(3):
             _sense(r, s, 1 + j, part, a_0[j], a_1[j], a_2[j])
     s.x[DELTA] += 2.0 * r.half_h[part] * r.omega_b * (omega_u - omega_g)
+
+
+@compiled
+def _drawn(s: Any, u_r: float, u_i: float) -> float:
+    """Return the power that the bridge draws from the DC link, p.u.; u is its frame's phasor."""
+    w_r, w_i = s.w[I_F, 0], s.w[I_F, 1]
+    return s.E[0] * (u_r * w_r + u_i * w_i) + s.E[1] * (u_r * w_i - u_i * w_r)
 
 
 @compiled

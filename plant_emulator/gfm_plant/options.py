@@ -16,12 +16,12 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from gfm_plant.names import SENSED
 from gfm_plant.parameters import Element, NonNegative, Positive, check_factors, load_converter
 from gfm_plant.records import MAX_DELAY
-from gfm_runtime.signals import Y_NAMES
+from gfm_runtime.signals import Y_NAMES, carried, names
 
-Measured = Literal["v_dc", "p", "q", "V"]
-Command = Literal["i_u", "omega_u", "E_u"]
-MEASURED = cast("tuple[Measured, ...]", tuple(Y_NAMES[k] for k in SENSED))
-COMMANDS: tuple[Command, ...] = ("i_u", "omega_u", "E_u")
+Measured = Literal["v_dc", "p", "q", "V", "i_d", "i_q", "v_d", "v_q", "i_od", "i_oq"]
+Command = Literal["i_u", "omega_u", "E_u", "E_q"]
+MEASURED = cast("tuple[Measured, ...]", (*(Y_NAMES[k] for k in SENSED), *names("y_inner")))
+COMMANDS = cast("tuple[Command, ...]", carried("u", inner=True))
 """The channels, in the order of the records."""
 
 
@@ -108,7 +108,11 @@ class Grid(Options):
 class Sensors(Options):
     """The sensors between the true quantities and the A/D, with errors for each channel."""
 
-    bandwidth_hz: Positive | None = Field(None, description="first-order low-pass; ideal if none")
+    bandwidth_hz: Positive | None = Field(
+        None,
+        description="first-order low-pass of v_dc, p, q and V; ideal if none. The currents and "
+        "voltages of an inner stage are sampled as they are",
+    )
     gain: dict[Measured, float] = Field({}, description="measured over true value, default 1")
     offset: dict[Measured, float] = Field({}, description="added to the measured value, p.u.")
     noise_std: dict[Measured, NonNegative] = Field(
@@ -153,11 +157,16 @@ class DigitalToAnalog(_Converter):
 
 
 DS2004 = AnalogToDigital(
-    bits=16, range={"v_dc": (0.0, 2.0), "p": (-2.0, 2.0), "q": (-2.0, 2.0), "V": (0.0, 2.0)}
+    bits=16,
+    range={
+        **{"v_dc": (0.0, 2.0), "p": (-2.0, 2.0), "q": (-2.0, 2.0), "V": (0.0, 2.0)},
+        **dict.fromkeys(MEASURED[len(SENSED) :], (-4.0, 4.0)),
+    },
 )
-"""The rig's A/D board: 16 bit, the transducers scaled to twice the nominal value."""
+"""The rig's A/D board: 16 bit, the transducers scaled to twice the nominal value; those of an inner
+stage, which the paper does not have, to four times, beyond the over-current trip."""
 
-DS2101 = DigitalToAnalog(bits=12, range={"i_u": (-2.0, 2.0), "E_u": (0.0, 2.0)})
+DS2101 = DigitalToAnalog(bits=12, range={"i_u": (-2.0, 2.0), "E_u": (0.0, 2.0), "E_q": (-2.0, 2.0)})
 """The rig's D/A board: 12 bit. omega_u is integrated to the angle before it, so never rounded."""
 
 

@@ -31,9 +31,9 @@ def trip(r: Any, s: Any, reason: int, value: float) -> None:
         s.trip = reason
         s.trip_tick = s.tick
         s.trip_value = value
-        s.x[0] = s.x[1] = s.w[I_F, 0] = s.w[I_F, 1] = s.i_source = s.E = 0.0
+        s.x[0] = s.x[1] = s.w[I_F, 0] = s.w[I_F, 1] = s.i_source = s.E[0] = s.E[1] = 0.0
         enter(r, s, circuit(s))
-        s.u_now[0], s.u_now[1], s.u_now[2] = 0.0, s.omega_g, 0.0
+        s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, s.omega_g, 0.0, 0.0
 
 
 @compiled

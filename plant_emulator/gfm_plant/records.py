@@ -2,7 +2,7 @@
 
 Both travel as arrays of shape (1,): compiled code reaches a field by plain pointer arithmetic,
 nothing is allocated in a tick, and a run can be saved or compared as bytes. Units are p.u. and s
-unless stated; the order of `measured` channels is (v_dc, p, q, V).
+unless stated; the order of measured channels is (v_dc, p, q, V), then those of an inner stage.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ N_CIRCUITS = 4
 OPERATING, BLOCKED, FAULTED = 0, 1, 2
 """The circuits: with the bridge in operation, or BLOCKED, without the filter inductor; and each of
 them + FAULTED."""
+N_MEASURED, N_COMMANDS = 10, 4  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 
 plant_par_dtype = np.dtype(
@@ -48,18 +49,18 @@ plant_par_dtype = np.dtype(
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
-        ("gain", "f8", (4,)),
-        ("offset", "f8", (4,)),
+        ("gain", "f8", (N_MEASURED,)),
+        ("offset", "f8", (N_MEASURED,)),
         ("noisy", "i8"),
-        ("noise_std", "f8", (4,)),
+        ("noise_std", "f8", (N_MEASURED,)),
         ("seed", "u8"),
-        ("adc_lo", "f8", (4,)),
-        ("adc_hi", "f8", (4,)),
-        ("adc_lsb", "f8", (4,)),
+        ("adc_lo", "f8", (N_MEASURED,)),
+        ("adc_hi", "f8", (N_MEASURED,)),
+        ("adc_lsb", "f8", (N_MEASURED,)),
         # D/A, one entry a command
-        ("dac_lo", "f8", (3,)),
-        ("dac_hi", "f8", (3,)),
-        ("dac_lsb", "f8", (3,)),
+        ("dac_lo", "f8", (N_COMMANDS,)),
+        ("dac_hi", "f8", (N_COMMANDS,)),
+        ("dac_lsb", "f8", (N_COMMANDS,)),
         # a finite grid on its own rating (H_grid = 0: ideal); its rating over the converter's
         ("H_grid", "f8"),
         ("D_grid", "f8"),
@@ -112,10 +113,10 @@ plant_state_dtype = np.dtype(
         ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
         ("i_source", "f8"),  # current of a DC source with a lag
-        ("E", "f8"),  # the bridge's voltage at this instant
+        ("E", "f8", (2,)),  # the bridge's voltage at this instant, d and q
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
-        ("u", "f8", (MAX_DELAY + 2, 3)),  # commands behind the D/A, u[k] first
-        ("u_now", "f8", (3,)),  # the command that acts at this instant
+        ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
+        ("u_now", "f8", (N_COMMANDS,)),  # the command that acts at this instant
         # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
         ("closed", "i8"),
         ("omega_g", "f8"),

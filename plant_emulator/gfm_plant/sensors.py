@@ -12,13 +12,15 @@ from gfm_plant.noise import gaussians
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecord
 from gfm_runtime.compiled import compiled
+from gfm_runtime.signals import NY
 
 
 @compiled
 def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> None:
     """Write the readings of the A/D at this tick to y (5,): (v_dc, p, omega_u, q, V) in p.u.
 
-    omega_u is the command that acts at this instant, without error.
+    omega_u is the command that acts at this instant, without error. A y of (11,) gets the currents
+    and voltages of an inner stage besides, (i_d, i_q, v_d, v_q, i_od, i_oq), which pass no filter.
     """
     r, s = par[0], st[0]
     if r.filtered:
@@ -35,6 +37,13 @@ def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> N
     y[2] = s.u_now[1]
     y[3] = _measure(r, 2, q, n_2)
     y[4] = _measure(r, 3, V, n_3)
+    if len(y) > NY:
+        for j in range(0, 6, 2):
+            n_0 = n_1 = 0.0
+            if r.noisy:
+                n_0, n_1 = gaussians(r.seed, s.tick, 2 + j // 2)
+            y[NY + j] = _measure(r, 4 + j, s.x[j], n_0)
+            y[NY + j + 1] = _measure(r, 5 + j, s.x[j + 1], n_1)
 
 
 @compiled

@@ -20,8 +20,9 @@ from gfm_runtime.controller import (
 )
 from gfm_runtime.errors import LawError
 from gfm_runtime.impedance import make_impedance
+from gfm_runtime.inner import settle
 from gfm_runtime.kernel import pack_law, state_dtype
-from gfm_runtime.signals import NU, NY, REF_NAMES
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, REF_NAMES
 from gfm_runtime.states import OK, READY, RUNNING, STATES
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
@@ -37,7 +38,8 @@ class Controller:
 
     ``asked`` is the name of the law that was requested last, and ``gains`` are its gains that
     differ from its file. ``names`` and ``changed`` are the same for every entry of ``laws``;
-    ``labels`` are their names in reports.
+    ``labels`` are their names in reports. ``inner`` says whether one of the laws has an inner
+    stage; y and u then have its signals too, whichever law is active.
 
     Args:
         sets: the laws that may become active, each under its name; the first one starts.
@@ -76,8 +78,9 @@ class Controller:
         self.names += [sets[0].name] * SPARE
         self.changed: list[dict[str, float]] = [{} for _ in self.discrete]
         self.labels += [f"other gains {k + 1}" for k in range(SPARE)]
-        self.laws = np.concatenate([pack_law(d, real) for d in self.discrete])
+        self.laws = np.concatenate([pack_law(d, real, omega_b) for d in self.discrete])
         self.states = np.zeros(len(self.laws), state_dtype(real))
+        self.inner = any(d.law.inner is not None for d in self.discrete)
         self.ctl = make_controller(hold)
         self.ctl["ref"] = self.ctl["ref_target"] = np.asarray(references, dtype=float)
         self.est = make_impedance(T_s, 1.0, omega_b)
@@ -140,8 +143,18 @@ class Controller:
         away = value - float(self.ctl["ref"][0, j])
         set_reference(self.ctl, j, value, abs(away) * self.T_s / ramp_s if ramp_s > 0 else 0.0)
 
-    def start(self, x_law: NDArray[Any], u: NDArray[Any]) -> None:
-        """Go from READY to RUNNING, at rest: the active law's state x_law (n,), u (3,) in p.u.
+    def start(
+        self,
+        x_law: NDArray[Any],
+        u: NDArray[Any],
+        y: NDArray[Any] | None = None,
+        e: complex | None = None,
+    ) -> None:
+        """Go from READY to RUNNING, at rest.
+
+        Args:
+            x_law, u: the active law's state (n,) and output (3,), p.u.
+            y, e: with an inner stage: measurements (11,) and the bridge's voltage e_d + j e_q, p.u.
 
         Raises:
             LawError: the controller is not READY; SAFE is latched until ``reset``.
@@ -153,6 +166,10 @@ class Controller:
         self.states[k] = np.zeros((), self.states.dtype)
         self.states["x"][k, : len(x_law)] = x_law
         self.states["u"][k] = u
+        self.ctl["u"] = u
+        if y is not None and e is not None:
+            settle(self.laws[k : k + 1], self.states[k : k + 1], np.asarray(u), y, e.real, e.imag)
+            self.ctl["out"] = [u[0], u[1], e.real, e.imag]
         self.ctl["state"] = RUNNING
 
     def reset(self) -> None:
@@ -161,7 +178,8 @@ class Controller:
         self.ctl["stale"] = 0
 
     def step(self, y: NDArray[np.float64], u: NDArray[np.float64]) -> None:
-        """One tick from Python: y (5,) in, u (3,) in and out, p.u."""
+        """One tick from Python: y (5,) in, u (3,) in and out, p.u.; (11,) and (4,) with an inner
+        stage."""
         control(self.ctl, self.laws, self.states, self.est, y, u)
 
 
@@ -175,7 +193,8 @@ def warm_up(controller: Controller) -> None:
     """Compile every function of a tick, on copies, so that nothing compiles during a run."""
     ctl, states = controller.ctl.copy(), controller.states.copy()
     ctl["state"], ctl["request"] = RUNNING, ctl["active"]
-    y, u = np.ones(NY), np.ones(NU)
     follow_plant(ctl, False)
-    control(ctl, controller.laws, states, controller.est.copy(), y, u)
+    for n_y, n_u in ((NY, NU), (NY_INNER, NU_INNER))[: 1 + controller.inner]:
+        y, u = np.ones(n_y), np.ones(n_u)
+        control(ctl, controller.laws, states, controller.est.copy(), y, u)
     missed(ctl)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from gfm_runtime.error_maps import ERROR_MAPS, V_MIN
-from gfm_runtime.kernel import N_MAX, NEGLIGIBLE, law_dtype, state_dtype
+from gfm_runtime.inner import NEGLIGIBLE
+from gfm_runtime.kernel import N_MAX, law_dtype, state_dtype
 from gfm_runtime.signals import NU, NY
 
 _C_TYPES = {"i8": "int64_t", "u8": "uint64_t", "f8": "double", "f4": "float"}

@@ -14,6 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from gfm_runtime.errors import LawError, meant
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import Law
 from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file
 
@@ -26,11 +27,13 @@ class LawSet:
         name: the name asked for.
         laws: one law, or one for each stage in ascending order of the stage's reactance.
         schedule: None, or the limits of the stages.
+        inner: the inner stage that replaces the law file's own, by name or path; None: its own.
     """
 
     name: str
     laws: tuple[Law, ...]
     schedule: Schedule | None = None
+    inner: str | None = None
 
 
 def _natural(name: str) -> list[int | str]:
@@ -81,22 +84,29 @@ def law_file(name: str) -> LawFile:
     raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}{close}")
 
 
-def load_law(name: str, **changed: float) -> LawSet:
+def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
     """A law by catalogue name or path, with parameters changed by name if wanted.
+
+    Args:
+        inner: an inner stage in place of the file's own: a shipped name, a file, or ``none``.
+        changed: values of parameters.
 
     Raises:
         LawError: as ``law_file`` and ``build_law``.
     """
     file = law_file(name)
+    if inner is not None:
+        named_inner(inner)  # its mistakes are not those of the law
+        file = file.model_copy(update={"inner": inner})
     stages = sorted(file.schedule.stages, key=lambda stage: stage.X) if file.schedule else []
     sets = [{**stage.parameters, **changed} for stage in stages] or [changed]
     try:
         laws = tuple(build_law(file, parameters) for parameters in sets)
     except LawError as problem:
         raise problem.within(f"law {'file ' * name.endswith('.toml')}{name}") from None
-    return LawSet(file.name, laws, file.schedule)
+    return LawSet(file.name, laws, file.schedule, inner)
 
 
 def get_law(name: str, **changed: float) -> Law:
     """A single law; of a gain-scheduled one, the first stage."""
-    return load_law(name, **changed).laws[0]
+    return load_law(name, None, **changed).laws[0]

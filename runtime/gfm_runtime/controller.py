@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.impedance import estimate
-from gfm_runtime.kernel import step
-from gfm_runtime.signals import NU, NY, group
+from gfm_runtime.inner import measure_frequency, settle_inner, shape, take_measurements
+from gfm_runtime.kernel import advance, output, set_inputs, step
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.states import (
     BAD_U,
     BAD_Y,
@@ -47,10 +48,13 @@ controller_dtype = np.dtype(
         ("ref", "f8", (NY,)),
         ("ref_target", "f8", (NY,)),
         ("ref_rate", "f8", (NY,)),  # p.u. per tick; 0 is a step
-        ("y", "f8", (NY,)),  # of this tick: the kernel takes fields of a record
+        ("y", "f8", (NY_INNER,)),  # of this tick: the kernel takes fields of a record
         ("u", "f8", (NU,)),
-        ("y_low", "f8", (NY,)),
-        ("y_high", "f8", (NY,)),
+        # with an inner stage: the references that the law sees, and what goes to the bridge
+        ("ref_seen", "f8", (NY,)),
+        ("out", "f8", (NU_INNER,)),
+        ("y_low", "f8", (NY_INNER,)),
+        ("y_high", "f8", (NY_INNER,)),
         # gain scheduling: stages first..first+count-1 of the laws share one schedule
         ("stages", "i8"),
         ("stage_law", "i8", (MAX_STAGES,)),
@@ -73,8 +77,9 @@ def make_controller(hold: int = 0) -> NDArray[Any]:
     rec = out[0]
     rec["request"], rec["hold"] = -1, hold
     rec["ref"] = rec["ref_target"] = [s.default for s in group("ref")]
-    rec["y_low"] = [s.low for s in group("y")]
-    rec["y_high"] = [s.high for s in group("y")]
+    measured = (*group("y"), *group("y_inner"))
+    rec["y_low"] = [s.low for s in measured]
+    rec["y_high"] = [s.high for s in measured]
     return out
 
 
@@ -134,6 +139,21 @@ def _schedule(ctl, est, y):
         ctl.request, ctl.since = ctl.stage_law[wanted], 0
 
 
+@inlined
+def _step_with_inner(law, state, c):
+    """One tick of a law and its inner stage: ``c.out`` from ``c.ref`` and ``c.y``."""
+    take_measurements(state, c.y)
+    for j in range(NY):
+        c.ref_seen[j] = c.ref[j]
+    if law.k_pll > 0.0:
+        measure_frequency(law, state)
+        c.ref_seen[2] = state.omega_pll
+    set_inputs(law, state, c.ref_seen, c.y)
+    output(law, state, c.u)
+    shape(law, state, c.u, c.out)
+    advance(law, state)
+
+
 @compiled
 def control(ctl, laws, states, est, y, u):
     """One tick: y[k] in, u[k] out.
@@ -141,13 +161,14 @@ def control(ctl, laws, states, est, y, u):
     Args:
         ctl, est: one-element arrays of ``controller_dtype`` and ``impedance_dtype``.
         laws, states: arrays of ``law_dtype`` and ``state_dtype``, one element a law.
-        y: measurements, shape (5,), p.u.
-        u: output, u[k], shape (3,), p.u. Unchanged in SAFE.
+        y: measurements, shape (5,), or (11,) with an inner stage, p.u.
+        u: output, u[k], shape (3,), or (4,) with an inner stage, p.u. Unchanged in SAFE.
     """
     c = ctl[0]
     if c.state != RUNNING:
         return
-    for j in range(NY):
+    inner = len(y) > NY
+    for j in range(len(y)):
         if not (c.y_low[j] <= y[j] <= c.y_high[j]):
             _go_safe(c, BAD_Y, j)
             return
@@ -167,7 +188,19 @@ def control(ctl, laws, states, est, y, u):
             c.bump = change_law(
                 laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u
             )
+            if inner:
+                take_measurements(states[k], c.y)
+                settle_inner(laws[k], states[k], c.u, c.out[2], c.out[3])
             c.active, c.changes = k, c.changes + 1
+    if inner:
+        _step_with_inner(laws[c.active], states[c.active], c)
+        for i in (1, 0, 2, 3):
+            if not math.isfinite(c.out[i]):
+                _go_safe(c, BAD_U, i)
+                return
+        for i in range(NU_INNER):
+            u[i] = c.out[i]
+        return
     step(laws[c.active], states[c.active], c.ref, c.y, c.u)
     for i in (1, 0, 2):  # omega_u first: column 3 takes it to the others
         if not math.isfinite(c.u[i]):

@@ -7,6 +7,7 @@ same bytes. The kernel knows no law by name, allocates nothing, calls no BLAS an
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,11 @@ from numpy.typing import DTypeLike, NDArray
 from gfm_runtime.compiled import inlined
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.errors import LawError
+from gfm_runtime.inner import INNER_NUMBERS, NEGLIGIBLE, Inner, inner_fields, inner_state_fields
 from gfm_runtime.signals import NU, NY
 from gfm_runtime.tustin import DiscreteLaw
 
 N_MAX = 12  # states; the largest law of Table II has five
-NEGLIGIBLE = 2.0**-100  # p.u.; decaying values below it become 0; exact in float32 too
 TREND_TIME = 0.01  # s; u[k] - u[k-1] is filtered with this before a bumpless change uses it
 
 
@@ -30,6 +31,8 @@ def law_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
         [
             ("n", "i8"),
             ("error_map", "i8"),
+            ("row", "i8", (N_MAX,)),  # of u that each state belongs to
+            *INNER_NUMBERS,
             ("error_parameters", f, (2,)),
             ("A", f, (N_MAX, N_MAX)),
             ("B_r", f, (N_MAX, NY)),
@@ -49,6 +52,7 @@ def law_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("E_y", f, (N_MAX, NY)),
             ("F", f, (N_MAX, NU)),
             ("G", f, (N_MAX, NU)),
+            *inner_fields(f),
         ],
         align=True,
     )
@@ -59,6 +63,7 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
     f = np.dtype(real)
     return np.dtype(
         [
+            ("limited", "i8"),  # whether the inner stage limits the current in this tick
             ("x", f, (N_MAX,)),
             ("x_next", f, (N_MAX,)),
             ("r", f, (NY,)),  # mapped references of this tick
@@ -68,14 +73,23 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("u", f, (NU,)),  # u of the last tick
             ("trend", f, (NU,)),  # filtered u[k] - u[k-1]
             ("ref", f, (NY,)),  # references of this tick as given, for a u_0 that follows one
+            *inner_state_fields(f),
         ],
         align=True,
     )
 
 
+_NO_INNER = Inner("none")
+
+
 @np.errstate(over="ignore")  # what overflows is refused below
-def pack_law(discrete: DiscreteLaw, real: DTypeLike = np.float64) -> NDArray[Any]:
+def pack_law(
+    discrete: DiscreteLaw, real: DTypeLike = np.float64, omega_b: float = 100 * math.pi
+) -> NDArray[Any]:
     """A discrete law as a one-element array of ``law_dtype``.
+
+    Args:
+        omega_b: base frequency of the converter, rad/s, for the inner stage.
 
     Raises:
         LawError: more states than the kernel holds, a number that overflows ``real``.
@@ -94,6 +108,8 @@ def pack_law(discrete: DiscreteLaw, real: DTypeLike = np.float64) -> NDArray[Any
         rec[name] = getattr(discrete, name)
     rec["loop"] = 1.0 / (1.0 - discrete.D_y[1, 2])
     rec["low"], rec["high"] = law.limits.low, law.limits.high
+    rec["row"][:n] = discrete.rows
+    (law.inner or _NO_INNER).pack(rec, discrete.T_s, omega_b)
     rec["decay"] = np.exp(-discrete.T_s / law.limits.T_off)
     rec["follow"] = -np.expm1(-discrete.T_s / TREND_TIME)
     for name in ("A", "B_r", "B_y", "C", "D_r", "D_y", "u_0", "W", "E_r", "E_y", "F", "G"):
@@ -153,6 +169,8 @@ def advance(law, state):
     for i in range(NU):
         u = _limited(law, state, i)
         excess = u - state.raw[i]
+        if i == 1 and law.inner != 0:  # the power limiter moves omega_u too
+            excess = state.omega - state.raw[i]
         if excess != 0.0:
             for j in range(n):
                 state.x[j] += law.W[j, i] * excess
@@ -169,8 +187,10 @@ def advance(law, state):
         for j in range(n):
             a += law.A[i, j] * state.x[j]
         state.x_next[i] = a
+    frozen = law.freeze != 0 and state.limited != 0
     for i in range(n):
-        state.x[i] = _faded(state.x_next[i])
+        if not (frozen and law.row[i] == 2):
+            state.x[i] = _faded(state.x_next[i])
 
 
 @inlined

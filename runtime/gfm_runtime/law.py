@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 from gfm_runtime.elements import INTEGRATOR, ZERO, Element
 from gfm_runtime.errors import LawError, Mistakes, meant
+from gfm_runtime.inner import Inner
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
 
 Cell = tuple[int, int]  # (i, j), zero-based row of u and column of y
@@ -87,6 +88,7 @@ class Law:
         limits: clamps and anti-windup.
         parameters: the named numbers the elements were computed from.
         home_grid: grid on which the defaults are stable.
+        inner: the inner stage between the law and the bridge; None: the bridge produces E_u.
     """
 
     name: str
@@ -100,6 +102,7 @@ class Law:
     limits: Limits = Limits()
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     home_grid: HomeGrid = HomeGrid()
+    inner: Inner | None = None
 
     def __post_init__(self) -> None:
         mistakes = Mistakes()

@@ -7,55 +7,32 @@ and the same checks. ``docs/law-files.md`` shows one line by line.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainValidator,
-    ValidationError,
-)
-from pydantic_core import PydanticCustomError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.expressions import evaluate
+from gfm_runtime.inner_file import InnerSpec, build_inner, named_inner
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
 from gfm_runtime.signals import U_NAMES
-from gfm_runtime.toml_file import parse_toml, read_text
-
-
-def _number(value: Any) -> float | str:
-    if isinstance(value, str):
-        return value
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        with suppress(OverflowError):
-            return float(value)
-    raise PydanticCustomError("number", "must be a number or an expression over the parameters")
+from gfm_runtime.toml_file import Number, Table, parse_toml, read_text
 
 
 def _listed(value: Any) -> Any:
     return [value] if isinstance(value, dict) else value
 
 
-# a number or an expression over the law's parameters; one union would give two errors a mistake
-Number = Annotated[float | str, PlainValidator(_number, json_schema_input_type=float | str)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class ElementSpec(_Model):
+class ElementSpec(Table):
     """One factor: its kind and its numbers (T, T_f in s)."""
 
     type: Literal["P", "I", "D", "PI", "PD", "IF", "O"] = Field(description="kind of element")
@@ -74,7 +51,7 @@ Factors = Annotated[
 ]
 
 
-class ParameterSpec(_Model):
+class ParameterSpec(Table):
     """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
 
     value: float = Field(allow_inf_nan=False, description="the number, in its unit")
@@ -86,7 +63,7 @@ class ParameterSpec(_Model):
     )
 
 
-class ErrorMapSpec(_Model):
+class ErrorMapSpec(Table):
     """The errors on which Phi(s) acts; R and X (p.u.) only for hybrid-angle."""
 
     type: str = Field("linear", description="linear, dc-energy, dvoc or hybrid-angle")
@@ -94,7 +71,7 @@ class ErrorMapSpec(_Model):
     X: Number | None = Field(None, description="reactance of the line, p.u.; hybrid-angle only")
 
 
-class SetPoints(_Model):
+class SetPoints(Table):
     """u_0: numbers (p.u.) or names of references."""
 
     i_u: Number = Field(0.0, description="p.u., or the name of a reference")
@@ -102,7 +79,7 @@ class SetPoints(_Model):
     E_u: Number = Field("V_ref", description="p.u., or the name of a reference")
 
 
-class LimitsSpec(_Model):
+class LimitsSpec(Table):
     """Clamps of u in p.u., times in s."""
 
     i_u: Range = Field(default_factory=lambda: [-5.0, 5.0], description="[low, high], p.u.")
@@ -112,7 +89,7 @@ class LimitsSpec(_Model):
     T_off: float = Field(0.2, description="decay of the offset left by a change of law, s")
 
 
-class GridSpec(_Model):
+class GridSpec(Table):
     """The grid the defaults are meant for, as factors on the converter's."""
 
     L_g: float = Field(1.0, gt=0, description="factor on the converter's line inductor")
@@ -120,7 +97,7 @@ class GridSpec(_Model):
     note: str = Field("the paper's grid", description="for people")
 
 
-class Stage(_Model):
+class Stage(Table):
     """One stage of a gain-scheduled law, in force up to the reactance X (p.u.)."""
 
     X: float = Field(gt=0, description="upper end of the stage, p.u.; the last one has no end")
@@ -129,7 +106,7 @@ class Stage(_Model):
     )
 
 
-class Schedule(_Model):
+class Schedule(Table):
     """Gains as a function of the estimated grid reactance."""
 
     stages: Annotated[list[Stage], Field(min_length=2, max_length=8)] = Field(
@@ -145,7 +122,7 @@ class Schedule(_Model):
     )
 
 
-class LawFile(_Model):
+class LawFile(Table):
     """The whole file."""
 
     name: str = Field(
@@ -167,6 +144,11 @@ class LawFile(_Model):
     )
     limits: LimitsSpec = Field(LimitsSpec(), description="clamps of u, anti-windup")
     home_grid: GridSpec = Field(GridSpec(), description="where the defaults are meant to be used")
+    inner: InnerSpec | str | None = Field(
+        None,
+        description="the inner stage between the law and the bridge: a table, or the name of a "
+        "shipped one or of a file; none if not given",
+    )
     schedule: Schedule | None = Field(
         None, description="gains by the estimated grid reactance; fixed gains if none"
     )
@@ -280,6 +262,10 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
     with mistakes.noting():
         low, high = zip(*(getattr(file.limits, name) for name in U_NAMES), strict=True)
         limits = Limits(low, high, file.limits.T_t, file.limits.T_off)
+    inner = None
+    with mistakes.noting():
+        spec = named_inner(file.inner) if isinstance(file.inner, str) else file.inner
+        inner = None if spec is None else build_inner(spec, numbers)
     law = None
     with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
         law = Law(
@@ -294,6 +280,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
             limits=limits,
             parameters=parameters,
             home_grid=HomeGrid(**file.home_grid.model_dump()),
+            inner=inner,
         )
     mistakes.check()
     assert law is not None

@@ -6,7 +6,9 @@ within a group is the order of the vectors everywhere:
 * ``y``   = (v_dc, p, omega_u, q, V), the measurements (Eq. (14) of the paper),
 * ``u``   = (i_u, omega_u, E_u), the control inputs (Eq. (13)),
 * ``ref`` = (V_dcref, P_ref, omega_g, Q_ref, V_ref), the references Y_ref (Eq. (17)),
-* ``d``   = (omega_g, V_g), the grid seen as disturbance (Eq. (15)).
+* ``d``   = (omega_g, V_g), the grid seen as disturbance (Eq. (15)),
+* ``y_inner`` and ``u_inner``: what a run with an inner stage (``gfm_runtime.inner``) measures and
+  commands besides, at the end of y and u; E_u is then the d component of the bridge's voltage.
 
 Add signals at the end of a group only; anything else is a new ``TABLE_VERSION``, which both
 sides of a link compare before they start.
@@ -18,9 +20,10 @@ import hashlib
 from dataclasses import astuple, dataclass
 from typing import Literal
 
-TABLE_VERSION = 1
+TABLE_VERSION = 2
 
-Group = Literal["y", "u", "ref", "d"]
+Group = Literal["y", "u", "y_inner", "u_inner", "ref", "d"]
+Vector = Literal["y", "u"]
 
 
 @dataclass(frozen=True)
@@ -68,9 +71,50 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("ref", "V_ref", "V_{ref}", "p.u.", "V_n", 1e-4, 0.5, 1.5, 1.0, "voltage magnitude"),
     Signal("d", "omega_g", r"\omega_g", "p.u.", "omega_n", 1e-5, 0.8, 1.2, 1.0, "grid frequency"),
     Signal("d", "V_g", "V_g", "p.u.", "V_n", 1e-4, 0.0, 1.5, 1.0, "grid voltage magnitude"),
+    Signal("y_inner", "i_d", "i_d", "p.u.", "S_n/V_n", 2e-4, -6.0, 6.0, 0.0, "current of L_f, d"),
+    Signal("y_inner", "i_q", "i_q", "p.u.", "S_n/V_n", 2e-4, -6.0, 6.0, 0.0, "current of L_f, q"),
+    Signal("y_inner", "v_d", "v_d", "p.u.", "V_n", 1e-4, -3.0, 3.0, 0.0, "voltage of C_f, d"),
+    Signal("y_inner", "v_q", "v_q", "p.u.", "V_n", 1e-4, -3.0, 3.0, 0.0, "voltage of C_f, q"),
+    Signal(
+        "y_inner",
+        "i_od",
+        "i_{od}",
+        "p.u.",
+        "S_n/V_n",
+        2e-4,
+        -6.0,
+        6.0,
+        0.0,
+        "current of the line, d",
+    ),
+    Signal(
+        "y_inner",
+        "i_oq",
+        "i_{oq}",
+        "p.u.",
+        "S_n/V_n",
+        2e-4,
+        -6.0,
+        6.0,
+        0.0,
+        "current of the line, q",
+    ),
+    Signal(
+        "u_inner",
+        "E_q",
+        "E_q",
+        "p.u.",
+        "V_n",
+        1e-4,
+        -3.0,
+        3.0,
+        0.0,
+        "q component of the bridge's voltage",
+    ),
 )
 
-NY, NU = 5, 3
+NY, NU = 5, 3  # of Phi
+NY_INNER, NU_INNER = 11, 4  # of a run with an inner stage
 
 
 def group(name: Group) -> tuple[Signal, ...]:
@@ -84,6 +128,12 @@ def names(name: Group) -> tuple[str, ...]:
 
 
 Y_NAMES, U_NAMES, REF_NAMES, D_NAMES = names("y"), names("u"), names("ref"), names("d")
+
+
+def carried(vector: Vector, inner: bool) -> tuple[str, ...]:
+    """The names of what a run exchanges: y or u, and with an inner stage its signals after them."""
+    more: Group = "y_inner" if vector == "y" else "u_inner"
+    return names(vector) + (names(more) if inner else ())
 
 
 def table_hash() -> str:

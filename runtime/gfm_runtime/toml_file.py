@@ -9,11 +9,34 @@ from __future__ import annotations
 import os
 import stat
 import tomllib
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, PlainValidator
+from pydantic_core import PydanticCustomError
 
 MAX_BYTES = 4 * 2**20  # some ten thousand events
 MAX_DEPTH = 32
+
+
+class Table(BaseModel):
+    """Base of the tables of a law file: unknown keys and wrong types are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def _number(value: Any) -> float | str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        with suppress(OverflowError):
+            return float(value)
+    raise PydanticCustomError("number", "must be a number or an expression over the parameters")
+
+
+# a number or an expression over the law's parameters; one union would give two errors a mistake
+Number = Annotated[float | str, PlainValidator(_number, json_schema_input_type=float | str)]
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from gfm_plant import Plant, make_plant
-from gfm_plant.options import DS2004, DS2101
+from gfm_plant.options import DS2004, DS2101, MEASURED
 
 
 def test_a_scenario_table() -> None:
@@ -83,7 +83,7 @@ def test_sampling_period(T_s: float) -> None:
 
 def test_boards_of_the_rig() -> None:
     assert (DS2004.bits, DS2101.bits) == (16, 12)
-    assert set(DS2004.range) == {"v_dc", "p", "q", "V"}
+    assert set(DS2004.range) == set(MEASURED)
     assert "omega_u" not in DS2101.range
 
 

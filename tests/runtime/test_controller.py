@@ -56,8 +56,9 @@ def test_a_fresh_record_is_init_with_the_tables_ranges() -> None:
     ctl = make_controller(hold=3)[0]
     assert (ctl["state"], ctl["reason"], ctl["request"], ctl["hold"]) == (INIT, OK, -1, 3)
     np.testing.assert_array_equal(ctl["ref"], [s.default for s in group("ref")])
-    np.testing.assert_array_equal(ctl["y_low"], [s.low for s in SIGNALS[:NY]])
-    np.testing.assert_array_equal(ctl["y_high"], [s.high for s in SIGNALS[:NY]])
+    measured = (*SIGNALS[:NY], *group("y_inner"))
+    np.testing.assert_array_equal(ctl["y_low"], [s.low for s in measured])
+    np.testing.assert_array_equal(ctl["y_high"], [s.high for s in measured])
 
 
 def test_ready_does_nothing_until_started() -> None:

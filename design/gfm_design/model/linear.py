@@ -157,7 +157,7 @@ def linearise_plant(
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
         C = np.zeros_like(C)
         C[_MEASURED, s] = np.eye(4)
-    C[_MEASURED] *= r["gain"][:, None]
+    C[_MEASURED] *= r["gain"][: len(_MEASURED), None]
     return LinearPlant(A, B, B_d, C, C_true)
 
 

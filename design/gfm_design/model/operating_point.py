@@ -8,7 +8,9 @@ it. A regulated DC source holds v_dc = 1, and row 1 of the law does not act.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import cmath
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from gfm_plant import NoEquilibrium, plant_equilibrium
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
 from gfm_plant.records import PlantRecord
+from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.tustin import DiscreteLaw
 
@@ -31,16 +34,25 @@ class OperatingPoint:
     """The common equilibrium of plant and law, all in p.u.
 
     Attributes:
-        x: the plant's state, shape (8,), order as in ``gfm_plant.model``.
-        u: the inputs, shape (3,); i_u is the current of the DC source, also of a regulated one.
+        x: the plant's state, shape (8,), order as in ``gfm_plant.model``, in the frame of the law:
+            its E_u lies on the d axis.
+        u: the law's output, shape (3,); i_u is the current of the DC source, also of a regulated
+            one.
         y: the outputs as the sensors report them, shape (5,).
         x_law: the law's state, shape (n,).
+        e: the bridge's voltage e_d + j e_q in that frame; E_u without an inner stage.
     """
 
     x: Vector
     u: Vector
     y: Vector
     x_law: Vector
+    e: complex
+
+    @property
+    def commands(self) -> Vector:
+        """(i_u, omega_u, e_d, e_q), shape (4,), p.u.: what the bridge gets."""
+        return np.array([self.u[0], self.u[1], self.e.real, self.e.imag])
 
 
 def operating_point(
@@ -75,6 +87,7 @@ def operating_point(
         dx = f(x, u, d, par)
         dc = u_law[0] - u[0] if controlled else x[V_DC] - 1.0
         ac = np.delete(dx, DELTA)  # delta rests by omega_u = omega_g
+        u[2] = abs(_internal(law, x, u, limited=False))
         rest = (x_next - x_law)[kept] / law.T_s
         return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], rest])
 
@@ -94,7 +107,8 @@ def operating_point(
             if np.abs(residual(z)).max() > 1e-5:
                 break
             x, u, y, x_law = _unpack(z, par, law, omega_g, kept)
-            return OperatingPoint(x, u, y, x_law)
+            x, u, e = _in_frame_of_law(law, x, u)
+            return OperatingPoint(x, u, y, x_law, e)
     idle = controlled and not (law.C[0].any() or law.D_y[0].any())
     cause = "; nothing holds v_dc: row 1 answers to no measurement" if idle else ""
     raise NoEquilibrium(
@@ -103,13 +117,40 @@ def operating_point(
     )
 
 
+def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> complex:
+    """The law's E for a bridge that rests at u: with an inner stage another voltage, behind it."""
+    inner, e = law.law.inner, complex(u[2])
+    if inner is None:
+        return e
+    if not limited:
+        inner = replace(inner, I_max=math.inf)
+    i, v, i_o = (complex(x[k], x[k + 1]) for k in (0, 2, 4))
+    try:
+        return inner.internal_voltage(i, v, i_o, e, float(u[1]))
+    except LawError as problem:
+        raise NoEquilibrium(str(problem)) from None
+
+
+def _in_frame_of_law(law: DiscreteLaw, x: Vector, u: Vector) -> tuple[Vector, Vector, complex]:
+    """The state, the law's output and the bridge's voltage, turned so that E lies on the d axis."""
+    E = _internal(law, x, u)
+    turn = E.conjugate() / abs(E)
+    turned = x.copy()
+    for k in (0, 2, 4):
+        w = complex(x[k], x[k + 1]) * turn
+        turned[k : k + 2] = w.real, w.imag
+    turned[DELTA] += cmath.phase(E)
+    return turned, np.array([u[0], u[1], abs(E)]), u[2] * turn
+
+
 def _unpack(
     z: Vector, par: PlantRecord, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
 ) -> tuple[Vector, Vector, Vector, Vector]:
     x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
     y = g(x, u)
     measured = np.array(SENSED)
-    y[measured] = par[0]["gain"] * y[measured] + par[0]["offset"]
+    gain, offset = (par[0][name][: len(measured)] for name in ("gain", "offset"))
+    y[measured] = gain * y[measured] + offset
     x_law = np.zeros(law.order)
     x_law[kept] = z[N_X + 2 :]
     return x, u, y, x_law

@@ -22,7 +22,7 @@ from gfm_hil.links import Port
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.realtime.clock import between_looks, now_ns, wait_until
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import Vector, names
 
 SILENCE_NS = 1_000_000_000
 LONGEST = 512  # bytes
@@ -32,7 +32,7 @@ _LOOKS = 1024  # polls between two reads of the clock
 Messages = NDArray[np.uint8]
 
 
-def frames(group: Group) -> Messages:
+def frames(group: Vector) -> Messages:
     """The bench's frames with consecutive sequences; shape (256, bytes)."""
     writer, values = FrameWriter(group), np.ones(len(names(group)))
     packed = b"".join(writer.pack(k, 0, 0, values) for k in range(_DIFFERENT))

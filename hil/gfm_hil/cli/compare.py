@@ -52,7 +52,7 @@ def call(options: argparse.Namespace) -> int:
         name: resolve(options, in_process=not asked, law=name) for name in dict.fromkeys(names)
     }
     folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
-    check_free(folder, base.ticks * len(scenarios))
+    check_free(folder, base.ticks * len(scenarios), base.has_inner)
     runs: dict[str, Run] = {}
     for name, scenario in scenarios.items():
         with progress_bar(scenario, name, options.quiet) as (progress, notice):

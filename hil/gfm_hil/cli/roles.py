@@ -39,7 +39,7 @@ def call(options: argparse.Namespace) -> int:
         with in_use(folder):
             run_role(role, scenario, folder, notice=lambda text: None)
         return 0
-    check_free(folder, scenario.ticks)
+    check_free(folder, scenario.ticks, scenario.has_inner)
 
     def notice(text: str) -> None:
         if not options.quiet:

@@ -161,7 +161,7 @@ class CommandServer:
         c = self._bench.controller
         if isinstance(event, Gains):
             gains = {**c.gains, **event.values}
-            retuned(c.asked, tuple(sorted(gains.items())), c.T_s)
+            retuned(c.asked, tuple(sorted(gains.items())), c.T_s, c.sets[c.asked].inner)
         if isinstance(event, Reset) and self._bench.scenario.after_trip == "end":
             raise ValueError("reset: this run ends at a trip; after_trip = 'wait' in its scenario")
         if ours == "plant":

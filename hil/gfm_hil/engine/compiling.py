@@ -107,13 +107,15 @@ _IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)
 
 
 def _both(found: list[Bench]) -> Set:
-    return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1))
+    return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1, found[0].inner))
 
 
 def _role(role: Role, found: list[Bench]) -> Set:
-    plant, controller = buffers(1)
-    part = plant if role == "plant" else controller
-    return f"the {role}", lambda: compile_role(role, found[0], part)
+    def compile_it() -> None:
+        plant, controller = buffers(1, found[0].inner)
+        compile_role(role, found[0], plant if role == "plant" else controller)
+
+    return f"the {role}", compile_it
 
 
 def _link(name: str, options: dict[str, Any]) -> Set:

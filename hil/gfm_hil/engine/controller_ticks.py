@@ -64,7 +64,7 @@ def controller_ticks(end, records, controller, event):
         times[k, 3] = sent = now_ns()
         if r.realtime and end.spins == 0:
             give_way()  # to the link's own thread: a sleep takes 9 µs before it leaves
-        record_controller(rows[k], ctl, est)
+        record_controller(rows[k], ctl, states, est)
         r.done += 1
         progress[0], progress[1] = k + 1, ctl[0].reason
         if ctl[0].state != r.seen or ctl[0].changes != changes:

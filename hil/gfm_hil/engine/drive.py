@@ -50,7 +50,7 @@ class _Loop:
         scenario, port, c = bench.scenario, link.port, bench.controller
         plant = role == "plant"
         self.link = link
-        self.writer = FrameWriter("y" if plant else "u")
+        self.writer = FrameWriter("y" if plant else "u", bench.inner)
         self.reader = FrameReader.of(role, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         self.loop["spin_limit"] = port.spin_limit
@@ -87,6 +87,11 @@ class _Loop:
         """Plant: the next tick; controller: the last one received."""
         return int(self.loop["tick"][0])
 
+    def keep_u(self, u: NDArray[np.float64]) -> None:
+        """Take u as the two newest that came."""
+        for name in ("u_last", "u_before"):
+            self.loop[name][0, : len(u)] = u
+
     def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
         """Tell the other side how this side ends."""
         tick = max(self.tick, 0)
@@ -98,7 +103,7 @@ def drive_plant(
 ) -> FrameReader:
     """Run the plant's side of a scenario after the handshake; returns its frame counters."""
     loop, ticks = _Loop("plant", bench, link, part, t0_ns, flags), bench.scenario.ticks
-    loop.loop["u_last"] = loop.loop["u_before"] = bench.u
+    loop.keep_u(bench.u)
     waits = bench.scenario.after_trip == "wait"
     while timeline.running:
         timeline.carry_out(loop.tick)
@@ -106,7 +111,7 @@ def drive_plant(
         tick = loop.tick
         if why == Why.RESTORE:
             bench.restore_plant(tick)
-            loop.loop["u_last"] = loop.loop["u_before"] = bench.u
+            loop.keep_u(bench.u)
         timeline.look(max(tick - 1, 0))
         if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):
             timeline.finish(tick)

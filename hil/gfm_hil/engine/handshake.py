@@ -33,7 +33,7 @@ from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError, FrameReader
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime.signals import NY, TABLE_VERSION, table_hash
+from gfm_runtime.signals import TABLE_VERSION, carried, table_hash
 
 _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
@@ -252,7 +252,9 @@ def _boot() -> str:
 def _tick(message: bytes, scenario: Scenario) -> int | None:
     """The tick of a plant's frame that a controller would accept as its first; None otherwise."""
     try:
-        return FrameReader.of("controller", scenario).unpack(message, np.empty(NY))
+        return FrameReader.of("controller", scenario).unpack(
+            message, np.empty(len(carried("y", scenario.has_inner)))
+        )
     except FrameError:
         return None
 

@@ -16,10 +16,9 @@ from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.tick import advance, answer, obey, sample
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import (
-    CONTROLLER_COLUMNS,
     CONTROLLER_TIMES,
-    PLANT_COLUMNS,
     PLANT_TIMES,
+    signals_of,
 )
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller
@@ -40,7 +39,7 @@ def _run_ticks(plant, controller, y, u, plant_rows, controller_rows, start, stop
         before = ctl[0].state
         tripped = sample(par, st, y, plant_rows[k])
         answer(ctl, laws, states, est, y, u, tripped != 0)
-        record_controller(controller_rows[k], ctl, est)
+        record_controller(controller_rows[k], ctl, states, est)
         record_command(plant_rows[k], u)
         if delayed:  # as over a link, where u[k] may come meanwhile
             plant_step(par, st)
@@ -68,8 +67,7 @@ def run_ticks(
 
     Args:
         bench: at tick ``start``.
-        plant_rows, controller_rows: of every tick, columns ``PLANT_COLUMNS`` and
-            ``CONTROLLER_COLUMNS``.
+        plant_rows, controller_rows: of every tick, columns as ``signals_of`` says.
     """
     c = bench.controller
     return int(_run_ticks(
@@ -102,8 +100,9 @@ def run_inproc(
     timeline.finish(k)
 
 
-def buffers(ticks: int) -> tuple[Part, Part]:
-    """Room in memory to record one run: the plant's and the controller's."""
+def buffers(ticks: int, inner: bool = False) -> tuple[Part, Part]:
+    """Room in memory to record one run, with an inner stage or not: the plant's and the
+    controller's."""
 
     def part(columns: Sequence[str], times: Sequence[str]) -> Part:
         return Part(
@@ -112,7 +111,10 @@ def buffers(ticks: int) -> tuple[Part, Part]:
             np.zeros(2, np.int64),
         )
 
-    return part(PLANT_COLUMNS, PLANT_TIMES), part(CONTROLLER_COLUMNS, CONTROLLER_TIMES)
+    return (
+        part(signals_of("plant", inner), PLANT_TIMES),
+        part(signals_of("controller", inner), CONTROLLER_TIMES),
+    )
 
 
 def compile_loop(bench: Bench, plant_part: Part, controller_part: Part) -> None:

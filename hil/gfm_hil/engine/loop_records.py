@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime.signals import NU
+from gfm_runtime.signals import NU_INNER
 from gfm_runtime.states import RUNNING
 
 
@@ -56,8 +56,8 @@ loop_dtype = np.dtype(
         ("woken", "i8"),  # ``flags[WAKE]`` as last seen
         ("waits", "i8"),  # after a trip or in SAFE: for a reset, instead of ending the run
         ("seen", "i8"),  # controller: the state with which it last returned
-        ("u_last", "f8", (NU,)),  # the two newest u that came in time
-        ("u_before", "f8", (NU,)),
+        ("u_last", "f8", (NU_INNER,)),  # the two newest u that came in time
+        ("u_before", "f8", (NU_INNER,)),
         ("phase", "f8"),  # controller: earliest arrivals of frames after t0 + k T, ns
     ],
     align=True,
@@ -90,7 +90,8 @@ class Records(NamedTuple):
     Attributes:
         loop: one element of ``loop_dtype``.
         flags: shape (FLAGS,), int64, written by other threads.
-        y, u: measurements (5,) and inputs (3,) of the current tick, p.u.
+        y, u: measurements (5,) and inputs (3,) of the current tick, (11,) and (4,) with an inner
+            stage, p.u.
         rows, times, progress: of the recording's part.
     """
 

@@ -25,7 +25,6 @@ from gfm_plant.names import CONTROLLER
 from gfm_plant.names import SILENT as NOT_HEARD
 from gfm_plant.protection import trip
 from gfm_runtime.compiled import compiled, inlined
-from gfm_runtime.signals import NU
 from gfm_runtime.states import PLANT_TRIP, SAFE
 
 _U_ID = 2
@@ -98,10 +97,10 @@ def plant_ticks(end, records, plant, last):
             if hurried:
                 unseen = k
             if r.extrapolate > 0:
-                for j in range(NU):
+                for j in range(len(u)):
                     r.u_before[j], r.u_last[j] = r.u_last[j], u[j]
         elif r.realtime and r.late < r.extrapolate:
-            for j in range(NU):
+            for j in range(len(u)):
                 u[j] = r.u_last[j] + (r.late + 1) * (r.u_last[j] - r.u_before[j])
         record_command(rows[k], u)
         progress[0] = k + 1

@@ -36,7 +36,7 @@ from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
-from gfm_runtime.signals import names
+from gfm_runtime.signals import carried
 
 
 def run_role(
@@ -69,8 +69,8 @@ def _run(
     if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
         write_text(folder / "scenario.toml", scenario_toml(scenario))
     if scenario.mode == "realtime":
-        keep_in_memory(folder, scenario.ticks, notice)
-    part = Part.create(folder, role, scenario.ticks)
+        keep_in_memory(folder, scenario.ticks, notice, bench.inner)
+    part = Part.create(folder, role, scenario.ticks, bench.inner)
     compile_role(role, bench, part)
     timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
     flags = np.zeros(FLAGS, np.int64)
@@ -151,9 +151,9 @@ def compile_role(role: Role, bench: Bench, part: Part) -> None:
     plant_command(par, st, u)
     warm_up(bench.controller)
     for group in DATA_IDS:
-        values = np.zeros(len(names(group)))
-        reader = FrameReader(group)
-        reader.unpack(FrameWriter(group).pack(0, 0, 0, values), values)
+        values = np.zeros(len(carried(group, bench.inner)))
+        reader, writer = FrameReader(group, bench.inner), FrameWriter(group, bench.inner)
+        reader.unpack(writer.pack(0, 0, 0, values), values)
         judge(reader.record, False, False)
     compile_loops(role, bench, part)
     pump.warm_up()
@@ -161,4 +161,5 @@ def compile_role(role: Role, bench: Bench, part: Part) -> None:
         record_sample(part.signals[0].copy(), y, par, st)
         record_command(part.signals[0].copy(), u)
     else:
-        record_controller(part.signals[0].copy(), bench.controller.ctl, bench.controller.est)
+        c = bench.controller
+        record_controller(part.signals[0].copy(), c.ctl, c.states, c.est)

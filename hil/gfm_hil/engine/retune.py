@@ -19,7 +19,9 @@ Gains = tuple[tuple[str, float], ...]
 
 
 @lru_cache(maxsize=64)
-def retuned(name: str, gains: Gains, T_s: float) -> tuple[DiscreteLaw, NDArray[Any]]:
+def retuned(
+    name: str, gains: Gains, T_s: float, inner: str | None = None
+) -> tuple[DiscreteLaw, NDArray[Any]]:
     """A law with some gains changed, discretised, and packed for the kernel.
 
     A gain that the law file ties to a changed one follows it unless it is given too. The newest
@@ -32,7 +34,7 @@ def retuned(name: str, gains: Gains, T_s: float) -> tuple[DiscreteLaw, NDArray[A
         file = law_file(name)
         if file.schedule is not None:
             raise LawError(f"law {name}", "is scheduled: its gains change by themselves")
-        (law,) = load_law(name, **tied(file, dict(gains))).laws
+        (law,) = load_law(name, inner, **tied(file, dict(gains))).laws
         discrete = discretise(law, T_s)
         return discrete, pack_law(discrete)
     except LawError as problem:
@@ -49,5 +51,7 @@ def change_gains(controller: Controller, values: Mapping[str, float]) -> int:
         ValueError: as ``retuned``.
     """
     gains = {**controller.gains, **values}
-    ready = retuned(controller.asked, tuple(sorted(gains.items())), controller.T_s)
+    name = controller.asked
+    inner = controller.sets[name].inner
+    ready = retuned(name, tuple(sorted(gains.items())), controller.T_s, inner)
     return controller.retune(*ready, gains)

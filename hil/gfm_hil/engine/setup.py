@@ -20,7 +20,7 @@ from gfm_hil.scenario.model import Scenario
 from gfm_plant import NoEquilibrium, make_plant, plant_init
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.signals import NY
+from gfm_runtime.signals import NY, NY_INNER, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
 
@@ -31,8 +31,8 @@ class Bench:
     Attributes:
         par, st: the plant's records.
         controller: the controller, its first law at rest and RUNNING.
-        y: measurements of the current tick, shape (5,), p.u.
-        u: inputs of the current tick, shape (3,), p.u.
+        y: measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
+        u: inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
     """
 
     scenario: Scenario
@@ -42,6 +42,11 @@ class Bench:
     start: OperatingPoint
     y: NDArray[np.float64]
     u: NDArray[np.float64]
+
+    @property
+    def inner(self) -> bool:
+        """Whether frames and recording carry the signals of an inner stage."""
+        return self.controller.inner
 
     def keep(self) -> None:
         """Remember this instant as the start, to which a reset goes back."""
@@ -53,7 +58,7 @@ class Bench:
     def restore_plant(self, tick: int) -> None:
         """Put the plant and its grid back to their start at a tick, and clear the trip."""
         self.par[:], self.st[:] = self._plant
-        self.st["tick"], self.u[:] = tick, self.start.u
+        self.st["tick"], self.u[:] = tick, self.start.commands[: len(self.u)]
 
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
@@ -67,7 +72,8 @@ class Bench:
             raise ValueError(f"reset: the controller is {STATES[state]}, not SAFE")
         c.ctl[:], c.laws[:], c.states[:], c.est[:] = self._controller
         c.asked, c.gains = self._asked, {}
-        c.ctl["state"], c.ctl["changes"], self.u[:] = READY, changes, self.start.u
+        c.ctl["state"], c.ctl["changes"] = READY, changes
+        self.u[:] = self.start.commands[: len(self.u)]
 
 
 def make_bench(scenario: Scenario) -> Bench:
@@ -84,7 +90,7 @@ def make_bench(scenario: Scenario) -> Bench:
     par, st = make_plant(plant, scenario.T_s)
     references = scenario.references.vector()
     # under the name that events use: the name inside a law file may differ
-    sets = [replace(load_law(name), name=name) for name in scenario.laws()]
+    sets = [replace(load_law(name, scenario.inner), name=name) for name in scenario.laws()]
     controller = Controller(
         sets,
         scenario.T_s,
@@ -102,9 +108,15 @@ def make_bench(scenario: Scenario) -> Bench:
         )
     except NoEquilibrium as problem:
         raise UserError(f"references, plant.grid: {problem}") from None
-    plant_init(par, st, start.x, start.u)
-    controller.start(start.x_law, start.u)
-    bench = Bench(scenario, par, st, controller, start, np.zeros(NY), start.u.copy())
+    plant_init(par, st, start.x, start.commands)
+    y = np.zeros(len(carried("y", controller.inner)))
+    if controller.inner:
+        y[:NY], y[NY:] = start.y, start.x[: NY_INNER - NY]
+        controller.start(start.x_law, start.u, y, start.e)
+    else:
+        controller.start(start.x_law, start.u)
+    u = start.commands[: len(carried("u", controller.inner))].copy()
+    bench = Bench(scenario, par, st, controller, start, np.zeros(len(y)), u)
     bench.keep()
     _ready_gains(scenario)
     return bench
@@ -125,6 +137,6 @@ def _ready_gains(scenario: Scenario) -> None:
         elif isinstance(event, Gains):
             gains.update(event.values)
             try:
-                retuned(name, tuple(sorted(gains.items())), scenario.T_s)
+                retuned(name, tuple(sorted(gains.items())), scenario.T_s, scenario.inner)
             except ValueError as problem:
                 raise UserError(f"events, {event.label()}: {problem}") from None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.links.crc import crc32
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import TABLE_VERSION, Group, names
+from gfm_runtime.signals import TABLE_VERSION, Vector, carried
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 MAGIC = 0x4647  # "GF"
@@ -214,7 +214,7 @@ if TYPE_CHECKING:
 
 LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
 
-DATA_IDS: dict[Group, int] = {"y": 1, "u": 2}
+DATA_IDS: dict[Vector, int] = {"y": 1, "u": 2}
 
 
 class FrameError(ValueError):
@@ -225,11 +225,11 @@ class FrameError(ValueError):
         self.fault = fault
 
 
-def frame_dtype(group: Group) -> np.dtype:
+def frame_dtype(group: Vector, inner: bool = False) -> np.dtype:
     """The layout as a NumPy record with one field per signal, for tools that read recordings."""
-    wire = wire_dtype(len(names(group)))
+    wire = wire_dtype(len(carried(group, inner)))
     fields = [(name, wire[name]) for name in wire.names or () if name not in ("values", "crc")]
-    return np.dtype([*fields, *((name, "<f8") for name in names(group)), ("crc", "<u4")])
+    return np.dtype([*fields, *((name, "<f8") for name in carried(group, inner)), ("crc", "<u4")])
 
 
 class FrameWriter:
@@ -237,11 +237,12 @@ class FrameWriter:
 
     Args:
         group: ``"y"`` or ``"u"``.
+        inner: the run has an inner stage, whose signals follow in the frame.
     """
 
-    def __init__(self, group: Group) -> None:
+    def __init__(self, group: Vector, inner: bool = False) -> None:
         self.sequence = np.zeros(1, np.int64)
-        self.frame, self.message = buffer(len(names(group)), DATA_IDS[group])
+        self.frame, self.message = buffer(len(carried(group, inner)), DATA_IDS[group])
 
     def pack(self, tick: int, state: int, reason: int, values: NDArray[np.float64]) -> bytes:
         """One frame; ``values`` has the shape of the group, p.u."""
@@ -259,6 +260,7 @@ class FrameReader:
 
     Args:
         group: ``"y"`` or ``"u"``. Without ``of``, the reader limits neither the tick nor the gap.
+        inner: as for ``FrameWriter``.
     """
 
     @classmethod
@@ -268,7 +270,8 @@ class FrameReader:
         A gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone. The
         plant's loop writes its own tick into ``newest`` at every tick.
         """
-        reader, link = cls("u" if role == "plant" else "y"), scenario.link
+        reader = cls("u" if role == "plant" else "y", scenario.has_inner)
+        link = scenario.link
         lockstep, r = scenario.mode == "lockstep", reader.record
         r["delta"] = math.ceil(link.peer_timeout_s / scenario.T_s) + 1
         asked = math.ceil(min(link.peer_timeout_s / link.repeat_s, LONGEST_JUMP))
@@ -282,11 +285,11 @@ class FrameReader:
             r["leaving"] = STOPPED
         return reader
 
-    def __init__(self, group: Group) -> None:
+    def __init__(self, group: Vector, inner: bool = False) -> None:
         self.group = group
         self.record = make_reader()
         self.data_id = DATA_IDS[group]
-        self.frame, self.message = buffer(len(names(group)), self.data_id)
+        self.frame, self.message = buffer(len(carried(group, inner)), self.data_id)
 
     @property
     def faults(self) -> dict[Fault, int]:

@@ -19,7 +19,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_plant import TRUTH
 from gfm_plant.names import TRIP_REASONS
-from gfm_runtime.signals import REF_NAMES, SIGNALS, U_NAMES, Y_NAMES
+from gfm_runtime.signals import REF_NAMES, SIGNALS, U_NAMES, Y_NAMES, names
 from gfm_runtime.states import STATES
 
 PLANT_COLUMNS = (
@@ -27,6 +27,9 @@ PLANT_COLUMNS = (
     *(f"u_{n}" for n in U_NAMES),
     *(f"true_{n}" for n in TRUTH),
 )
+#: a run with an inner stage records these after the plant's and the controller's
+PLANT_INNER = (*(f"y_{n}" for n in names("y_inner")), *(f"u_{n}" for n in names("u_inner")))
+CONTROLLER_INNER = ("E_law", "i_ref_d", "i_ref_q", "limited")
 CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
 # ns of CLOCK_MONOTONIC, -1: never; in lockstep a sample late, an answer is "received" at the look
 # that finds the next frame "sent"; "stall" is the longest gap between two looks at the clock
@@ -38,7 +41,26 @@ SIGNALS_OF: dict[Role, tuple[str, ...]] = {
     "controller": CONTROLLER_COLUMNS,
 }
 TIMES_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
-BYTES_PER_TICK = 8 * sum(map(len, [*SIGNALS_OF.values(), *TIMES_OF.values()]))
+_INNER_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_INNER, "controller": CONTROLLER_INNER}
+
+
+def signals_of(role: Role, inner: bool) -> tuple[str, ...]:
+    """The columns that a role records, without times; ``inner``: the run has an inner stage."""
+    return SIGNALS_OF[role] + (_INNER_OF[role] if inner else ())
+
+
+def recorded_in(role: Role, width: int) -> tuple[str, ...]:
+    """The columns of a recording of so many of them; empty if no run records so many."""
+    return {len(names): names for names in (signals_of(role, x) for x in (False, True))}.get(
+        width, ()
+    )
+
+
+def bytes_per_tick(inner: bool = False) -> int:
+    """What a tick takes in the parts of a run."""
+    signals = [signals_of(role, inner) for role in SIGNALS_OF]
+    return 8 * sum(map(len, [*signals, *TIMES_OF.values()]))
+
 
 PIECE = 1 << 18  # ticks of a column that a reader holds in memory at a time
 
@@ -156,11 +178,22 @@ def _table() -> dict[str, Described]:
         Described(
             "X_est", "X_{est}", "p.u. (Z_b)", "grid reactance as a scheduled law estimates it"
         ),
+        *_signals("y", ("y_inner",), _SENSOR),
+        *_signals("u", ("u_inner",), _COMMAND),
+        Described("E_law", "E_u", "p.u. (V_n)", "voltage that the law asks for"),
+        *(
+            Described(f"i_ref_{a}", f"i^*_{a}", "p.u. (S_n/V_n)",
+                      f"current that the inner stage asks for, {a}")
+            for a in "dq"
+        ),
+        Described("limited", "", "", "whether the inner stage limits the current", "",
+                  ((0, "no"), (1, "yes"))),
         *(_time(role, name) for role, times in TIMES_OF.items() for name in times),
     ]  # fmt: skip
     found = {row.name: row for row in rows}
     times = [f"{role}_{name}" for role, names in TIMES_OF.items() for name in names]
-    return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *times)}
+    inner = (*PLANT_INNER, *CONTROLLER_INNER)
+    return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *inner, *times)}
 
 
 TABLE = _table()
@@ -199,7 +232,7 @@ def named(
     role: Role, signals: NDArray[Any], times: NDArray[Any] | None = None
 ) -> dict[str, NDArray[Any]]:
     """A side's arrays, shape (ticks, columns) each, as views of shape (ticks,) by column name."""
-    found = {name: signals[:, j] for j, name in enumerate(SIGNALS_OF[role])}
+    found = {name: signals[:, j] for j, name in enumerate(recorded_in(role, signals.shape[1]))}
     if times is not None:
         found |= {f"{role}_{name}": times[:, j] for j, name in enumerate(TIMES_OF[role])}
     return found

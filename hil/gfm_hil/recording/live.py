@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import SIGNALS_OF, Columns, named
+from gfm_hil.recording.columns import Columns, named, recorded_in
 from gfm_hil.recording.parts import Part
 from gfm_runtime.toml_file import read_toml
 
@@ -64,7 +64,8 @@ class LiveRun:
 
     def row(self, role: Role, tick: int) -> dict[str, float]:
         """What a side recorded in a tick that is done, by column, without its times."""
-        return dict(zip(SIGNALS_OF[role], self.parts[role].signals[tick].tolist(), strict=True))
+        values = self.parts[role].signals[tick].tolist()
+        return dict(zip(recorded_in(role, len(values)), values, strict=True))
 
     @property
     def misses(self) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import CONTROLLER_COLUMNS, SIGNALS_OF, TIMES_OF
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, TIMES_OF, recorded_in
 from gfm_hil.recording.npz import BLOCK, Table, write_npz
 from gfm_hil.recording.parts import Part
 from gfm_runtime.assembly import SPARE
@@ -49,11 +49,18 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> None:
     files = {role: folder / "parts" / f"{role}_signals.npy" for role in parts}
     counts = {role: _recorded(files[role], len(part.signals)) for role, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
-    write_npz(folder / "signals.npz", _signals(files, done, T_s, laws))
+    columns = {role: recorded_in(role, part.signals.shape[1]) for role, part in parts.items()}
+    write_npz(folder / "signals.npz", _signals(files, columns, done, T_s, laws))
     write_npz(folder / "timing.npz", _timing(folder / "parts", [*parts], done))
 
 
-def _signals(files: dict[Role, Path], done: int, T_s: float, laws: list[str]) -> Iterator[Table]:
+def _signals(
+    files: dict[Role, Path],
+    columns: dict[Role, tuple[str, ...]],
+    done: int,
+    T_s: float,
+    laws: list[str],
+) -> Iterator[Table]:
     kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
 
     def clock(first: int, last: int) -> list[NDArray[Any]]:
@@ -74,10 +81,10 @@ def _signals(files: dict[Role, Path], done: int, T_s: float, laws: list[str]) ->
         return read
 
     if "plant" in files:
-        kinds = dict.fromkeys(SIGNALS_OF["plant"], np.dtype(float))
+        kinds = dict.fromkeys(columns["plant"], np.dtype(float))
         yield Table(kinds, done, rows(files["plant"], None))
     if "controller" in files:
-        kinds = dict.fromkeys(CONTROLLER_COLUMNS, np.dtype(float))
+        kinds = dict.fromkeys(columns["controller"], np.dtype(float))
         yield Table(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
     yield Table.of(laws=np.array(known_laws(laws, used)))
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import BYTES_PER_TICK, SIGNALS_OF, TIMES_OF
+from gfm_hil.recording.columns import TIMES_OF, bytes_per_tick, recorded_in, signals_of
 
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
@@ -41,9 +41,12 @@ class Part:
     progress: NDArray[np.int64]
 
     @staticmethod
-    def create(folder: Path, role: Role, ticks: int) -> Part:
-        """New files in ``folder``/parts, filled so that no page is first touched in the loop."""
-        columns, times = SIGNALS_OF[role], TIMES_OF[role]
+    def create(folder: Path, role: Role, ticks: int, inner: bool = False) -> Part:
+        """New files in ``folder``/parts, filled so that no page is first touched in the loop.
+
+        ``inner``: the run has an inner stage, and records its signals.
+        """
+        columns, times = signals_of(role, inner), TIMES_OF[role]
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
@@ -75,15 +78,15 @@ class Part:
         except Exception:  # missing or incomplete; numpy has no common base for its errors
             return None
         signals, times, progress = arrays
-        columns, names = SIGNALS_OF[role], TIMES_OF[role]
         kinds = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
-        widths = (signals.shape[1:], times.shape[1:]) == ((len(columns),), (len(names),))
+        known = signals.ndim == 2 and recorded_in(role, signals.shape[1]) != ()
+        widths = known and times.shape[1:] == (len(TIMES_OF[role]),)
         whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)
         return Part(*arrays) if whole and 0 <= progress[0] <= len(signals) else None
 
 
 def keep_in_memory(
-    folder: Path, ticks: int, notice: Callable[[str], None] = lambda text: None
+    folder: Path, ticks: int, notice: Callable[[str], None] = lambda text: None, inner: bool = False
 ) -> None:
     """Keep the parts of a run in memory until they are merged, if there is room.
 
@@ -99,7 +102,7 @@ def keep_in_memory(
     if not _MEMORY.is_dir():
         return
     _rescue(notice)
-    needed = BYTES_PER_TICK * ticks
+    needed = bytes_per_tick(inner) * ticks
     parts = folder / "parts"
     if not parts.is_symlink():
         if shutil.disk_usage(_MEMORY).free < 2 * needed:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from gfm_hil.realtime.atomics import prefetch
-from gfm_plant import plant_truth
+from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.compiled import compiled
-from gfm_runtime.signals import NU, NY
+from gfm_runtime.signals import NU, NY, NY_INNER
 
-_TRUE = NY + NU
+_TRUE, _Y_INNER = NY + NU, NY + NU + len(TRUTH)
+_U_INNER = _Y_INNER + NY_INNER - NY
 _SOON = 8  # rows; a page that is new to the processor would hold up the tick that begins it
 
 
@@ -18,6 +19,8 @@ def record_sample(row, y, par, st):
     for j in range(NY):
         row[j] = y[j]
     plant_truth(par, st, row[_TRUE:])
+    for j in range(NY, len(y)):
+        row[_Y_INNER + j - NY] = y[j]
 
 
 @compiled
@@ -25,11 +28,13 @@ def record_command(row, u):
     """Fill the rest of the row when u has come."""
     for j in range(NU):
         row[NY + j] = u[j]
+    for j in range(NU, len(u)):
+        row[_U_INNER + j - NU] = u[j]
 
 
 @compiled
-def record_controller(row, ctl, est):
-    """One row of CONTROLLER_COLUMNS."""
+def record_controller(row, ctl, states, est):
+    """One row of CONTROLLER_COLUMNS, and CONTROLLER_INNER if it is longer."""
     prefetch(row.ctypes.data + _SOON * row.nbytes)
     c = ctl[0]
     for j in range(NY):
@@ -37,3 +42,7 @@ def record_controller(row, ctl, est):
     row[NY] = c.active
     row[NY + 1] = c.state
     row[NY + 2] = est[0].X
+    if len(row) > NY + 3:
+        s = states[c.active]
+        row[NY + 3], row[NY + 4], row[NY + 5] = c.u[2], s.i_ref[0], s.i_ref[1]
+        row[NY + 6] = s.limited

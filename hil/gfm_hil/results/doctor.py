@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
-from gfm_hil.recording.columns import BYTES_PER_TICK
+from gfm_hil.recording.columns import bytes_per_tick
 
 Level = Literal["green", "yellow", "red"]
 Facts = dict[str, Any]
@@ -30,7 +30,7 @@ _CAP_SYS_NICE = 23
 _FAST_CLOCKS = {"tsc", "arch_sys_counter", "riscv_clocksource", "kvm-clock"}
 _FAST_CLOCKS |= {"hyperv_clocksource_tsc_page"}
 _WAKE_US = 20  # of a tick of 100 µs
-_MINUTE_BYTES = 60 * 10_000 * BYTES_PER_TICK
+_MINUTE_BYTES = 60 * 10_000 * bytes_per_tick()
 _NEEDED = ("numpy", "numba", "pyzmq", "python-can")
 
 

@@ -25,7 +25,7 @@ from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.columns import BYTES_PER_TICK, Columns
+from gfm_hil.recording.columns import Columns, bytes_per_tick
 from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.npz import Table, write_npz
@@ -37,11 +37,12 @@ from gfm_hil.scenario.model import Scenario, load_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
-_BYTES_PER_TICK = BYTES_PER_TICK + 16  # in the files, which have tick and t as well
 
 
-def check_free(folder: Path, ticks: int) -> None:
+def check_free(folder: Path, ticks: int, inner: bool = False) -> None:
     """See that a run may be recorded in ``folder``, which need not exist.
+
+    ``inner``: the run has an inner stage.
 
     Raises:
         UserError: it holds something, cannot be made or written, or the disk is too full; a
@@ -55,7 +56,7 @@ def check_free(folder: Path, ticks: int) -> None:
     if there == folder and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     # the parts stay until the run's files are there, which compression may not make smaller
-    needed = 2 * _BYTES_PER_TICK * ticks
+    needed = 2 * (bytes_per_tick(inner) + 16) * ticks  # with tick and t
     free = shutil.disk_usage(there).free
     if needed > free:
         raise UserError(

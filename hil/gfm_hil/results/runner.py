@@ -56,7 +56,7 @@ def run_scenario(
         UserError: the folder is in use, no operating point, an endpoint that is occupied. The
             folder is then left as it was.
     """
-    check_free(folder, scenario.ticks)
+    check_free(folder, scenario.ticks, scenario.has_inner)
     # here, so that two processes do not compile the same at a time
     bench = compiled_bench(scenario, notice, ("plant",) if controller_command else ROLES)
     folder.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ def run_scenario(
 
 def _run_here(bench: Bench, folder: Path, progress: Progress, interrupt: Interrupt) -> float:
     """Run both sides in this process; returns when the first tick was run."""
-    parts = {role: Part.create(folder, role, bench.scenario.ticks) for role in ROLES}
+    parts = {role: Part.create(folder, role, bench.scenario.ticks, bench.inner) for role in ROLES}
     timeline = Timeline(bench, folder / "events_both.jsonl", ROLES)
     began = time.monotonic()
 
@@ -108,7 +108,7 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
         UserError: the scenario has no operating point.
     """
     bench = make_bench(scenario)
-    plant, controller = parts or buffers(scenario.ticks)
+    plant, controller = parts or buffers(scenario.ticks, bench.inner)
     plant.signals[:] = np.nan
     timeline = TimelineInMemory(bench)
     began, date = time.monotonic(), time.time()

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -32,6 +33,7 @@ from gfm_hil.scenario.expectation import check_expectation
 from gfm_plant import ConverterParameters, Plant, load_converter, make_plant
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
 from gfm_runtime.errors import meant, printable
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.signals import REF_NAMES, table_hash
 from gfm_runtime.toml_file import read_toml
 
@@ -133,6 +135,11 @@ class Scenario(_Model):
         "lockstep", description="lockstep: simulated time; realtime: the clock"
     )
     law: str = Field("mimo-gfm", description="catalogue name or path of a law file")
+    inner: str | None = Field(
+        None,
+        description="inner stage of every law, in place of its own: a shipped name (gfmhil laws), "
+        "the path of a file, or none",
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
     expect: Literal["completed", "oscillating", "tripped", "safe"] = Field(
         "completed", description="status with which the run counts as passed (exit code 0)"
@@ -198,7 +205,7 @@ class Scenario(_Model):
         the law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "compare"}
         about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
-        content = self.model_dump(exclude={*about, "law", "events", "ready_laws"})
+        content = self.model_dump(exclude={*about, "law", "inner", "events", "ready_laws"})
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
         events = [
@@ -209,7 +216,16 @@ class Scenario(_Model):
 
     def laws_digest(self) -> str:
         """Hash of the content of every law that the run uses."""
-        return _hash([law_file(name).model_dump() for name in self.laws()])
+        spec = None if self.inner is None else named_inner(self.inner)
+        inner = [self.inner is not None, spec and spec.model_dump()]
+        return _hash([inner, *(law_file(name).model_dump() for name in self.laws())])
+
+    @cached_property
+    def has_inner(self) -> bool:
+        """Whether a law of the run has an inner stage: frames and recording then carry its
+        signals."""
+        found = (load_law(name, self.inner) for name in self.laws())
+        return any(law.inner is not None for one in found for law in one.laws)
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:
@@ -384,7 +400,7 @@ def check_scenario(
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
         try:
-            for stage in load_law(law).laws:
+            for stage in load_law(law, scenario.inner).laws:
                 _try_law(law, stage, scenario.T_s)
         except LawError as problem:
             wrong += [ours + line for line in problem.lines]

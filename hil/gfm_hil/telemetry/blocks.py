@@ -17,7 +17,7 @@ import zmq
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF
+from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF, recorded_in, signals_of
 from gfm_hil.telemetry.follow import Rows
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
@@ -40,9 +40,9 @@ class Block:
     rows: NDArray[np.void]
 
 
-def block_dtype(role: Role) -> np.dtype:
-    """The dtype of one row of a side."""
-    signals, times = SIGNALS_OF[role], TIMES_OF[role]
+def block_dtype(role: Role, inner: bool = False) -> np.dtype:
+    """The dtype of one row of a side; ``inner``: of a run with an inner stage."""
+    signals, times = signals_of(role, inner), TIMES_OF[role]
     return np.dtype(
         [("tick", "<i8"), *((n, "<f8") for n in signals), *((f"{n}_ns", "<i8") for n in times)]
     )
@@ -50,9 +50,10 @@ def block_dtype(role: Role) -> np.dtype:
 
 def messages(rows: Rows) -> list[list[bytes]]:
     """The messages that carry some rows."""
-    whole = np.empty(len(rows.signals), block_dtype(rows.role))
+    columns = recorded_in(rows.role, rows.signals.shape[1])
+    whole = np.empty(len(rows.signals), block_dtype(rows.role, columns != SIGNALS_OF[rows.role]))
     whole["tick"] = np.arange(rows.first, rows.first + len(whole))
-    for j, name in enumerate(SIGNALS_OF[rows.role]):
+    for j, name in enumerate(columns):
         whole[name] = rows.signals[:, j]
     for j, name in enumerate(TIMES_OF[rows.role]):
         whole[f"{name}_ns"] = rows.times[:, j]
@@ -77,7 +78,7 @@ class BlockReader:
         self._socket = self._context.socket(zmq.SUB)
         self._socket.set(zmq.RCVHWM, ROOM)
         self._socket.set(
-            zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s).itemsize for s in ROLES)
+            zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s, True).itemsize for s in ROLES)
         )
         self._socket.subscribe(f"{_TOPIC}{role}")
         self._socket.connect(endpoint)

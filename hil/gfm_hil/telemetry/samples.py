@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import json
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from gfm_hil.recording.columns import SIGNALS_OF
+from gfm_hil.core.roles import Role
+from gfm_hil.recording.columns import recorded_in
 from gfm_hil.recording.timing import SLACK, missed
 from gfm_hil.telemetry.follow import Rows
 
@@ -27,7 +29,9 @@ def _place(column: str) -> tuple[str, str]:
     return (group, rest) if group in _GROUPS else ("", column)
 
 
-_PLACES = {role: [_place(name) for name in names] for role, names in SIGNALS_OF.items()}
+@cache
+def _places(role: Role, width: int) -> list[tuple[str, str]]:
+    return [_place(name) for name in recorded_in(role, width)]
 
 
 class Sampler:
@@ -80,7 +84,7 @@ class Sampler:
         """One tick's numbers; JSON cannot hold NaN or infinity."""
         tick = rows.first + k
         sample: dict[str, Any] = {"timestamp": round(tick * self.T_s, 9), "tick": tick}
-        for (group, name), value in zip(_PLACES[rows.role], values, strict=True):
+        for (group, name), value in zip(_places(rows.role, len(values)), values, strict=True):
             if math.isfinite(value):
                 (sample.setdefault(group, {}) if group else sample)[name] = value
         return sample

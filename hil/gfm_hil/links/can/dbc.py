@@ -19,15 +19,15 @@ from cantools.database.can.formats.dbc.dbc_specifics import DbcSpecifics
 from cantools.database.conversion import BaseConversion
 
 from gfm_hil.core.roles import Role
-from gfm_runtime.signals import Group, group, table_hash
 from gfm_runtime.signals import Signal as Row
+from gfm_runtime.signals import Vector, group, table_hash
 from gfm_runtime.states import REASONS, STATES
 
 INT16 = 32767  # largest count; the range is symmetric
 INVALID = -32768
-SENDERS: dict[Group, Role] = {"y": "plant", "u": "controller"}
+SENDERS: dict[Vector, Role] = {"y": "plant", "u": "controller"}
 #: frame name of each vector; if a vector needs several frames, they append _1, _2 …
-VECTORS: dict[Group, str] = {"y": "Measurements", "u": "Commands"}
+VECTORS: dict[Vector, str] = {"y": "Measurements", "u": "Commands"}
 STATUS: dict[Role, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
 SEGMENT: dict[Role, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
 CRC, COUNTER = "Crc", "Counter"
@@ -79,7 +79,7 @@ def _protection() -> list[Signal]:
     ]
 
 
-def _vector(name: Group, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
+def _vector(name: Vector, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
     """Name, identifier, length and signals of every frame of a vector."""
     rows = group(name)
     room = len(rows) if fd else (8 - _HEADER) // 2

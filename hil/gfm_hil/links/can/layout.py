@@ -30,7 +30,7 @@ from gfm_hil.links.can.dbc import (
 )
 from gfm_hil.links.can.wire import crc8
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import Vector, names
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Plan:
         fd: CAN FD rather than classic.
     """
 
-    vectors: dict[Group, list[Layout]]
+    vectors: dict[Vector, list[Layout]]
     status: dict[Role, Layout]
     segment: dict[Role, Layout]
     digest: int
@@ -138,7 +138,7 @@ def plan_of(database: Database) -> Plan:
     missing = sorted({*STATUS.values(), *SEGMENT.values()} - set(messages))
     if missing:
         raise ValueError(f"frames {missing} are missing")
-    vectors: dict[Group, list[Layout]] = {}
+    vectors: dict[Vector, list[Layout]] = {}
     for group, title in VECTORS.items():
         mine = [m for name, m in messages.items() if name == title or name.startswith(f"{title}_")]
         vectors[group] = [_layout(m, names(group)) for m in sorted(mine, key=lambda m: m.frame_id)]

@@ -41,7 +41,7 @@ from gfm_hil.links.can.sockets import FULL, SOCKETCAN, set_socket
 from gfm_hil.links.can.wire import BRS, FD, frame_dtype, pack, unpack
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import Vector, names
 
 # python-can also raises what it logs, and we print that in one line: silence its log
 logging.getLogger("can").addHandler(logging.NullHandler())
@@ -217,7 +217,7 @@ def warm_up(plan: Plan) -> None:
     """Compile (or load from the cache) what a tick calls, before the other side waits for it."""
     ends = {role: Node(plan, role, CanOptions(fd=plan.fd)) for role in ROLES}
     message = np.zeros(LONGEST, np.uint8)
-    groups: tuple[tuple[Role, Group], ...] = (("plant", "y"), ("controller", "u"))
+    groups: tuple[tuple[Role, Vector], ...] = (("plant", "y"), ("controller", "u"))
     for role, group in groups:
         mine, theirs = ends[role].handle, ends[ROLES[1 - ROLES.index(role)]].handle
         words = FrameWriter(group).pack(0, 0, 0, np.zeros(len(names(group))))

@@ -15,7 +15,7 @@ import numpy as np
 from gfm_hil.core.roles import Role
 from gfm_hil.links.can import wire
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import Group
+from gfm_runtime.signals import Vector
 from gfm_runtime.states import RUNNING, STOPPED
 
 NOTHING = -1
@@ -52,7 +52,7 @@ subrate_dtype = np.dtype(
 def set_subrate(subrate: np.ndarray, role: Role, every: int) -> None:
     """Initialise one record of ``subrate_dtype`` for a side that exchanges every n-th tick."""
     s, plant = subrate[0], role == "plant"
-    groups: tuple[Group, Group] = ("y", "u") if plant else ("u", "y")
+    groups: tuple[Vector, Vector] = ("y", "u") if plant else ("u", "y")
     s["every"], s["plant"] = every, plant
     for k, group in enumerate(groups):
         s["size"][k], s["head"][k] = wire.size_and_head(group)

@@ -23,7 +23,7 @@ from gfm_hil.links.can.dbc import SENDERS
 from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
 from gfm_hil.realtime.atomics import copy
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import Group
+from gfm_runtime.signals import Vector
 
 #: a CAN frame: identifier and payload
 CanFrame = tuple[int, bytes]
@@ -85,20 +85,20 @@ receiver_dtype = np.dtype(
 )
 
 
-def set_sender(sender: np.ndarray, plan: Plan, group: Group, heartbeat: int) -> None:
+def set_sender(sender: np.ndarray, plan: Plan, group: Vector, heartbeat: int) -> None:
     """Initialise one record of ``sender_dtype``; it repeats the status every ``heartbeat``
     vectors."""
     _set_table(sender, plan, group)
     sender["heartbeat"], sender["told"], sender["tick"] = heartbeat, NOTHING, NOTHING
 
 
-def set_receiver(receiver: np.ndarray, plan: Plan, group: Group) -> None:
+def set_receiver(receiver: np.ndarray, plan: Plan, group: Vector) -> None:
     """Initialise one record of ``receiver_dtype``."""
     _set_table(receiver, plan, group)
     receiver["sequence"] = receiver["said"] = receiver["counter"] = NOTHING
 
 
-def _set_table(record: np.ndarray, plan: Plan, group: Group) -> None:
+def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
     r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
     r["parts"], r["flags"] = len(parts), plan.fd * (wire.FD | wire.BRS)
     r["size"], r["head"] = wire.size_and_head(group)
@@ -273,7 +273,7 @@ class VectorSender:
         heartbeat: vectors after which the status is repeated.
     """
 
-    def __init__(self, plan: Plan, group: Group, heartbeat: int) -> None:
+    def __init__(self, plan: Plan, group: Vector, heartbeat: int) -> None:
         self.record = np.zeros(1, sender_dtype)
         set_sender(self.record, plan, group, heartbeat)
         self._frames = np.zeros(PARTS + 1, wire.frame_dtype)

@@ -43,13 +43,15 @@ def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     Raises:
         RunFailed: an error that is not the run's own.
     """
-    parts = None
+    parts: dict[bool, tuple[Part, Part]] = {}
     records = []
     for run, law in jobs:
         try:
             scenario, drawn = campaign.scenario(run, law)
-            parts = parts or buffers(scenario.ticks)
-            summary, p = simulate(scenario, *parts)
+            inner = scenario.has_inner
+            if inner not in parts:
+                parts[inner] = buffers(scenario.ticks, inner)
+            summary, p = simulate(scenario, *parts[inner])
         except Exception as problem:
             words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
             raise RunFailed(words) from problem

@@ -51,7 +51,7 @@ def experiment(name: str, law: str) -> dict[str, Any]:
         "events": [{"t": AT, **event} | ({"law": law} if switched else {})],
     }
     scenario = check_scenario(content, f"law comparison, {name}")
-    parts = buffers(scenario.ticks)
+    parts = buffers(scenario.ticks, scenario.has_inner)
     summary, p = simulate(scenario, *parts)
     out: dict[str, Any] = {"status": summary["status"], "reason": summary["reason"]}
     at = round(AT / scenario.T_s)

@@ -1,0 +1,445 @@
+"""The inner stage between a law and the bridge: current limit, current and voltage loops.
+
+A law gives the internal voltage E_u and the frequency omega_u. Without an inner stage the bridge
+produces E_u itself, as in the paper. With one, the measured currents and voltages of the filter
+(i, v, i_o in the converter's dq frame) and E = E_u + j 0 give the bridge's voltage e = e_d + j e_q:
+
+* ``virtual-stator``: a reference current behind a virtual impedance,
+  (X_v/omega_b) di*/dt = E - v - (R_v + j omega X_v) i*, which the limit cuts, then a current loop;
+* ``cascaded``: a PI voltage loop around v* = E - (R_v + j omega X_v) i_o gives i*, which the limit
+  cuts, then the current loop;
+* ``threshold-impedance``: e = E - k (|i_f| - I_thr) (1 + j omega sigma) i_f beyond the threshold,
+  where i_f is the low-pass filtered current; there is no current loop.
+
+The current loop is e = v_f + (k_c + k_ci/s) (i* - i) + j omega L_f i with the low-pass filtered
+voltage v_f, and |e| <= m v_dc. Around them: a power limiter that lowers (raises) omega_u while p is
+above P_max (below P_min), a frequency measurement (PLL) that replaces the reference omega_g of
+column 3, and the freeze of the E_u row's states while the current is limited.
+
+Sources: the structures are those of Paquette and Divan (IEEE Trans. Ind. Appl. 51(2), 2015:
+virtual impedance current limiting), Qoria et al. (IEEE Open Access J. Power Energy 7, 2020:
+threshold virtual impedance, X/R 5, 0.67 p.u.), and the cascaded loops of Yazdani and Iravani,
+"Voltage-Sourced Converters in Power Systems", chapter 8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.errors import LawError, Mistakes
+
+KINDS = {"none": 0, "virtual-stator": 1, "cascaded": 2, "threshold-impedance": 3}
+NONE, STATOR, CASCADED, THRESHOLD = KINDS.values()
+PRIORITIES = {"circular": 0, "d": 1, "q": 2, "angle": 3}
+_D, _Q, _ANGLE = 1, 2, 3
+
+SPACE_VECTOR = 1.3025508
+"""Largest |e| over v_dc by space-vector modulation for the paper's 700 V and 380 V, p.u."""
+
+NEGLIGIBLE = 2.0**-100  # p.u.; decaying values below it become 0; exact in float32 too
+_NEVER = 1e6  # p.u.; stands for infinity, times which 0 is no number
+_LEAST_V = 0.05  # p.u.; the PLL holds its frequency below
+
+V_DC, P, OMEGA, I_D, I_Q, V_D, V_Q, I_OD, I_OQ = range(9)
+"""Places of the measurements in ``state.m``: those that the inner stage uses, in this order."""
+
+
+@dataclass(frozen=True)
+class Inner:
+    """The parameters of an inner stage; those of another kind than ``kind`` do not act.
+
+    Attributes:
+        kind: a key of ``KINDS``.
+        I_max: limit of |i*|, p.u. (virtual-stator, cascaded).
+        priority: a key of ``PRIORITIES``: circular keeps the angle of i*; d (q) gives the active
+            (reactive) current the whole limit first; angle sets the limited i* to ``angle``.
+        angle: of the limited i* against the converter's d axis, degrees (priority angle).
+        R_v, X_v: virtual impedance, p.u.
+        k_c, k_ci: current loop, p.u./p.u. and 1/s.
+        L_f, C_f: the converter's own filter, p.u.
+        f_v: bandwidth of the low-pass on v, Hz.
+        k_v, k_vi: voltage loop, p.u./p.u. and 1/s (cascaded).
+        k_ff: part of i_o that is fed forward (cascaded).
+        I_thr, k_thr, sigma: threshold, p.u.; impedance per current beyond it; its X/R
+            (threshold-impedance).
+        f_i: bandwidth of the low-pass on i, Hz (threshold-impedance).
+        m: limit of |e| over v_dc, p.u.; infinite for none.
+        freeze: hold the states of the E_u row while the current is limited.
+        P_max, P_min: where the power limiter begins, p.u.; infinite for none.
+        k_P, k_Pi: the power limiter, p.u. of omega_u per p.u. of power, and 1/s.
+        f_pll: bandwidth of the PLL that measures omega_g for column 3, Hz; 0 for none.
+    """
+
+    kind: str = "virtual-stator"
+    I_max: float = 1.2
+    priority: str = "circular"
+    angle: float = 0.0
+    R_v: float = 0.1
+    X_v: float = 0.3
+    k_c: float = 0.15
+    k_ci: float = 0.0
+    L_f: float = 0.0174
+    C_f: float = 0.2268
+    f_v: float = 400.0
+    k_v: float = 0.5
+    k_vi: float = 50.0
+    k_ff: float = 1.0
+    I_thr: float = 1.0
+    k_thr: float = 0.67
+    sigma: float = 5.0
+    f_i: float = 50.0
+    m: float = SPACE_VECTOR
+    freeze: bool = True
+    P_max: float = math.inf
+    P_min: float = -math.inf
+    k_P: float = 0.01
+    k_Pi: float = 0.1
+    f_pll: float = 0.0
+
+    def __post_init__(self) -> None:
+        mistakes = Mistakes()
+
+        def check(name: str, good: bool, allowed: str) -> None:
+            with mistakes.noting():
+                if not good:
+                    value = getattr(self, name)
+                    raise LawError(f"inner.{name}", f"{value!r} must be {allowed}")
+
+        for name in ("I_max", "k_c", "L_f", "f_v", "I_thr", "f_i", "m"):
+            check(name, getattr(self, name) > 0.0, "> 0")
+        check("X_v", self.X_v > 0.0 or self.kind != "virtual-stator", "> 0")
+        least = (
+            "R_v",
+            "X_v",
+            "k_ci",
+            "C_f",
+            "k_v",
+            "k_vi",
+            "k_ff",
+            "k_thr",
+            "sigma",
+            "k_P",
+            "k_Pi",
+        )
+        for name in (*least, "f_pll"):
+            check(name, getattr(self, name) >= 0.0, ">= 0")
+        check("P_max", self.P_max > self.P_min, f"above P_min = {self.P_min!r}")
+        mistakes.check()
+
+    def pack(self, rec: Any, T_s: float, omega_b: float) -> None:
+        """Fill the fields of ``INNER_FIELDS`` in a law's record."""
+        turn = omega_b * T_s
+        rec["inner"], rec["priority"] = KINDS[self.kind], PRIORITIES[self.priority]
+        rec["freeze"] = self.freeze
+        rec["I_cos"] = self.I_max * math.cos(math.radians(self.angle))
+        rec["I_sin"] = self.I_max * math.sin(math.radians(self.angle))
+        for name in _PLAIN:
+            rec[name] = np.clip(getattr(self, name), -_NEVER, _NEVER)
+        rec["one"], rec["half_turn"], rec["least_v"] = 1.0, turn / 2, _LEAST_V
+        rec["negligible"] = NEGLIGIBLE
+        if self.kind == "virtual-stator":
+            rec["stator_a"] = self.R_v / self.X_v * turn / 2
+            rec["stator_b"] = turn / self.X_v
+        rec["T_k_ci"], rec["T_k_vi"] = T_s * self.k_ci, T_s * self.k_vi
+        rec["T_k_Pi"] = T_s * self.k_Pi
+        rec["follow_v"] = -math.expm1(-2 * math.pi * self.f_v * T_s)
+        rec["follow_i"] = -math.expm1(-2 * math.pi * self.f_i * T_s)
+        omega_n = 2 * math.pi * self.f_pll  # damping ratio 1/sqrt(2)
+        rec["k_pll"] = math.sqrt(2) * omega_n / omega_b
+        rec["T_k_pll"] = T_s * omega_n**2 / omega_b
+
+    def internal_voltage(
+        self, i: complex, v: complex, i_o: complex, e: complex, omega: float
+    ) -> complex:
+        """The E at which the stage rests, for a filter that rests under e; all in one dq frame.
+
+        Args:
+            i, v, i_o, e: currents and voltages, p.u.
+            omega: p.u.
+
+        Raises:
+            LawError: the limit does not let the stage rest there.
+        """
+        Z_v = complex(self.R_v, omega * self.X_v)
+        if self.kind == "threshold-impedance":
+            beyond = max(abs(i) - self.I_thr, 0.0)
+            return e + self.k_thr * beyond * complex(1.0, omega * self.sigma) * i
+        i_ref = i if self.k_ci > 0.0 else i + (e - v - 1j * omega * self.L_f * i) / self.k_c
+        if abs(i_ref) > self.I_max:
+            raise LawError(
+                "inner.I_max", f"{self.I_max:g} p.u.: this operating point needs {abs(i_ref):.4g}"
+            )
+        return v + Z_v * (i_ref if self.kind == "virtual-stator" else i_o)
+
+
+_PLAIN = (
+    "I_max", "R_v", "X_v", "k_c", "L_f", "C_f", "k_v", "k_ff", "I_thr", "k_thr", "sigma", "m",
+    "P_max", "P_min", "k_P",
+)  # fmt: skip
+_PACKED = (
+    "one", "half_turn", "I_cos", "I_sin", "stator_a", "stator_b", "T_k_ci", "T_k_vi", "T_k_Pi",
+    "follow_v", "follow_i", "k_pll", "T_k_pll", "least_v", "negligible",
+)  # fmt: skip
+
+
+#: integers of the stage in ``law_dtype``: places in ``KINDS`` and ``PRIORITIES``, and yes or no
+INNER_NUMBERS = [("inner", "i8"), ("priority", "i8"), ("freeze", "i8")]
+
+
+def inner_fields(f: np.dtype[Any]) -> list[Any]:
+    """The inner stage's constants in ``law_dtype``."""
+    return [(name, f) for name in (*_PLAIN, *_PACKED)]
+
+
+def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
+    """The inner stage's variables in ``state_dtype``."""
+    return [
+        ("m", f, (9,)),  # measurements of this tick
+        ("i_ref", f, (2,)),
+        ("v_f", f, (2,)),
+        ("i_f", f, (2,)),
+        ("x_c", f, (2,)),  # integrals of the current and of the voltage loop
+        ("x_v", f, (2,)),
+        ("away", f, (2,)),  # voltage left by a bumpless change, decays
+        ("e", f, (2,)),
+        ("omega", f),  # omega_u after the power limiter
+        ("x_high", f),
+        ("x_low", f),
+        ("pll", f, (2,)),  # unit phasor that follows v, in the converter's frame
+        ("omega_pll", f),
+    ]
+
+
+@inlined
+def take_measurements(state, y):
+    """Copy what the stage needs from y (11,), p.u., in the arithmetic of the law."""
+    for j in range(3):
+        state.m[j] = y[j]
+    for j in range(6):
+        state.m[I_D + j] = y[5 + j]
+
+
+@inlined
+def measure_frequency(law, state):
+    """One tick of the PLL on v; ``state.omega_pll`` is then the measured omega_g, p.u."""
+    m, c, s = state.m, state.pll[0], state.pll[1]
+    size = math.sqrt(m[V_D] * m[V_D] + m[V_Q] * m[V_Q])
+    error = m[V_Q] * c - m[V_D] * s
+    if size > law.least_v:  # else there is no voltage to follow
+        error = error / size
+    state.omega_pll += law.T_k_pll * error
+    h = (state.omega_pll + law.k_pll * error - m[OMEGA]) * law.half_turn
+    # times (1 + j h) / (1 - j h), whose modulus is 1; the root takes the rounding out
+    a, b = law.one - h * h, h + h
+    c, s = a * c - b * s, a * s + b * c
+    length = math.sqrt(c * c + s * s)
+    state.pll[0], state.pll[1] = c / length, s / length
+
+
+@inlined
+def _limit_power(law, state, omega):
+    """omega_u, p.u., lowered while p is above P_max and raised while it is below P_min."""
+    over, under = state.m[P] - law.P_max, law.P_min - state.m[P]
+    state.x_high += law.T_k_Pi * over
+    if state.x_high < 0:
+        state.x_high = 0
+    state.x_low += law.T_k_Pi * under
+    if state.x_low < 0:
+        state.x_low = 0
+    lower, raise_by = law.k_P * over + state.x_high, law.k_P * under + state.x_low
+    if lower > 0:
+        omega = omega - lower
+    if raise_by > 0:
+        omega = omega + raise_by
+    return min(max(omega, law.low[1]), law.high[1])
+
+
+@inlined
+def _limit_current(law, state):
+    """Cut i* to I_max, and remember whether that was needed."""
+    d, q = state.i_ref[0], state.i_ref[1]
+    size = d * d + q * q
+    most = law.I_max * law.I_max
+    state.limited = size > most
+    if not state.limited:
+        return
+    if law.priority == _ANGLE:
+        state.i_ref[0], state.i_ref[1] = law.I_cos, law.I_sin
+    elif law.priority == _D:
+        d = min(max(d, -law.I_max), law.I_max)
+        rest = math.sqrt(most - d * d)
+        state.i_ref[0], state.i_ref[1] = d, min(max(q, -rest), rest)
+    elif law.priority == _Q:
+        q = min(max(q, -law.I_max), law.I_max)
+        rest = math.sqrt(most - q * q)
+        state.i_ref[0], state.i_ref[1] = min(max(d, -rest), rest), q
+    else:
+        scale = law.I_max / math.sqrt(size)
+        state.i_ref[0], state.i_ref[1] = d * scale, q * scale
+
+
+@inlined
+def _stator(law, state, E_d, E_q):
+    """One tick of the virtual stator by the trapezoidal rule on its own pole: i* from E - v."""
+    m = state.m
+    b = state.omega * law.half_turn
+    keep, lose = law.one - law.stator_a, law.one + law.stator_a
+    d, q = state.i_ref[0], state.i_ref[1]
+    r_d = keep * d + b * q + law.stator_b * (E_d - m[V_D])
+    r_q = keep * q - b * d + law.stator_b * (E_q - m[V_Q])
+    size = lose * lose + b * b
+    state.i_ref[0], state.i_ref[1] = (r_d * lose + r_q * b) / size, (r_q * lose - r_d * b) / size
+    _limit_current(law, state)
+
+
+@inlined
+def _voltage_loop(law, state, E_d, E_q):
+    """One tick of the cascaded voltage loop: i* from v* - v; it integrates only within the
+    limit."""
+    m, X = state.m, state.omega * law.X_v
+    error_d = E_d - law.R_v * m[I_OD] + X * m[I_OQ] - m[V_D]
+    error_q = E_q - law.R_v * m[I_OQ] - X * m[I_OD] - m[V_Q]
+    B = state.omega * law.C_f
+    state.i_ref[0] = law.k_v * error_d + state.x_v[0] + law.k_ff * m[I_OD] - B * m[V_Q]
+    state.i_ref[1] = law.k_v * error_q + state.x_v[1] + law.k_ff * m[I_OQ] + B * m[V_D]
+    _limit_current(law, state)
+    if not state.limited:
+        state.x_v[0] += law.T_k_vi * error_d
+        state.x_v[1] += law.T_k_vi * error_q
+
+
+@inlined
+def _current_loop(law, state):
+    """One tick of the current loop: e from i* - i, before the limit of modulation."""
+    m, X = state.m, state.omega * law.L_f
+    error_d, error_q = state.i_ref[0] - m[I_D], state.i_ref[1] - m[I_Q]
+    state.e[0] = state.v_f[0] + law.k_c * error_d + state.x_c[0] - X * m[I_Q]
+    state.e[1] = state.v_f[1] + law.k_c * error_q + state.x_c[1] + X * m[I_D]
+    state.x_c[0] += law.T_k_ci * error_d
+    state.x_c[1] += law.T_k_ci * error_q
+
+
+@inlined
+def _drop(law, state, E_d, E_q):
+    """e = E less the drop over the threshold impedance."""
+    d, q = state.i_f[0], state.i_f[1]
+    beyond = math.sqrt(d * d + q * q) - law.I_thr
+    state.limited = beyond > 0
+    state.e[0], state.e[1] = E_d, E_q
+    if state.limited:
+        R = law.k_thr * beyond
+        X = R * state.omega * law.sigma
+        state.e[0] = E_d - R * d + X * q
+        state.e[1] = E_q - R * q - X * d
+
+
+@inlined
+def _follow(law, state):
+    """One tick of the low-passes on v and i."""
+    m = state.m
+    for k in range(2):
+        state.v_f[k] += law.follow_v * (m[V_D + k] - state.v_f[k])
+        state.i_f[k] += law.follow_i * (m[I_D + k] - state.i_f[k])
+
+
+@inlined
+def shape(law, state, u, out):
+    """One tick of the inner stage, between ``output`` and ``advance`` of the law.
+
+    Args:
+        law, state: records of ``law_dtype`` and ``state_dtype``; ``take_measurements`` was called.
+        u: the law's own output (i_u, omega_u, E_u), shape (3,), p.u.
+        out: (i_u, omega_u, e_d, e_q), shape (4,), p.u.
+    """
+    out[0] = u[0]
+    E_d, E_q = _limited_E(law, state) + state.away[0], state.away[1]
+    state.omega = min(max(state.raw[1], law.low[1]), law.high[1])
+    if law.inner == NONE:
+        state.limited = 0
+        state.e[0], state.e[1] = E_d, E_q
+    else:
+        state.omega = _limit_power(law, state, state.omega)
+        _follow(law, state)
+        if law.inner == THRESHOLD:
+            _drop(law, state, E_d, E_q)
+        else:
+            if law.inner == STATOR:
+                _stator(law, state, E_d, E_q)
+            else:
+                _voltage_loop(law, state, E_d, E_q)
+            _current_loop(law, state)
+        most = law.m * state.m[V_DC]
+        size = state.e[0] * state.e[0] + state.e[1] * state.e[1]
+        if size > most * most:
+            scale = most / math.sqrt(size)
+            state.e[0] *= scale
+            state.e[1] *= scale
+    for k in range(2):
+        state.away[k] *= law.decay
+        if abs(state.away[k]) < law.negligible:
+            state.away[k] = 0
+    out[1], out[2], out[3] = state.omega, state.e[0], state.e[1]
+
+
+@inlined
+def _limited_E(law, state):
+    return min(max(state.raw[2], law.low[2]), law.high[2])
+
+
+@inlined
+def settle_inner(law, state, u, e_d, e_q):
+    """Set the stage so that it goes on with the bridge voltage e: at the start, and when another
+    law takes over. What its structure cannot absorb goes into ``state.away``.
+
+    Args:
+        law, state: as for ``shape``.
+        u: the law's output (i_u, omega_u, E_u), shape (3,), p.u.
+        e_d, e_q: p.u.
+    """
+    m, omega = state.m, u[1]
+    state.omega, state.omega_pll = omega, omega
+    size = math.sqrt(m[V_D] * m[V_D] + m[V_Q] * m[V_Q])
+    state.pll[0], state.pll[1] = law.one, 0
+    if size > law.least_v:
+        state.pll[0], state.pll[1] = m[V_D] / size, m[V_Q] / size
+    state.x_high, state.x_low, state.limited = 0, 0, 0
+    for k in range(2):
+        state.v_f[k], state.i_f[k] = m[V_D + k], m[I_D + k]
+        state.x_c[k] = state.x_v[k] = 0
+    state.away[0], state.away[1] = 0, 0
+    need_d, need_q = e_d, e_q
+    X = state.omega * law.L_f
+    lack_d, lack_q = e_d - m[V_D] + X * m[I_Q], e_q - m[V_Q] - X * m[I_D]
+    state.i_ref[0], state.i_ref[1] = m[I_D], m[I_Q]
+    if law.inner == THRESHOLD:
+        _drop(law, state, 0, 0)
+        need_d, need_q = e_d - state.e[0], e_q - state.e[1]
+    elif law.inner != NONE:
+        if law.T_k_ci > 0:
+            state.x_c[0], state.x_c[1] = lack_d, lack_q
+        else:
+            state.i_ref[0] += lack_d / law.k_c
+            state.i_ref[1] += lack_q / law.k_c
+        through_d, through_q = state.i_ref[0], state.i_ref[1]
+        if law.inner == CASCADED:
+            B = state.omega * law.C_f
+            state.x_v[0] = through_d - law.k_ff * m[I_OD] + B * m[V_Q]
+            state.x_v[1] = through_q - law.k_ff * m[I_OQ] - B * m[V_D]
+            through_d, through_q = m[I_OD], m[I_OQ]
+        X = state.omega * law.X_v
+        need_d = m[V_D] + law.R_v * through_d - X * through_q
+        need_q = m[V_Q] + law.R_v * through_q + X * through_d
+    state.e[0], state.e[1] = e_d, e_q
+    state.away[0], state.away[1] = need_d - u[2], need_q
+
+
+@compiled
+def settle(law, state, u, y, e_d, e_q):
+    """``settle_inner`` from Python: one-element arrays of the records, and y (11,), p.u."""
+    take_measurements(state[0], y)
+    settle_inner(law[0], state[0], u, e_d, e_q)
