@@ -4,8 +4,8 @@ The ripple of a signal is the peak-to-peak value of its strongest sinusoid, so t
 spread over all frequencies, counts for little. It is judged over the last second, or, if less time
 has passed since the last disturbance, over the second half of that time: what a disturbance set
 going has had as long to die away before. A ripple that has halved since the stretch before, of the
-same length, is dying away, and one that the last half of the stretch does not show was a step. An unbalance of the grid that is still there explains the even multiples
-of the grid's frequency.
+same length, is dying away, and one that the last half of the stretch does not show was a step. An
+unbalance of the grid that is still there explains the even multiples of the grid's frequency.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class _Event(BaseModel):
 
     def lasts(self) -> float:
         """How long it acts, s, if the event itself says so; 0 for a step and for what stays."""
-        return float(getattr(self, "duration", None) or getattr(self, "ramp_s", 0.0))
+        return float(getattr(self, "duration", None) or getattr(self, "ramp_s", None) or 0.0)
 
 
 def reference_field(name: str, default: float | None) -> Any:
