@@ -29,6 +29,7 @@ from gfm_plant.solution import BRIDGE, GRID, NEGATIVE, STATES
 _DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 _PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
+_LOOK = 10e-6  # s; how often a peak-current limit looks at the current
 _MOST = 500  # steps, or pieces, in a period
 
 
@@ -135,6 +136,8 @@ def _pack_circuit(par: PlantRecord, options: Plant) -> None:
     per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
 
+    par["i_peak"] = math.inf if options.i_peak is None else options.i_peak
+
     source = options.dc_source
     par["tau_dc"] = source.tau_s or 0.0
     par["i_max"] = math.inf if source.i_max is None else source.i_max
@@ -219,7 +222,10 @@ def _pack_pieces(par: PlantRecord, fastest: float) -> None:
             f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
             " plant.grid.load_L"
         )
-    pieces = np.maximum(np.ceil(r["stretch"] * (fastest / (2 * _PIECE))), 1)
+    least = 1.0
+    if r["i_peak"] < math.inf:  # the hardware looks at the current once a piece
+        least = math.ceil(longest / _LOOK)
+    pieces = np.maximum(np.ceil(r["stretch"] * (fastest / (2 * _PIECE))), least)
     par["pieces"], par["half_h"] = pieces, r["stretch"] / pieces / 2
     per_C = r["omega_b"] / r["C_dc"]
     rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))

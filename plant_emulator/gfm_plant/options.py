@@ -272,6 +272,11 @@ class Plant(Options):
         description="limit of the bridge's voltage by v_dc: line-to-line RMS at most "
         "v_dc / sqrt(2) (space-vector) or v_dc sqrt(3/8) (sine-triangle)",
     )
+    i_peak: Positive | None = Field(
+        None,
+        description="peak-current limit of the bridge, p.u.: its hardware blocks pulses so that "
+        "the current of L_f stays within; none if not given",
+    )
     grid: Grid = Field(Grid(), description="grid simulator at the start")
     sensors: Sensors = Field(
         Sensors(), description="what stands between the true quantities and the A/D"

@@ -46,8 +46,9 @@ plant_par_dtype = np.dtype(
         ("k_i", "f8"),
         ("i_max", "f8"),
         ("tau_dc", "f8"),  # its lag, s (0: none)
-        # the bridge: |E| <= m_max v_dc
+        # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
+        ("i_peak", "f8"),
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
