@@ -31,7 +31,9 @@ def step_table(name: str, runs: dict[str, Run]) -> None:
     rows = []
     for label, one in runs.items():
         events = one.summary["events"]
-        if one.summary["status"] == "completed":
+        if one.summary["status"] == "oscillating":
+            label += ", oscillating"
+        if one.summary["status"] in ("completed", "oscillating"):
             cells = [number(events[0].get(key), digits) for key, _, digits in COLUMNS]
         else:
             t = one.summary["duration_s"]
