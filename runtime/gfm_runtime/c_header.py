@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from gfm_runtime.error_maps import ERROR_MAPS, V_MIN
+from gfm_runtime.error_maps import ERROR_MAPS, R_MIN, V_MIN
 from gfm_runtime.inner import NEGLIGIBLE
 from gfm_runtime.kernel import N_MAX, law_dtype, state_dtype
 from gfm_runtime.signals import NU, NY
@@ -62,6 +62,7 @@ def c_header(real: DTypeLike = np.float64) -> str:
             f"#define NY {NY}",
             f"#define NU {NU}",
             f"#define V_MIN {V_MIN!r}",
+            f"#define R_MIN {R_MIN.hex()}",
             f"#define NEGLIGIBLE {NEGLIGIBLE.hex()}",
             *(f"#define ERROR_{k.upper().replace('-', '_')} {v}" for k, v in ERROR_MAPS.items()),
             "",
