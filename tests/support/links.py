@@ -143,7 +143,7 @@ def run_pair(
     folder.mkdir(parents=True, exist_ok=True)
     where = endpoint or link_kind(link).fresh(folder)
     benches = {role: make_bench(scenario) for role in ROLES}
-    parts = {role: Part.create(folder, role, scenario.ticks) for role in ROLES}
+    parts = {role: Part.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES}
     for role in ROLES:
         compile_role(role, benches[role], parts[role])
     pair = Pair()
