@@ -150,7 +150,7 @@ def run_pair(
 
     def call(role: Role) -> None:
         bench, part, impairment = benches[role], parts[role], scenario.link.impairment
-        end = open_link(link, role, where, options)
+        end = open_link(link, role, where, options, bench.inner)
         timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         used = end
         if impairment is not None and impairment.hits(role):

@@ -240,8 +240,11 @@ class Scenario(_Model):
                 problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
         else:
             kind = link_kind(self.link.type)
+            options = kind.options.model_validate(self.link.options)
             try:
-                kind.check(kind.options.model_validate(self.link.options), self.T_s)
+                kind.check(options.of_run(self.has_inner), self.T_s)
+            except LawError:
+                pass  # ``check_scenario`` says what is wrong with the laws
             except ValueError as problem:
                 problems.append(f"link.options: {problem}")
         if problems:
