@@ -393,6 +393,12 @@ def check_scenario(
     except ValidationError as problem:
         raise UserError("\n".join(lines(problem, Scenario, source))) from None
     wrong: list[str] = []
+    if scenario.inner is not None:
+        try:
+            named_inner(scenario.inner)
+        except LawError as problem:
+            ours = "" if ("inner",) in overrides else f"{where}: "
+            raise UserError("\n".join(ours + line for line in problem.lines)) from None
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
         try:
