@@ -13,11 +13,12 @@ from scipy.linalg import expm
 from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
-from gfm_plant.options import COMMANDS, MEASURED, Plant
+from gfm_plant.options import COMMANDS, MEASURED, Overload, Plant, Protection
 from gfm_plant.parameters import load_converter
 from gfm_plant.records import (
     BLOCKED,
     FAULTED,
+    N_RING,
     OPERATING,
     PlantRecord,
     plant_par_dtype,
@@ -53,10 +54,7 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
     _pack_grid(par, options, T_s)
     _pack_measurement(par, options)
     _pack_timing(par, options, T_s)
-    for k, (name, *_) in enumerate(TRIPS):
-        trip = getattr(options.protection, name)
-        par["trip_limit"][0, k] = trip.threshold
-        par["trip_ticks"][0, k] = math.ceil(trip.delay_s / T_s - 1e-6) if trip.enabled else -1
+    _pack_protection(par, options.protection, T_s)
     connect(par, closed=True)
 
     st = np.zeros(1, plant_state_dtype)
@@ -177,6 +175,20 @@ def _pack_measurement(par: PlantRecord, options: Plant) -> None:
     par["seed"] = sensors.seed
     _pack_converter(par, "adc", options.adc.bits, options.adc.range, MEASURED)
     _pack_converter(par, "dac", options.dac.bits, options.dac.range, COMMANDS)
+
+
+def _pack_protection(par: PlantRecord, protection: Protection, T_s: float) -> None:
+    par["trip_ticks"] = -1
+    trips = [getattr(protection, name) for name, *_ in TRIPS]
+    for k, trip in enumerate([*trips, *protection.overload]):
+        par["trip_limit"][0, k] = trip.threshold
+        if isinstance(trip, Overload) or trip.enabled:
+            par["trip_ticks"][0, k] = math.ceil(trip.delay_s / T_s - 1e-6)
+    par["by_voltage"] = protection.frequency == "voltage"
+    if protection.overload or protection.frequency == "voltage":
+        cycle = 2 * math.pi / (par[0]["omega_b"] * T_s)  # ticks
+        par["place_ticks"] = math.ceil(cycle / N_RING)
+        par["places"] = max(1, round(cycle / par[0]["place_ticks"]))
 
 
 def _pack_converter(
