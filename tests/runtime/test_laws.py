@@ -39,7 +39,11 @@ matching-2  0 0 0 0 0  | P 0 0 0 0             | P 0 0 0 0
 """
 ROWS = {line.split()[0]: line for line in TABLE_II.strip().splitlines()}
 DEPLOYABLE, RIG = "mimo-gfm-deployable", "mimo-gfm-deployable-rig"
-BESIDE = ("mimo-gfm", "mimo-gfm-scheduled", DEPLOYABLE, RIG, "dvoc", "hybrid-angle", "psc-dc")
+PRACTICAL = "mimo-gfm-practical"
+BESIDE = (
+    *("mimo-gfm", "mimo-gfm-scheduled", DEPLOYABLE, RIG, PRACTICAL),
+    *("dvoc", "hybrid-angle", "psc-dc"),
+)
 
 # Orders counted by hand: one for the DC PI, then row 2, then row 3.
 ORDERS = {
@@ -50,6 +54,7 @@ ORDERS = {
     "vsg-10": 1 + 2 + 1, "vsg-11": 1 + 3 + 1, "vsg-12": 1 + 3 + 1,
     "matching-1": 1, "matching-2": 0,
     "mimo-gfm": 1 + 1 + 1, "mimo-gfm-scheduled": 1 + 1 + 1, DEPLOYABLE: 1 + 1 + 1, RIG: 1 + 1 + 1,
+    PRACTICAL: 1 + 1 + 1,
     "dvoc": 1 + 1, "hybrid-angle": 1 + 1, "psc-dc": 1,
 }  # fmt: skip
 
