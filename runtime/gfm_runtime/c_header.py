@@ -8,15 +8,16 @@ structs out otherwise stops with an error instead of reading the wrong bytes.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-from gfm_runtime.error_maps import ERROR_MAPS, V_MIN
-from gfm_runtime.inner import NEGLIGIBLE
+from gfm_runtime.error_maps import ERROR_MAPS, R_MIN, V_MIN
+from gfm_runtime.inner import KINDS, NEGLIGIBLE, PRIORITIES
 from gfm_runtime.kernel import N_MAX, law_dtype, state_dtype
-from gfm_runtime.signals import NU, NY
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
 
 _C_TYPES = {"i8": "int64_t", "u8": "uint64_t", "f8": "double", "f4": "float"}
 
@@ -44,6 +45,10 @@ def c_struct(dtype: np.dtype[Any], name: str) -> str:
     return "\n".join(["typedef struct {", *members, f"}} {name};", *checks, ""])
 
 
+def _numbered(prefix: str, names: Mapping[str, int]) -> list[str]:
+    return [f"#define {prefix}_{k.upper().replace('-', '_')} {v}" for k, v in names.items()]
+
+
 def c_header(real: DTypeLike = np.float64) -> str:
     """The whole header: ``real``, the constants, ``law_t`` and ``state_t``; float64 or float32."""
     f = np.dtype(real)
@@ -61,9 +66,14 @@ def c_header(real: DTypeLike = np.float64) -> str:
             f"#define N_MAX {N_MAX}",
             f"#define NY {NY}",
             f"#define NU {NU}",
+            f"#define NY_INNER {NY_INNER}",
+            f"#define NU_INNER {NU_INNER}",
             f"#define V_MIN {V_MIN!r}",
+            f"#define R_MIN {R_MIN.hex()}",
             f"#define NEGLIGIBLE {NEGLIGIBLE.hex()}",
-            *(f"#define ERROR_{k.upper().replace('-', '_')} {v}" for k, v in ERROR_MAPS.items()),
+            *_numbered("ERROR", ERROR_MAPS),
+            *_numbered("INNER", KINDS),
+            *_numbered("PRIORITY", PRIORITIES),
             "",
             f"typedef {_C_TYPES[f.str[1:]]} real;",
             "",

@@ -97,8 +97,8 @@ class Inner:
     freeze: bool = True
     P_max: float = math.inf
     P_min: float = -math.inf
-    k_P: float = 0.01
-    k_Pi: float = 0.1
+    k_P: float = 0.2
+    k_Pi: float = 5.0
     f_pll: float = 0.0
 
     def __post_init__(self) -> None:

@@ -27,8 +27,8 @@ class PowerLimiter(Table):
 
     P_max: Number = Field(description="p.u.")
     P_min: Number = Field(description="p.u.")
-    k_p: Number = Field(0.01, description="p.u. of omega_u per p.u. of power")
-    k_i: Number = Field(0.1, description="1/s")
+    k_p: Number = Field(0.2, description="p.u. of omega_u per p.u. of power")
+    k_i: Number = Field(5.0, description="1/s")
 
 
 class _Stage(Table):

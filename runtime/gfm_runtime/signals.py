@@ -130,10 +130,15 @@ def names(name: Group) -> tuple[str, ...]:
 Y_NAMES, U_NAMES, REF_NAMES, D_NAMES = names("y"), names("u"), names("ref"), names("d")
 
 
-def carried(vector: Vector, inner: bool) -> tuple[str, ...]:
-    """The names of what a run exchanges: y or u, and with an inner stage its signals after them."""
+def carried_rows(vector: Vector, inner: bool) -> tuple[Signal, ...]:
+    """What a run exchanges: y or u, and with an inner stage its signals after them."""
     more: Group = "y_inner" if vector == "y" else "u_inner"
-    return names(vector) + (names(more) if inner else ())
+    return group(vector) + (group(more) if inner else ())
+
+
+def carried(vector: Vector, inner: bool) -> tuple[str, ...]:
+    """The names of ``carried_rows``."""
+    return tuple(s.name for s in carried_rows(vector, inner))
 
 
 def table_hash() -> str:

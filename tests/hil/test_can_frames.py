@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,14 +14,21 @@ from gfm_hil.links.can.segments import OTHER_DBC, SegmentSender
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import crc8
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
-from gfm_runtime.signals import Group, group, names
+from gfm_runtime.signals import Group, carried_rows, group, names
 from gfm_runtime.states import RUNNING, SAFE
 
 from ..support.can import Joiner, VectorReceiver
 
 DBC = {fd: read_dbc(write_dbc(fd)) for fd in (True, False)}
 PLAN = {fd: plan_of(dbc) for fd, dbc in DBC.items()}
-ALL = [(fd, name, part) for fd in DBC for name in VECTORS for part in PLAN[fd].vectors[name]]
+INNER_PLAN = {fd: plan_of(dbc, True) for fd, dbc in DBC.items()}
+ALL = [
+    (fd, name, plan, part)
+    for fd in DBC
+    for plan in (PLAN[fd], INNER_PLAN[fd])
+    for name in VECTORS
+    for part in plan.vectors[name]
+]
 WIDTH = {name: len(names(name)) for name in VECTORS}
 
 either = st.booleans()
@@ -80,7 +88,11 @@ def test_the_dbc_survives_its_own_text(fd):
         assert signal.comment == row.description
 
 
-@pytest.mark.parametrize("row", [*group("y"), *group("u")], ids=lambda r: f"{r.group}-{r.name}")
+@pytest.mark.parametrize(
+    "row",
+    [*carried_rows("y", True), *carried_rows("u", True)],
+    ids=lambda r: f"{r.group}-{r.name}",
+)
 def test_the_range_of_every_signal_fits(row):
     for end in (row.low, row.high):
         assert abs(end - offset(row)) / row.scale <= INT16
@@ -88,31 +100,33 @@ def test_the_range_of_every_signal_fits(row):
 
 @given(st.data(), st.sampled_from(ALL))
 def test_packing_is_that_of_cantools(data, frame):
-    fd, name, part = frame
-    sent = np.array(data.draw(st.lists(values, min_size=WIDTH[name], max_size=WIDTH[name])))
+    fd, name, plan, part = frame
+    rows = carried_rows(name, plan.inner)
+    names = [row.name for row in rows]
+    sent = np.array(data.draw(st.lists(values, min_size=len(rows), max_size=len(rows))))
     tick = data.draw(st.integers(0, 2**40))
-    sender = VectorSender(PLAN[fd], name, 1)
-    payloads = dict(sender.frames(FrameWriter(name).pack(tick, RUNNING, 0, sent)))
+    sender = VectorSender(plan, name, 1)
+    payloads = dict(sender.frames(FrameWriter(name, plan.inner).pack(tick, RUNNING, 0, sent)))
     payload = payloads[part.number]
 
     message = DBC[fd].get_message_by_frame_id(part.number)
     ends = {
-        names(name)[k]: (o - INT16 * s, o + INT16 * s)
+        names[k]: (o - INT16 * s, o + INT16 * s)
         for k, s, o in zip(part.index, part.scale, part.offset, strict=True)
     }
-    physical = {n: float(np.clip(sent[names(name).index(n)], *ends[n])) for n in ends}
+    physical = {n: float(np.clip(sent[names.index(n)], *ends[n])) for n in ends}
     crc = crc8(part.data_id, np.frombuffer(payload, np.uint8))
     header = {"Crc": int(crc), "Counter": tick % 2 * 64 + 128}  # of sequence 0
     assert message.encode({**physical, **header}, strict=False) == payload
 
     decoded = message.decode(payload, decode_choices=False)
-    got = np.full(WIDTH[name], np.nan)
+    got = np.full(len(rows), np.nan)
     unpack_vector(
         np.frombuffer(payload, np.uint8), part.index, part.start, part.scale, part.offset, got
     )
-    assert {names(name)[k]: got[k] for k in part.index} == {n: decoded[n] for n in ends}
+    assert {names[k]: got[k] for k in part.index} == {n: decoded[n] for n in ends}
     for n, (low, high) in ends.items():
-        value, scale = sent[names(name).index(n)], group(name)[names(name).index(n)].scale
+        value, scale = sent[names.index(n)], rows[names.index(n)].scale
         if low <= value <= high:
             assert abs(decoded[n] - value) <= 0.5001 * scale
 
@@ -356,6 +370,48 @@ def test_a_damaged_message_is_counted():
 def test_a_message_too_long_is_refused():
     with pytest.raises(ValueError, match="2000 bytes; at most 1012 fit"):
         SegmentSender(PLAN[False], "plant").frames(bytes(2000))
+
+
+@given(vectors, either, st.data())
+def test_every_value_of_an_inner_stage_comes_back_within_half_a_count(name, fd, data):
+    plan, rows = INNER_PLAN[fd], carried_rows(name, True)
+    sender, receiver = VectorSender(plan, name, 10), VectorReceiver(plan, name)
+    writer, reader = FrameWriter(name, True), FrameReader(name, True)
+    for tick in range(3):
+        sent = np.array([data.draw(st.floats(row.low, row.high)) for row in rows])
+        frames = sender.frames(writer.pack(tick, RUNNING, 0, sent))
+        heard = [receiver.take(*frame) for frame in frames]
+        (message,) = [one for one in heard if one is not None]
+        got = np.zeros(len(rows))
+        assert reader.unpack(message, got) == tick
+        assert (np.abs(got - sent) <= 0.5001 * np.array([row.scale for row in rows])).all()
+
+
+def test_frames_of_an_inner_stage_follow_those_of_the_vector():
+    """0x110 and 0x120 begin the vectors of other runs; no identifier is used twice."""
+    numbers = {
+        (fd, name): [part.number for part in INNER_PLAN[fd].vectors[name]]
+        for fd in DBC
+        for name in VECTORS
+    }
+    assert numbers == {
+        (True, "u"): [0x118],
+        (True, "y"): [0x128],
+        (False, "u"): [0x118, 0x119],
+        (False, "y"): [0x128, 0x129, 0x12A, 0x12B],
+    }
+    for fd, dbc in DBC.items():
+        assert [len(INNER_PLAN[fd].vectors[n]) for n in "yu"] == ([1, 1] if fd else [4, 2])
+        assert len({m.frame_id for m in dbc.messages}) == len(dbc.messages)
+
+
+def test_the_frames_of_an_inner_stage_count_only_in_its_runs():
+    """A file that lacks them describes every other run, by the same digest."""
+    older = Database([m for m in DBC[True].messages if "Inner" not in m.name])
+    assert len(older.messages) == len(DBC[True].messages) - 2
+    assert plan_of(older).digest == PLAN[True].digest != INNER_PLAN[True].digest
+    with pytest.raises(ValueError, match=r"frames MeasurementsInner….*inner stage"):
+        plan_of(older, True)
 
 
 def test_another_dbc_is_named():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.links.can.dbc import SEGMENT, STATUS, VECTORS
+from gfm_hil.links.can.dbc import INNER, SEGMENT, STATUS, VECTORS
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.export import export_run
@@ -71,19 +71,21 @@ def exported(folder: Path, place: Path) -> tuple[list[can.Message], cantools.dat
 
 
 @pytest.mark.parametrize(
-    ("port", "options", "frames"),
+    ("port", "options", "frames", "content"),
     [
-        (19500, {}, {"y": 1, "u": 1}),
-        (19510, {"every": 3}, {"y": 1, "u": 1}),
-        (19520, {"fd": False, "bitrate": 1_000_000, "every": 10}, {"y": 2, "u": 1}),
+        (19500, {}, {"y": 1, "u": 1}, CONTENT),
+        (19510, {"every": 3}, {"y": 1, "u": 1}, CONTENT),
+        (19520, {"fd": False, "bitrate": 1_000_000, "every": 10}, {"y": 2, "u": 1}, CONTENT),
+        (19550, {"every": 2}, {"y": 1, "u": 1}, {**CONTENT, "law": "vsg-2", "inner": "cascaded"}),
     ],
-    ids=["FD", "FD every third tick", "classic"],
+    ids=["FD", "FD every third tick", "classic", "inner stage"],
 )
-def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, frames):
-    heard = run_over_can(tmp_path / "run", port, **options)
+def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, frames, content):
+    heard = run_over_can(tmp_path / "run", port, content, **options)
     found, dbc = exported(tmp_path / "run", tmp_path)
     for role, group, count in (("plant", "y", frames["y"]), ("controller", "u", frames["u"])):
-        numbers = {m.frame_id for m in dbc.messages if m.name.startswith(VECTORS[group])}
+        title = (INNER if "inner" in content else VECTORS)[group]
+        numbers = {m.frame_id for m in dbc.messages if m.name.partition("_")[0] == title}
         assert len(numbers) == count
         numbers.add(dbc.get_message_by_name(STATUS[role]).frame_id)
         there = [(m.arbitration_id, bytes(m.data), m.is_fd) for m in heard

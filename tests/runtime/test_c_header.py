@@ -37,6 +37,19 @@ def test_what_is_not_a_record_is_refused() -> None:
         c_header("f2")
 
 
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_the_inner_stage_is_in_the_header(real: str) -> None:
+    """11 measurements and 4 commands; kinds and priorities under the numbers of the records."""
+    lines = c_header(real).splitlines()
+    wanted = {
+        "NY_INNER": 11, "NU_INNER": 4, "INNER_NONE": 0, "INNER_VIRTUAL_STATOR": 1,
+        "INNER_CASCADED": 2, "INNER_THRESHOLD_IMPEDANCE": 3, "PRIORITY_CIRCULAR": 0,
+        "PRIORITY_D": 1, "PRIORITY_Q": 2, "PRIORITY_ANGLE": 3,
+    }  # fmt: skip
+    assert {f"#define {name} {number}" for name, number in wanted.items()} <= {*lines}
+    assert "    int64_t priority;" in lines and "    int64_t limited;" in lines
+
+
 @pytest.mark.apt
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_a_compiler_agrees(real: str, tmp_path: Path) -> None:

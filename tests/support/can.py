@@ -12,7 +12,7 @@ from gfm_hil.links.can.segments import LONGEST, join, joiner_dtype, set_joiner
 from gfm_hil.links.can.subrate import admit, goes, in_force, made, set_subrate, subrate_dtype
 from gfm_hil.links.can.vectors import NOTHING, decode, knows, receiver_dtype, set_receiver
 from gfm_hil.links.can.wire import frame_dtype
-from gfm_runtime.signals import Group
+from gfm_runtime.signals import Vector
 
 
 def frame_of(number: int, payload: bytes) -> np.ndarray:
@@ -26,8 +26,8 @@ def frame_of(number: int, payload: bytes) -> np.ndarray:
 class VectorReceiver:
     """Converts CAN frames back to frames of the bench."""
 
-    def __init__(self, plan: Plan, group: Group) -> None:
-        self._record, self._message = np.zeros(1, receiver_dtype), np.zeros(100, np.uint8)
+    def __init__(self, plan: Plan, group: Vector) -> None:
+        self._record, self._message = np.zeros(1, receiver_dtype), np.zeros(LONGEST, np.uint8)
         set_receiver(self._record, plan, group)
 
     @property

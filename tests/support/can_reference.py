@@ -10,23 +10,25 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
-from gfm_hil.recording.columns import PLANT_COLUMNS
+from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.recorder import record_command, record_sample
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import plant_advance, plant_sample
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import Vector, carried
 
 DBC = read_dbc(write_dbc(True))
 
 
-def through_cantools(name: Group, values: np.ndarray) -> None:
-    """Quantise a vector as CAN FD does, with cantools alone."""
-    title = {"y": "Measurements", "u": "Commands"}[name]
+def through_cantools(name: Vector, values: np.ndarray) -> None:
+    """Quantise a vector, with the signals of an inner stage or without, as CAN FD does, with
+    cantools alone."""
+    inner = len(values) > len(carried(name, False))
+    title = {"y": "Measurements", "u": "Commands"}[name] + "Inner" * inner
     message = DBC.get_message_by_name(title)
-    physical = dict(zip(names(name), values.tolist(), strict=True))
+    physical = dict(zip(carried(name, inner), values.tolist(), strict=True))
     payload = message.encode({**physical, "Crc": 0, "Counter": 0}, strict=False)
     decoded = message.decode(payload, decode_choices=False)
-    values[:] = [decoded[n] for n in names(name)]
+    values[:] = [decoded[n] for n in carried(name, inner)]
 
 
 def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str, np.ndarray]:
@@ -36,7 +38,8 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
     """
     b = make_bench(scenario)
     timeline = Timeline(b, folder / "events.jsonl", ROLES)
-    rows = np.full((scenario.ticks, len(PLANT_COLUMNS)), np.nan)
+    columns = signals_of("plant", b.inner)
+    rows = np.full((scenario.ticks, len(columns)), np.nan)
     command, sent = b.u.copy(), []
     for tick in range(scenario.ticks):
         timeline.carry_out(tick)
@@ -53,4 +56,4 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
         record_command(rows[tick], applied)
         plant_advance(b.par, b.st, applied)
     timeline.close()
-    return {name: rows[:, j] for j, name in enumerate(PLANT_COLUMNS)}
+    return {name: rows[:, j] for j, name in enumerate(columns)}

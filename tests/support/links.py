@@ -143,14 +143,14 @@ def run_pair(
     folder.mkdir(parents=True, exist_ok=True)
     where = endpoint or link_kind(link).fresh(folder)
     benches = {role: make_bench(scenario) for role in ROLES}
-    parts = {role: Part.create(folder, role, scenario.ticks) for role in ROLES}
+    parts = {role: Part.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES}
     for role in ROLES:
         compile_role(role, benches[role], parts[role])
     pair = Pair()
 
     def call(role: Role) -> None:
         bench, part, impairment = benches[role], parts[role], scenario.link.impairment
-        end = open_link(link, role, where, options)
+        end = open_link(link, role, where, options, bench.inner)
         timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         used = end
         if impairment is not None and impairment.hits(role):

@@ -23,7 +23,7 @@ from rich.table import Table
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.recording.run import controlled_by
-from gfm_hil.results.report import as_expected, cell, event_rows
+from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
 from gfm_hil.scenario.model import Scenario, load_scenario
@@ -39,6 +39,7 @@ _OPTIONS = {
     "duration": "--duration",
     "seed": "--seed",
     "law": "--law",
+    "inner": "--inner",
 }
 
 
@@ -53,6 +54,10 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
         help="override a key of link.options, e.g. curve=keys; may be repeated",
     )  # fmt: skip
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
+    command.add_argument(
+        "--inner", metavar="NAME",
+        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
+    )  # fmt: skip
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
 
 
@@ -81,6 +86,7 @@ def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
         link__endpoint=options.endpoint,
         duration=options.duration,
         seed=options.seed,
+        inner=options.inner,
         **{f"link__options__{key}": value for key, value in options.option},
         **more,
     )
@@ -139,7 +145,8 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console.print(f"[bold {colour}]{summary['status']}[/]{expected}{reason}", highlight=False)
     for part in summary["unmet"]:
         console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
-    console.print(escape(controlled_by(summary)), highlight=False)
+    stage = f" · inner stage {inner_stages(summary)}" if "inner" in summary else ""
+    console.print(escape(controlled_by(summary) + stage), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
         f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {cell(summary['misses'])} misses",

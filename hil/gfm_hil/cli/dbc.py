@@ -21,6 +21,9 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
     command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")
+    command.add_argument(
+        "--inner", action="store_true", help="with --budget: of a run with an inner stage"
+    )
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
 
 
@@ -29,7 +32,7 @@ def call(options: argparse.Namespace) -> int:
     if options.T_s <= 0:
         raise UserError(f"--T_s {options.T_s:g}: must be more than 0 s")
     if options.budget:
-        terminal().print(_budgets(options.T_s), highlight=False)
+        terminal().print(_budgets(options.T_s, options.inner), highlight=False)
         return 0
     from gfm_hil.links.can.dbc import write_dbc
 
@@ -44,8 +47,9 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _budgets(T_s: float) -> Table:
-    """Longest frames of y and u by bit rate, and the exchange that fits."""
+def _budgets(T_s: float, inner: bool) -> Table:
+    """Longest frames of y and u by bit rate, and the exchange that fits; ``inner``: in a run with
+    an inner stage."""
     from gfm_hil.links.can import CanOptions
     from gfm_hil.links.can.bus_time import budget
     from gfm_hil.links.can.layout import load_plan
@@ -57,7 +61,7 @@ def _budgets(T_s: float) -> Table:
     for column in table.columns:
         column.no_wrap = True
     for fd, rates in _RATES.items():
-        plan = load_plan(CanOptions(fd=fd))
+        plan = load_plan(CanOptions(fd=fd).of_run(inner))
         for bitrate, data in rates:
             need = budget(plan, bitrate, data)
             every = need.every(T_s)

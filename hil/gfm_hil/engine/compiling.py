@@ -75,7 +75,7 @@ def compiled_bench(
         sets.append(_both(found))
     else:
         sets += [_role(role, found) for role in roles]
-        sets.append(_link(link.type, link.options))
+        sets.append(_link(link.type, link.options, scenario.has_inner))
         if link.impairment is not None:
             sets.append(("the link's impairment", impaired.warm_up))
         if scenario.mode == "realtime":
@@ -118,6 +118,7 @@ def _role(role: Role, found: list[Bench]) -> Set:
     return f"the {role}", compile_it
 
 
-def _link(name: str, options: dict[str, Any]) -> Set:
+def _link(name: str, options: dict[str, Any], inner: bool = False) -> Set:
     kind = link_kind(name)
-    return f"the link {name}", lambda: kind.warm_up(kind.options.model_validate(options))
+    checked = kind.options.model_validate(options).of_run(inner)
+    return f"the link {name}", lambda: kind.warm_up(checked)

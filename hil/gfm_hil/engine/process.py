@@ -110,7 +110,8 @@ def _meet_and_run(
     """
     scenario = bench.scenario
     rights = ask_for_real_time(role) if scenario.mode == "realtime" else None
-    good: Link = open_link(scenario.link.type, role, endpoint, scenario.link.options)
+    kind, options = scenario.link.type, scenario.link.options
+    good: Link = open_link(kind, role, endpoint, options, bench.inner)
     link = good
 
     def stopped() -> bool:

@@ -6,9 +6,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, PrivateAttr, ValidationError
 
 from gfm_hil.core.errors import lines
 from gfm_hil.core.roles import Role
@@ -50,6 +50,19 @@ class LinkOptions(BaseModel):
     """Base class of a link's own options, the table ``link.options`` of a scenario."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    _inner: bool = PrivateAttr(False)
+
+    @property
+    def inner(self) -> bool:
+        """Whether the run has an inner stage, whose signals the frames carry too. Its laws say
+        so, not the user."""
+        return self._inner
+
+    def of_run(self, inner: bool) -> Self:
+        """The same options in a run with an inner stage or without."""
+        options = self.model_copy()
+        options._inner = inner
+        return options
 
 
 @dataclass(frozen=True)
@@ -83,8 +96,12 @@ class LinkKind:
     warm_up: Callable[[Any], None] = lambda options: None
     exact: bool = True
 
-    def checked(self, endpoint: str | None, options: dict[str, Any]) -> LinkOptions:
+    def checked(
+        self, endpoint: str | None, options: dict[str, Any], inner: bool = False
+    ) -> LinkOptions:
         """The options as a model, if endpoint (None: a fresh one) and options may be used.
+
+        ``inner``: in a run with an inner stage.
 
         Raises:
             ValueError: they may not; one line.
@@ -97,4 +114,4 @@ class LinkKind:
             wrong = lines(problem, self.options)
             raise ValueError("; ".join(f"options.{line}" for line in wrong)) from None
         self.check_both(endpoint, found)
-        return found
+        return found.of_run(inner)

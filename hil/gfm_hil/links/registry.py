@@ -45,15 +45,21 @@ def link_kind(name: str) -> LinkKind:
     raise ValueError(f"link.type = {name!r}: must be one of {link_names()}")
 
 
-def open_link(name: str, role: Role, endpoint: str, options: dict[str, Any] | None = None) -> Link:
-    """Open one end of the link of that name.
+def open_link(
+    name: str,
+    role: Role,
+    endpoint: str,
+    options: dict[str, Any] | None = None,
+    inner: bool = False,
+) -> Link:
+    """Open one end of the link of that name; ``inner``: for a run with an inner stage.
 
     Raises:
         UserError: the name, the endpoint or the options are wrong, or the link cannot be opened.
     """
     try:
         kind = link_kind(name)
-        checked = kind.checked(endpoint, options or {})
+        checked = kind.checked(endpoint, options or {}, inner)
     except ValueError as problem:
         raise UserError(f"link: {problem}") from None
     return kind.open(role, endpoint, checked)

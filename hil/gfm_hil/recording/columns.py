@@ -29,7 +29,8 @@ PLANT_COLUMNS = (
 )
 #: a run with an inner stage records these after the plant's and the controller's
 PLANT_INNER = (*(f"y_{n}" for n in names("y_inner")), *(f"u_{n}" for n in names("u_inner")))
-CONTROLLER_INNER = ("E_law", "i_ref_d", "i_ref_q", "limited")
+I_REF = ("i_ref_d", "i_ref_q")
+CONTROLLER_INNER = ("E_law", *I_REF, "limited")
 CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
 # ns of CLOCK_MONOTONIC, -1: never; in lockstep a sample late, an answer is "received" at the look
 # that finds the next frame "sent"; "stall" is the longest gap between two looks at the clock
@@ -117,7 +118,9 @@ class Described:
 
     def shown(self, f_n: float) -> Shown:
         """A frequency in Hz (``f_n`` is nominal), an angle in degrees, the rest as recorded."""
-        signal = self.name.partition("_")[2] or self.name
+        signal = self.name
+        if self.name not in CONTROLLER_INNER:  # their names have no prefix
+            signal = self.name.partition("_")[2] or self.name
         if self.unit == "p.u. (omega_n)":
             return Shown("f_g" if signal == "omega_g" else "f", "Hz", f_n)
         if self.unit == "rad":

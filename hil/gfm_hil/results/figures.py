@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.columns import PIECE, TABLE, Columns, Rows
+from gfm_hil.recording.columns import I_REF, PIECE, TABLE, Columns, Rows, pieces
 from gfm_hil.recording.run import controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.scenario.expectation import reason_name
@@ -125,6 +125,38 @@ def _mark(
         )  # fmt: skip
 
 
+class Magnitude:
+    """The size of a vector of which two columns hold the components; only slices are read."""
+
+    def __init__(self, d: Rows, q: Rows) -> None:
+        self._d, self._q, self.dtype = d, q, d.dtype
+
+    def __len__(self) -> int:
+        return len(self._d)
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return np.hypot(self._d[rows], self._q[rows])
+
+
+def _shade(axes: Axes, t: Rows, x: Rows) -> None:
+    """Shade the times at which a column of 0 and 1 is 1; one artist, read piece by piece."""
+    changes, before = [], False
+    for first, part in zip(range(0, len(x), PIECE), pieces(x, 0, len(x)), strict=True):
+        on = np.concatenate([[before], part == 1])
+        changes += (first + np.flatnonzero(on[1:] != on[:-1])).tolist()
+        before = bool(on[-1])
+    if before:
+        changes.append(len(x) - 1)
+    edges = [float(t[k : k + 1][0]) for k in changes]
+    spans = [(a, b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    if spans:
+        shade = axes.broken_barh(
+            spans, (0, 1), transform=axes.get_xaxis_transform(), color=COLOURS[4], alpha=0.3, lw=0,
+            zorder=0, label="limited",
+        )  # fmt: skip
+        shade.set_in_layout(False)
+
+
 def _legend(axes: Axes, columns: int) -> None:
     """A legend above the panel, where it covers no curve; matplotlib warns that it is slow to look
     for a free place among many points."""
@@ -175,22 +207,27 @@ def draw_signals(
 ) -> list[Axes]:
     """Fill a figure with the six panels of a run: p, q, frequency, V, v_dc and currents."""
     axes = _panels(figure, 3, 2)
-    blue, red, green, *_ = COLOURS
+    blue, red, green, purple, *_ = COLOURS
     # a regulated source ignores i_u
     i_u = [("u_i_u", green, "i_u")] if scenario.plant.dc_source.mode == "controlled" else []
+    inner = [("i_ref", purple, "|i*|")] if {*I_REF} <= signals.keys() else []
+    E = "E_law" if "E_law" in signals else "u_E_u"  # with an inner stage u_E_u is e_d
+    signals = {**signals, "i_ref": Magnitude(*(signals[n] for n in I_REF))} if inner else signals
     panels: list[tuple[str, list[tuple[str, str, str]]]] = [
         ("active power p", [("true_p", blue, "p"), ("ref_P_ref", _GREY, "P_ref")]),
         ("reactive power q", [("true_q", blue, "q"), ("ref_Q_ref", _GREY, "Q_ref")]),
         ("frequency", [("true_omega_u", blue, "converter"), ("true_omega_g", _GREY, "grid")]),
-        ("voltage V", [("true_V", blue, "V"), ("u_E_u", red, "E_u")]),
+        ("voltage V", [("true_V", blue, "V"), (E, red, "E_u")]),
         ("DC voltage v_dc", [("true_v_dc", blue, "v_dc")]),
-        ("currents", [("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *i_u]),
+        ("currents", [("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *inner, *i_u]),
     ]
+    if "limited" in signals:
+        _shade(axes[-1], signals["t"], signals["limited"])
     for a, (title, names) in zip(axes, panels, strict=True):
         curves = [(signals, n, colour, label) for n, colour, label in names if n in signals]
         _draw_columns(a, title, names[0][0], scenario, curves)
         if len(curves) > 1:
-            _legend(a, len(curves))
+            _legend(a, len(curves) + len(a.collections))
     _mark(axes, summary["events"])
     trips = [{"t": x["t"], "label": reason_name(x["reason"])} for x in summary.get("trips", [])]
     _mark(axes, trips, red, above=20 + 10 * min(3, len(summary["events"])))

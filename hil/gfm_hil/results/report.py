@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,14 @@ def finite(value: Any) -> Any:
     return value
 
 
+def inner_stages(summary: Mapping[str, Any]) -> str:
+    """The kinds of the laws' inner stages in words: one if all have the same."""
+    kinds = summary["inner"]
+    if len({*kinds.values()}) == 1:
+        return str(next(iter(kinds.values())))
+    return ", ".join(f"{law}: {kind}" for law, kind in kinds.items())
+
+
 def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
     """A table in HTML, which may be wider than the page."""
 
@@ -117,6 +125,7 @@ def write_report(
     )
     facts = [
         ("controlled by", controlled_by(summary)),
+        *([("inner stage", inner_stages(summary))] if "inner" in summary else []),
         ("link, mode", f"{summary['link']}, {summary['mode']}"),
         (
             "simulated",

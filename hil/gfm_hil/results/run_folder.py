@@ -32,7 +32,7 @@ from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.parts import remove_parts
 from gfm_hil.recording.run import read_recording
 from gfm_hil.results.run import Run
-from gfm_hil.results.summary import origin, summarise
+from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.scenario.toml_out import write_scenario
 
@@ -194,7 +194,7 @@ def _complete(
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
     links = _link_ends(folder)
     summary = summarise(scenario, signals, timing, log, worst(log, outside), links, wall_s)
-    summary |= origin(scenario, (folder / "scenario.toml").stat().st_mtime)
+    summary |= stages(scenario) | origin(scenario, (folder / "scenario.toml").stat().st_mtime)
     run = Run(scenario, summary, signals, labels, log, folder, timing)
     _conclude(run, figures)
     return run
@@ -235,7 +235,7 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
     if ids[0] is None or ids[0] != ids[1]:
         raise UserError(f"{first}, {second}: are not of the same run: run = {ids[0]!r}, {ids[1]!r}")
     done = plant.summary["ticks"]
-    check_free(folder, done)
+    check_free(folder, done, "inner" in plant.summary)
     log = read_log(*(run.file("events.jsonl") for run in roles.values()))
     links = {
         role: _link_end(role, roles[role].summary)
@@ -255,7 +255,8 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
         signals, timing, labels = read_recording(folder)
         wall_s = plant.summary["wall_s"]
         summary = summarise(plant.scenario, signals, timing, log, worst(log, None), links, wall_s)
-        summary |= {key: plant.summary[key] for key in ("date", "version")}
+        kept = ("inner", "date", "version")
+        summary |= {key: plant.summary[key] for key in kept if key in plant.summary}
         summary["machines"] = controller.summary["machines"] | plant.summary["machines"]
         whole = Run(plant.scenario, summary, signals, labels, log, folder, timing)
         _conclude(whole, figures=True)

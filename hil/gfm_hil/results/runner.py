@@ -23,7 +23,7 @@ from gfm_hil.recording.merge import known_laws, laws_used
 from gfm_hil.recording.parts import Part, remove_parts
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
-from gfm_hil.results.summary import origin, summarise
+from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import INPROC, Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 
@@ -122,6 +122,6 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
     columns |= named("controller", controller.signals[:done].copy("F"))
     outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
     summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
-    summary |= origin(scenario, date)
+    summary |= stages(scenario) | origin(scenario, date)
     laws = known_laws(bench.controller.labels, laws_used(columns["law"][:]))
     return Run(scenario, summary, columns, laws, timeline.lines)

@@ -22,6 +22,8 @@ from gfm_hil.results.metrics import event_metrics
 from gfm_hil.results.ripple import remaining_ripple
 from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
+from gfm_runtime import load_law
+from gfm_runtime.inner_file import NO_INNER
 
 _BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
 _FAULTS = ("tripped", "safe")
@@ -43,6 +45,16 @@ def origin(scenario: Scenario, began: float) -> dict[str, Any]:
         "version": version("gfmhil"),
         "machines": {platform.node(): judged},
     }
+
+
+def stages(scenario: Scenario) -> dict[str, Any]:
+    """The kind of the inner stage of each law, under the key ``inner``; empty if no law of the run
+    has one."""
+    if not scenario.has_inner:
+        return {}
+    laws = {name: load_law(name, scenario.inner).laws[0] for name in scenario.laws()}
+    kinds = {name: law.inner.kind if law.inner else NO_INNER for name, law in laws.items()}
+    return {"inner": kinds}
 
 
 def summarise(

@@ -251,8 +251,11 @@ class Scenario(_Model):
                 problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
         else:
             kind = link_kind(self.link.type)
+            options = kind.options.model_validate(self.link.options)
             try:
-                kind.check(kind.options.model_validate(self.link.options), self.T_s)
+                kind.check(options.of_run(self.has_inner), self.T_s)
+            except LawError:
+                pass  # ``check_scenario`` says what is wrong with the laws
             except ValueError as problem:
                 problems.append(f"link.options: {problem}")
         if problems:
@@ -402,6 +405,12 @@ def check_scenario(
     except ValidationError as problem:
         raise UserError("\n".join(lines(problem, Scenario, source))) from None
     wrong: list[str] = []
+    if scenario.inner is not None:
+        try:
+            named_inner(scenario.inner)
+        except LawError as problem:
+            ours = "" if ("inner",) in overrides else f"{where}: "
+            raise UserError("\n".join(ours + line for line in problem.lines)) from None
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
         try:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import TABLE, Columns
+from gfm_hil.recording.columns import CONTROLLER_INNER, I_REF, TABLE, Columns
 from gfm_hil.recording.timing import LATE, MISS_NEEDS, ROUND_TRIP, SLACK, Duration, missed
 from gfm_runtime.signals import names
 
-_LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5}  # of a channel's range, by its unit
+_LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5, "": 1.0}  # of a channel's range, by its unit
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Channel:
 
     Attributes:
         name: in messages between page and server.
-        group: y, u, ref, d, plant or loop.
+        group: y, u, ref, d, plant, inner (of a run with an inner stage) or loop.
         symbol, unit, description: for display.
         least: the smallest range of values that fills the height of a plot, in ``unit``.
         needs: columns of the recording from which it is computed.
@@ -65,6 +65,11 @@ def make_channels(T_s: float, f_b: float) -> tuple[Channel, ...]:
           for n in names("ref")),
         *(_column(f"d_{n}", "d", f"true_{n}", f_b) for n in names("d")),
         *(_column(n, "plant", f"true_{n}", f_b) for n in ("i", "delta")),
+        *(_column(n, "inner", f"y_{n}", f_b) for n in names("y_inner")),
+        *(_column(f"u_{n}", "inner", f"u_{n}", f_b) for n in names("u_inner")),
+        *(_column(n, "inner", n, f_b) for n in CONTROLLER_INNER),
+        Channel("i_ref", "inner", "i_ref", "p.u.", "size of the current that the inner stage asks "
+                "for", _LEAST["p.u."], I_REF, _i_ref),
         _duration("slack", SLACK, 10.0, T_s),
         _duration("round_trip", ROUND_TRIP, 5.0, T_s),
         _duration("late", LATE, 5.0, T_s),
@@ -80,6 +85,11 @@ def _column(name: str, group: str, column: str, f_b: float) -> Channel:
         return np.asarray(columns[column][first:last] * factor)
 
     return Channel(name, group, symbol, unit, row.quantity, _LEAST[unit], (column,), of)
+
+
+def _i_ref(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
+    d, q = (columns[name][first:last] for name in I_REF)
+    return np.hypot(d, q)
 
 
 def _duration(name: str, duration: Duration, least: float, T_s: float) -> Channel:

@@ -21,13 +21,12 @@ from functools import cache
 import numpy as np
 
 from gfm_hil.links.can import CanOptions
-from gfm_hil.links.can.dbc import VECTORS
+from gfm_hil.links.can.dbc import PAYLOADS, VECTORS
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_runtime.compiled import cached
 
 DATA_RATES = (2_000_000, 5_000_000, 8_000_000)  # bit/s of common transceivers
 _CRC_15 = 0x4599  # x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
-PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes; the index is the DLC
 _TAIL = 12  # ACK, its delimiter, end of frame, interframe space
 _NEVER = -9999
 _RUN = 5
@@ -170,7 +169,7 @@ def check_budget(options: CanOptions, T_s: float) -> None:
         return
     fd, rates = options.fd, f"{options.bitrate / 1e6:g}"
     rates += f"/{options.data_bitrate / 1e6:g}" if fd else ""
-    with_fd = plan if fd else load_plan(CanOptions())
+    with_fd = plan if fd else load_plan(CanOptions().of_run(options.inner))
     faster = [r for r in DATA_RATES if not fd or r > options.data_bitrate]
     fits = [r for r in faster if budget(with_fd, options.bitrate, r).exchange <= period]
     nearest = [f"every = {need.every(T_s)}"]

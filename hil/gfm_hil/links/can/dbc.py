@@ -2,8 +2,10 @@
 
 Every frame that carries values begins with two bytes of end-to-end protection, then values as
 int16, little-endian. A value travels in counts of its ``scale``; -32768 stands for NaN.
-CAN FD sends a vector in one frame, classic CAN in as many as it needs. The lower identifier wins
-the bus: states first, then commands, then measurements, then segments of handshake messages.
+CAN FD sends a vector in one frame, classic CAN in as many as it needs. A run with an inner stage
+uses frames of its own, which carry that stage's signals after those of the vector. The lower
+identifier wins the bus: states first, then commands, then measurements, then segments of handshake
+messages.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from cantools.database.conversion import BaseConversion
 
 from gfm_hil.core.roles import Role
 from gfm_runtime.signals import Signal as Row
-from gfm_runtime.signals import Vector, group, table_hash
+from gfm_runtime.signals import Vector, carried_rows, table_hash
 from gfm_runtime.states import REASONS, STATES
 
 INT16 = 32767  # largest count; the range is symmetric
@@ -28,13 +30,17 @@ INVALID = -32768
 SENDERS: dict[Vector, Role] = {"y": "plant", "u": "controller"}
 #: frame name of each vector; if a vector needs several frames, they append _1, _2 …
 VECTORS: dict[Vector, str] = {"y": "Measurements", "u": "Commands"}
+#: the same in a run with an inner stage
+INNER: dict[Vector, str] = {name: f"{title}Inner" for name, title in VECTORS.items()}
 STATUS: dict[Role, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
 SEGMENT: dict[Role, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
 CRC, COUNTER = "Crc", "Counter"
 
 _HEADER = 2  # bytes of end-to-end protection
-_IDS = {"PlantStatus": 0x100, "ControllerStatus": 0x101, "Commands": 0x110, "Measurements": 0x120,
-        "PlantSegment": 0x700, "ControllerSegment": 0x701}  # fmt: skip
+_IDS = {"PlantStatus": 0x100, "ControllerStatus": 0x101, "Commands": 0x110, "CommandsInner": 0x118,
+        "Measurements": 0x120, "MeasurementsInner": 0x128, "PlantSegment": 0x700,
+        "ControllerSegment": 0x701}  # fmt: skip
+PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes of a frame; the index is the DLC
 _NODES = {"plant": "Plant", "controller": "Controller"}
 
 
@@ -79,17 +85,17 @@ def _protection() -> list[Signal]:
     ]
 
 
-def _vector(name: Vector, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
+def _vector(name: Vector, inner: bool, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
     """Name, identifier, length and signals of every frame of a vector."""
-    rows = group(name)
+    rows, vector = carried_rows(name, inner), (INNER if inner else VECTORS)[name]
     room = len(rows) if fd else (8 - _HEADER) // 2
     parts = [rows[k : k + room] for k in range(0, len(rows), room)]
     frames = []
     for k, part in enumerate(parts):
-        title = VECTORS[name] + (f"_{k + 1}" if len(parts) > 1 else "")
+        title = vector + (f"_{k + 1}" if len(parts) > 1 else "")
         values = [_value(row, _HEADER + 2 * j) for j, row in enumerate(part)]
-        length = _HEADER + 2 * len(part)
-        frames.append((title, _IDS[VECTORS[name]] + k, length, [*_protection(), *values]))
+        length = next(n for n in PAYLOADS if n >= _HEADER + 2 * len(part))
+        frames.append((title, _IDS[vector] + k, length, [*_protection(), *values]))
     return frames
 
 
@@ -121,7 +127,8 @@ def write_dbc(fd: bool) -> str:
         signals = _segment(fd)
         frames.append((SEGMENT[role], _IDS[SEGMENT[role]], 64 if fd else 8, signals, role))
     for name, role in SENDERS.items():
-        frames += [(*frame, role) for frame in _vector(name, fd)]
+        for inner in (False, True):
+            frames += [(*frame, role) for frame in _vector(name, inner, fd)]
     other = {"plant": "Controller", "controller": "Plant"}
     messages = []
     for title, number, length, signals, role in sorted(frames, key=lambda f: f[1]):

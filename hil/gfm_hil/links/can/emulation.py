@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfm_hil.links.can.bus_time import PAYLOADS, frame_time
+from gfm_hil.links.can.bus_time import frame_time
+from gfm_hil.links.can.dbc import PAYLOADS
 from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
 from gfm_hil.realtime.atomics import copy
 from gfm_runtime.compiled import cached

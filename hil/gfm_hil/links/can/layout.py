@@ -6,6 +6,7 @@ cantools reads the DBC once, at the start; the loop never calls it.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,7 @@ from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import (
     COUNTER,
     CRC,
+    INNER,
     INT16,
     INVALID,
     SEGMENT,
@@ -30,7 +32,7 @@ from gfm_hil.links.can.dbc import (
 )
 from gfm_hil.links.can.wire import crc8
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import Vector, names
+from gfm_runtime.signals import Vector, carried
 
 
 @dataclass(frozen=True)
@@ -59,13 +61,15 @@ class Layout:
 
 @dataclass(frozen=True)
 class Plan:
-    """All frames of a DBC.
+    """The frames of a DBC that a run uses.
 
     Attributes:
         vectors: the frames of each vector, in the order of their identifiers.
         status, segment: the frame of each sender.
-        digest: hash of all definitions; both sides compare it.
+        digest: hash of all definitions, in a run without an inner stage less the frames of such a
+            stage; both sides compare it.
         fd: CAN FD rather than classic.
+        inner: the vectors have the signals of an inner stage.
     """
 
     vectors: dict[Vector, list[Layout]]
@@ -73,6 +77,7 @@ class Plan:
     segment: dict[Role, Layout]
     digest: int
     fd: bool
+    inner: bool = False
 
 
 def _definition(message: Message) -> str:
@@ -128,8 +133,13 @@ def _layout(message: Message, vector: tuple[str, ...] = ()) -> Layout:
     )
 
 
-def plan_of(database: Database) -> Plan:
-    """The frames of a DBC that the link uses.
+def _frames_of(title: str, messages: Mapping[str, Message]) -> list[Message]:
+    found = [m for name, m in messages.items() if name == title or name.startswith(f"{title}_")]
+    return sorted(found, key=lambda m: m.frame_id)
+
+
+def plan_of(database: Database, inner: bool = False) -> Plan:
+    """The frames of a DBC that the link uses; ``inner``: in a run with an inner stage.
 
     Raises:
         ValueError: a frame or a signal is missing or misplaced.
@@ -139,18 +149,22 @@ def plan_of(database: Database) -> Plan:
     if missing:
         raise ValueError(f"frames {missing} are missing")
     vectors: dict[Vector, list[Layout]] = {}
-    for group, title in VECTORS.items():
-        mine = [m for name, m in messages.items() if name == title or name.startswith(f"{title}_")]
-        vectors[group] = [_layout(m, names(group)) for m in sorted(mine, key=lambda m: m.frame_id)]
+    for group, title in (INNER if inner else VECTORS).items():
+        wanted = carried(group, inner)
+        vectors[group] = [_layout(m, wanted) for m in _frames_of(title, messages)]
         found = sorted(k for layout in vectors[group] for k in layout.index.tolist())
-        if found != list(range(len(names(group)))):
-            raise ValueError(f"frames {title}…: must carry each of {list(names(group))} once")
+        if found != list(range(len(wanted))):
+            why = "; this run has an inner stage" if inner else ""
+            raise ValueError(f"frames {title}…: must carry each of {list(wanted)} once{why}")
+    unused = {m.name for title in INNER.values() for m in _frames_of(title, messages) if not inner}
+    defined = [_definition(m) for m in database.messages if m.name not in unused]
     plan = Plan(
         vectors,
         {role: _layout(messages[STATUS[role]]) for role in ROLES},
         {role: _layout(messages[SEGMENT[role]]) for role in ROLES},
-        _digest("".join(sorted(map(_definition, database.messages))), 4),
+        _digest("".join(sorted(defined)), 4),
         any(m.is_fd for m in database.messages),
+        inner,
     )
     for layout in [*vectors["y"], *vectors["u"], *plan.status.values()]:
         fields: Any = layout.dtype.fields
@@ -207,10 +221,10 @@ def load_plan(options: CanOptions) -> Plan:
         ValueError: the DBC cannot be read, or lacks what the link needs.
     """
     if options.dbc is None:
-        return plan_of(read_dbc(write_dbc(options.fd)))
+        return plan_of(read_dbc(write_dbc(options.fd)), options.inner)
     where = f"dbc = {options.dbc!r}"
     try:
-        plan = plan_of(read_dbc(Path(options.dbc).read_text(encoding="utf-8")))
+        plan = plan_of(read_dbc(Path(options.dbc).read_text(encoding="utf-8")), options.inner)
     except OSError as problem:
         raise ValueError(f"{where}: {problem.strerror}") from None
     except Exception as problem:  # cantools' parser errors have no common base class

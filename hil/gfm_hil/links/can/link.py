@@ -41,7 +41,7 @@ from gfm_hil.links.can.sockets import FULL, SOCKETCAN, set_socket
 from gfm_hil.links.can.wire import BRS, FD, frame_dtype, pack, unpack
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
-from gfm_runtime.signals import Vector, names
+from gfm_runtime.signals import Vector, carried
 
 # python-can also raises what it logs, and we print that in one line: silence its log
 logging.getLogger("can").addHandler(logging.NullHandler())
@@ -185,7 +185,8 @@ class CanLink:
                 self._put_segment(*segment)
             theirs = int(self._node.joiner["theirs"][0])
             return PeerLost(
-                f"the {self._other} uses another DBC ({theirs:08x}, ours is {self._digest:08x})"
+                f"the {self._other} uses another DBC, or one side alone has an inner stage "
+                f"({theirs:08x}, ours is {self._digest:08x})"
             )
         return PeerLost(f"the CAN bus {self._where} is gone: {said or os.strerror(lost)}")
 
@@ -220,7 +221,8 @@ def warm_up(plan: Plan) -> None:
     groups: tuple[tuple[Role, Vector], ...] = (("plant", "y"), ("controller", "u"))
     for role, group in groups:
         mine, theirs = ends[role].handle, ends[ROLES[1 - ROLES.index(role)]].handle
-        words = FrameWriter(group).pack(0, 0, 0, np.zeros(len(names(group))))
+        values = np.zeros(len(carried(group, plan.inner)))
+        words = FrameWriter(group, plan.inner).pack(0, 0, 0, values)
         for k in range(compose(mine, np.frombuffer(words, np.uint8))):
             account(mine, ends[role].out[k : k + 1])
             bring(theirs, ends[role].out[k : k + 1])

@@ -103,7 +103,7 @@ class Node:
         set_sender(self.sender, plan, "y" if plant else "u", options.heartbeat)
         set_receiver(self.receiver, plan, "u" if plant else "y")
         set_joiner(self.joiner, plan, role)
-        set_subrate(views["subrate"], role, options.every)
+        set_subrate(views["subrate"], role, options.every, plan.inner)
         if options.emulate:
             set_bus(self.bus, options.fd, options.bitrate, options.data_bitrate)
 

@@ -49,13 +49,14 @@ subrate_dtype = np.dtype(
 )
 
 
-def set_subrate(subrate: np.ndarray, role: Role, every: int) -> None:
-    """Initialise one record of ``subrate_dtype`` for a side that exchanges every n-th tick."""
+def set_subrate(subrate: np.ndarray, role: Role, every: int, inner: bool = False) -> None:
+    """Initialise one record of ``subrate_dtype`` for a side that exchanges every n-th tick;
+    ``inner``: in a run with an inner stage."""
     s, plant = subrate[0], role == "plant"
     groups: tuple[Vector, Vector] = ("y", "u") if plant else ("u", "y")
     s["every"], s["plant"] = every, plant
     for k, group in enumerate(groups):
-        s["size"][k], s["head"][k] = wire.size_and_head(group)
+        s["size"][k], s["head"][k] = wire.size_and_head(group, inner)
     s["ordinary"] = (0, RUNNING) if plant else (RUNNING, 0)
     s["due"] = s["asked"] = s["given"] = s["ticks"] = NOTHING
 

@@ -101,7 +101,7 @@ def set_receiver(receiver: np.ndarray, plan: Plan, group: Vector) -> None:
 def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
     r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
     r["parts"], r["flags"] = len(parts), plan.fd * (wire.FD | wire.BRS)
-    r["size"], r["head"] = wire.size_and_head(group)
+    r["size"], r["head"] = wire.size_and_head(group, plan.inner)
     done = 0
     for k, part in enumerate(parts):
         r["number"][k], r["length"][k], r["data_id"][k] = part.number, part.length, part.data_id
@@ -161,6 +161,7 @@ def encode(sender, message, frames):
         a, b = s.first[k], s.first[k + 1]
         _head(frames[count], s.number[k], s.length[k], s.flags)
         data = frames[count].data[: s.length[k]]
+        data[:] = 0  # also the bytes that carry no value
         s.saturated += pack_vector(
             s.values, s.index[a:b], s.start[a:b], s.scale[a:b], s.offset[a:b], s.data_id[k],
             counter, data,

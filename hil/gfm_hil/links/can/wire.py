@@ -14,7 +14,7 @@ import numpy as np
 from gfm_hil.links.crc import crc32
 from gfm_hil.links.frame import DATA_IDS, buffer, wire_dtype
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import NU, NY, Vector, names
+from gfm_runtime.signals import NU_INNER, NY_INNER, Vector, carried
 
 frame_dtype = np.dtype(
     [("id", "u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", (2,)), ("data", "u1", 64)]
@@ -87,7 +87,7 @@ def crc8(data_id, payload):
     return crc ^ 0xFF
 
 
-VALUES = max(NY, NU)  # of the longest vector
+VALUES = max(NY_INNER, NU_INNER)  # of the longest vector
 MOST = wire_dtype(VALUES).itemsize  # bytes of the longest frame
 
 
@@ -104,9 +104,9 @@ CRC_BYTES = 4  # at the end
 _HEAD_BYTES = STATE  # magic, version, data id
 
 
-def size_and_head(group: Vector) -> tuple[int, int]:
+def size_and_head(group: Vector, inner: bool) -> tuple[int, int]:
     """Length and first bytes of a vector's frames, which distinguish them from other messages."""
-    _, message = buffer(len(names(group)), DATA_IDS[group])
+    _, message = buffer(len(carried(group, inner)), DATA_IDS[group])
     return len(message), int.from_bytes(message[:_HEAD_BYTES].tobytes(), "little")
 
 

@@ -26,7 +26,7 @@ from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.vectors import CanFrame, VectorSender
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.recording.run import RecordedRun
-from gfm_runtime.signals import Group, names
+from gfm_runtime.signals import Vector, carried
 from gfm_runtime.states import INIT, PLANT_TRIP, REASONS, SAFE
 
 _PIECE = 1 << 16  # ticks
@@ -58,8 +58,8 @@ def dbc_text(run: RecordedRun) -> str:
 
 def can_options(run: RecordedRun) -> CanOptions:
     """The run's own if it went over CAN, else the link's defaults."""
-    link = run.scenario.link
-    return CanOptions(**link.options) if link.type == "can" else CanOptions()
+    link, inner = run.scenario.link, "u_E_q" in run.recorded
+    return CanOptions(**(link.options if link.type == "can" else {})).of_run(inner)
 
 
 def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
@@ -80,7 +80,7 @@ def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
 
 def _measurements(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
-    writer, sender = FrameWriter("y"), VectorSender(plan, "y", options.heartbeat)
+    writer, sender = FrameWriter("y", plan.inner), VectorSender(plan, "y", options.heartbeat)
     clock = _Clock(run, "plant")
     for first, last in _pieces(run):
         rows, times = _vector(run, "y", first, last), clock.times(first, last)
@@ -97,7 +97,7 @@ def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Tim
 
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
     """
-    writer, sender = FrameWriter("u"), VectorSender(plan, "u", options.heartbeat)
+    writer, sender = FrameWriter("u", plan.inner), VectorSender(plan, "u", options.heartbeat)
     n = options.every
     clock, reasons = _Clock(run, "controller"), _SafeReasons(run)
     for first, last in _pieces(run):
@@ -122,9 +122,10 @@ def _pieces(run: RecordedRun) -> Iterator[tuple[int, int]]:
     return ((a, min(a + _PIECE, run.ticks)) for a in range(0, run.ticks, _PIECE))
 
 
-def _vector(run: RecordedRun, group: Group, first: int, last: int) -> NDArray[np.float64]:
+def _vector(run: RecordedRun, group: Vector, first: int, last: int) -> NDArray[np.float64]:
     """Rows of a vector, shape (ticks, n), p.u."""
-    return np.column_stack([run.recorded[f"{group}_{n}"][first:last] for n in names(group)])
+    carries = carried(group, "u_E_q" in run.recorded)
+    return np.column_stack([run.recorded[f"{group}_{n}"][first:last] for n in carries])
 
 
 def _taken(run: RecordedRun, first: int, last: int) -> NDArray[np.bool_]:
