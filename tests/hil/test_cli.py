@@ -16,6 +16,7 @@ from gfm_hil.cli import main
 from gfm_hil.scenario.model import shipped_scenarios
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime import law_names
+from gfm_runtime.inner_file import inner_names
 
 from ..support.laws import every_law
 
@@ -74,7 +75,7 @@ def test_laws_lists_the_catalogue(call):
     assert code == 0
     assert_fits(out)
     listed = [line.split()[0] for line in out.splitlines() if line and line[0] != " "]
-    assert listed == ["law", *law_names()]
+    assert listed == ["law", *law_names(), "inner", *inner_names()]
 
 
 def test_laws_as_json_is_a_list_of_objects_with_names(call):
