@@ -85,7 +85,11 @@ class ThresholdImpedance(_Stage):
     f_i: Number = Field(50.0, description="low-pass on i, Hz")
 
 
-MODELS = (VirtualStator, Cascaded, ThresholdImpedance)
+MODELS: dict[str, type[Table]] = {
+    "virtual-stator": VirtualStator,
+    "cascaded": Cascaded,
+    "threshold-impedance": ThresholdImpedance,
+}
 InnerSpec = Annotated[VirtualStator | Cascaded | ThresholdImpedance, Field(discriminator="type")]
 _ADAPTER: TypeAdapter[InnerSpec] = TypeAdapter(InnerSpec)
 
@@ -109,8 +113,7 @@ def build_inner(spec: InnerSpec, parameters: Mapping[str, float]) -> Inner:
 def acting(inner: Inner) -> dict[str, Any]:
     """The parameters of a stage that act, by their names in ``Inner``: those of its kind, and of
     the power limiter if it has one."""
-    (model,) = (m for m in MODELS if m.model_fields["type"].annotation == Literal[inner.kind])
-    names = [name for name in model.model_fields if name not in ("type", "power")]
+    names = [name for name in MODELS[inner.kind].model_fields if name not in ("type", "power")]
     if math.isfinite(inner.P_max) or math.isfinite(inner.P_min):
         names += ["P_max", "P_min", "k_P", "k_Pi"]
     return {name: getattr(inner, name) for name in names}
