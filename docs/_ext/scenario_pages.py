@@ -38,6 +38,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[plant.delay]", options.Delay),
     ("[plant.protection]", options.Protection),
 )
+OVERLOAD = ("[[plant.protection.overload]]", options.Overload)
 TRIP = ("one protection, e.g. [plant.protection.over_current]", options.Trip)
 EVENTS = get_args(get_args(events.Event)[0])
 LAW_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
@@ -96,7 +97,7 @@ def _default(field: FieldInfo) -> str:
         return "none"
     if isinstance(value, options.Trip):
         return f"{value.threshold:g} p.u., {value.delay_s:g} s"
-    if isinstance(value, BaseModel) or value in ({}, [], ""):
+    if isinstance(value, BaseModel) or value in ({}, [], (), ""):
         return "–"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
@@ -126,7 +127,7 @@ def _tables(tables: tuple[tuple[str, type[BaseModel]], ...]) -> str:
 
 def scenario_tables() -> str:
     """Every table of a scenario file."""
-    return _tables((*TABLES, TRIP))
+    return _tables((*TABLES, TRIP, OVERLOAD))
 
 
 def end_reasons() -> str:

@@ -21,8 +21,8 @@ COLUMNS = (
     ("f_nadir_hz", "f nadir [Hz]", 3),
     ("f_peak_hz", "f peak [Hz]", 3),
     ("rocof_hz_s", "RoCoF [Hz/s]", 2),
-    ("damping_ratio", "damping ratio", 3),
-    ("oscillation_hz", "oscillation [Hz]", 2),
+    ("damping_ratio", "swing: damping ratio", 3),
+    ("oscillation_hz", "swing [Hz]", 2),
 )
 
 
@@ -31,7 +31,9 @@ def step_table(name: str, runs: dict[str, Run]) -> None:
     rows = []
     for label, one in runs.items():
         events = one.summary["events"]
-        if one.summary["status"] == "completed":
+        if one.summary["status"] == "oscillating":
+            label += ", oscillating"
+        if one.summary["status"] in ("completed", "oscillating"):
             cells = [number(events[0].get(key), digits) for key, _, digits in COLUMNS]
         else:
             t = one.summary["duration_s"]
@@ -122,7 +124,7 @@ def switchover() -> None:
         ["status", "bump of u [p.u.]", "oscillation of p", "damping ratio", "reason"],
         [[
             s["status"], f"${mantissa}\\cdot10^{{{int(exponent)}}}$",
-            f"{s['events'][0]['oscillation_hz']:.1f} Hz",
-            number(s["events"][0]["damping_ratio"], 3), s["reason"].replace("|", "\\|"),
+            f"{s['events'][0]['fast_hz']:.1f} Hz",
+            number(s["events"][0]["fast_damping_ratio"], 3), s["reason"].replace("|", "\\|"),
         ]],
     )  # fmt: skip

@@ -13,11 +13,12 @@ from scipy.linalg import expm
 from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
-from gfm_plant.options import COMMANDS, MEASURED, Plant
+from gfm_plant.options import COMMANDS, MEASURED, Overload, Plant, Protection
 from gfm_plant.parameters import load_converter
 from gfm_plant.records import (
     BLOCKED,
     FAULTED,
+    N_RING,
     OPERATING,
     PlantRecord,
     plant_par_dtype,
@@ -28,6 +29,7 @@ from gfm_plant.solution import BRIDGE, GRID, NEGATIVE, STATES
 _DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 _PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
+_LOOK = 10e-6  # s; how often a peak-current limit looks at the current
 _MOST = 500  # steps, or pieces, in a period
 
 
@@ -52,10 +54,7 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
     _pack_grid(par, options, T_s)
     _pack_measurement(par, options)
     _pack_timing(par, options, T_s)
-    for k, (name, *_) in enumerate(TRIPS):
-        trip = getattr(options.protection, name)
-        par["trip_limit"][0, k] = trip.threshold
-        par["trip_ticks"][0, k] = math.ceil(trip.delay_s / T_s - 1e-6) if trip.enabled else -1
+    _pack_protection(par, options.protection, T_s)
     connect(par, closed=True)
 
     st = np.zeros(1, plant_state_dtype)
@@ -137,6 +136,8 @@ def _pack_circuit(par: PlantRecord, options: Plant) -> None:
     per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
 
+    par["i_peak"] = math.inf if options.i_peak is None else options.i_peak
+
     source = options.dc_source
     par["tau_dc"] = source.tau_s or 0.0
     par["i_max"] = math.inf if source.i_max is None else source.i_max
@@ -176,6 +177,20 @@ def _pack_measurement(par: PlantRecord, options: Plant) -> None:
     _pack_converter(par, "dac", options.dac.bits, options.dac.range, COMMANDS)
 
 
+def _pack_protection(par: PlantRecord, protection: Protection, T_s: float) -> None:
+    par["trip_ticks"] = -1
+    trips = [getattr(protection, name) for name, *_ in TRIPS]
+    for k, trip in enumerate([*trips, *protection.overload]):
+        par["trip_limit"][0, k] = trip.threshold
+        if isinstance(trip, Overload) or trip.enabled:
+            par["trip_ticks"][0, k] = math.ceil(trip.delay_s / T_s - 1e-6)
+    par["by_voltage"] = protection.frequency == "voltage"
+    if protection.overload or protection.frequency == "voltage":
+        cycle = 2 * math.pi / (par[0]["omega_b"] * T_s)  # ticks
+        par["place_ticks"] = math.ceil(cycle / N_RING)
+        par["places"] = max(1, round(cycle / par[0]["place_ticks"]))
+
+
 def _pack_converter(
     par: PlantRecord,
     prefix: str,
@@ -207,7 +222,10 @@ def _pack_pieces(par: PlantRecord, fastest: float) -> None:
             f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
             " plant.grid.load_L"
         )
-    pieces = np.maximum(np.ceil(r["stretch"] * (fastest / (2 * _PIECE))), 1)
+    least = 1.0
+    if r["i_peak"] < math.inf:  # the hardware looks at the current once a piece
+        least = math.ceil(longest / _LOOK)
+    pieces = np.maximum(np.ceil(r["stretch"] * (fastest / (2 * _PIECE))), least)
     par["pieces"], par["half_h"] = pieces, r["stretch"] / pieces / 2
     per_C = r["omega_b"] / r["C_dc"]
     rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))

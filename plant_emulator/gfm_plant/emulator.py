@@ -204,8 +204,39 @@ def _stretch(r: Any, s: Any, age: int, part: int) -> None:
         s.E[0] *= scale
         s.E[1] *= scale
     c = circuit(s)
+    E_d, E_q = s.E[0], s.E[1]
     for _ in range(r.pieces[part]):
+        if r.i_peak < math.inf and s.trip == 0:
+            s.E[0], s.E[1] = _within_peak(r, s, part, E_d, E_q, most)
         _piece(r, s, c, part)
+
+
+@compiled
+def _within_peak(
+    r: Any, s: Any, part: int, E_d: float, E_q: float, most: float
+) -> tuple[float, float]:
+    """Return the bridge's mean voltage over a piece, in the converter's frame.
+
+    It is the command, unless the current of L_f would leave the limit. The hardware then blocks
+    pulses, which on average gives the voltage that keeps the current at the limit, in the direction
+    in which the command would have led it.
+    """
+    u_r, u_i = s.unit[BRIDGE, 0], s.unit[BRIDGE, 1]
+    i_d, i_q = s.w[I_F, 0] * u_r + s.w[I_F, 1] * u_i, s.w[I_F, 1] * u_r - s.w[I_F, 0] * u_i
+    v_d, v_q = s.w[V, 0] * u_r + s.w[V, 1] * u_i, s.w[V, 1] * u_r - s.w[V, 0] * u_i
+    X = s.u_now[1] * r.L_f
+    drop_d, drop_q = v_d + r.R_f * i_d - X * i_q, v_q + r.R_f * i_q + X * i_d
+    reach = 2.0 * r.half_h[part] * r.omega_b / r.L_f  # p.u. of current per p.u. of voltage
+    to_d, to_q = i_d + reach * (E_d - drop_d), i_q + reach * (E_q - drop_q)
+    size = math.sqrt(to_d * to_d + to_q * to_q)
+    if size <= r.i_peak:
+        return E_d, E_q
+    scale = r.i_peak / size
+    E_d, E_q = drop_d + (to_d * scale - i_d) / reach, drop_q + (to_q * scale - i_q) / reach
+    size = math.sqrt(E_d * E_d + E_q * E_q)
+    if size > most:
+        E_d, E_q = E_d * most / size, E_q * most / size
+    return E_d, E_q
 
 
 @compiled

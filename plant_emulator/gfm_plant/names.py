@@ -19,6 +19,7 @@ TRIPS = (
 DIVERGED = len(TRIPS) + 1
 BAD_COMMAND = len(TRIPS) + 2
 CONTROLLER = len(TRIPS) + 3
+OVERLOAD = len(TRIPS) + 4
 
 TRIP_REASONS: dict[int, str] = {
     0: "none",
@@ -26,6 +27,7 @@ TRIP_REASONS: dict[int, str] = {
     DIVERGED: "diverged",
     BAD_COMMAND: "command not finite",
     CONTROLLER: "blocked for the controller",
+    OVERLOAD: "overload",
 }
 """What the trip code in a plant's state means."""
 

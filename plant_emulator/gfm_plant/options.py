@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from gfm_plant.names import SENSED
 from gfm_plant.parameters import Element, NonNegative, Positive, check_factors, load_converter
-from gfm_plant.records import MAX_DELAY
+from gfm_plant.records import MAX_DELAY, N_OVERLOADS
 from gfm_runtime.signals import Y_NAMES, carried, names
 
 Measured = Literal["v_dc", "p", "q", "V", "i_d", "i_q", "v_d", "v_q", "i_od", "i_oq"]
@@ -218,6 +218,13 @@ _TRIPS = {
 }
 
 
+class Overload(Options):
+    """A step of the overload profile."""
+
+    threshold: Positive = Field(description="p.u. of the current's RMS over a cycle")
+    delay_s: NonNegative = Field(description="how long the threshold must stay crossed, s")
+
+
 class Protection(Options):
     """The converter's protection, on the true quantities; a table may give part of a trip."""
 
@@ -228,6 +235,18 @@ class Protection(Options):
     dc_under_voltage: Trip = Field(_TRIPS["dc_under_voltage"], description="v_dc")
     over_frequency: Trip = Field(_TRIPS["over_frequency"], description="omega_u")
     under_frequency: Trip = Field(_TRIPS["under_frequency"], description="omega_u")
+    frequency: Literal["command", "voltage"] = Field(
+        "command",
+        description="what the last two watch: omega_u, or the speed of the filter capacitor's "
+        "voltage, whose angle is compared with that of one cycle before",
+    )
+    overload: tuple[Overload, ...] = Field(
+        (),
+        strict=False,
+        max_length=N_OVERLOADS,
+        description="steps of the overload profile: each trips when the RMS of the bridge's "
+        "current over one cycle of the nominal frequency stays above its threshold for its time",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -252,6 +271,11 @@ class Plant(Options):
         "unlimited",
         description="limit of the bridge's voltage by v_dc: line-to-line RMS at most "
         "v_dc / sqrt(2) (space-vector) or v_dc sqrt(3/8) (sine-triangle)",
+    )
+    i_peak: Positive | None = Field(
+        None,
+        description="peak-current limit of the bridge, p.u.: its hardware blocks pulses so that "
+        "the current of L_f stays within; none if not given",
     )
     grid: Grid = Field(Grid(), description="grid simulator at the start")
     sensors: Sensors = Field(

@@ -1,9 +1,17 @@
-"""Protection: thresholds with persistence, a latched trip, and the words for it."""
+"""Protection: thresholds with persistence, a latched trip, and the words for it.
+
+Two quantities are taken over one cycle of the nominal frequency: the RMS of the bridge's current,
+and the speed of the capacitor's voltage, by which its angle has turned in that time. A ring holds
+what the sums since the start were at each place of the last cycle. The difference of two of them is
+exact to their rounding, so that nothing drifts.
+"""
 
 from __future__ import annotations
 
 import math
 from typing import Any
+
+import numpy as np
 
 from gfm_plant.names import (
     BAD_COMMAND,
@@ -11,13 +19,16 @@ from gfm_plant.names import (
     CONTROLLER_SAFE,
     DIVERGED,
     NO_FRESH_U,
+    OVERLOAD,
     SILENT,
     TRIP_REASONS,
     TRIPS,
 )
-from gfm_plant.records import PlantRecord
-from gfm_plant.solution import I_F, circuit, enter
+from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecord
+from gfm_plant.solution import I_F, V, circuit, enter
 from gfm_runtime.compiled import compiled
+
+_LEAST_V = 0.2  # p.u.; a smaller voltage has no angle that a relay could read
 
 
 @compiled
@@ -40,16 +51,52 @@ def trip(r: Any, s: Any, reason: int, value: float) -> None:
 def protect(r: Any, s: Any) -> None:
     """Check every threshold on the true values of this tick."""
     i = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
-    V = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
+    v = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
     v_dc = s.x[7]
-    omega_u = s.u_now[1]
+    omega = s.u_now[1]
+    if r.places > 0:
+        _look_back(r, s, i)
+        if r.by_voltage:
+            omega = s.omega_v
     _watch(r, s, 0, i, 1.0)
-    _watch(r, s, 1, V, 1.0)
-    _watch(r, s, 2, V, -1.0)
+    _watch(r, s, 1, v, 1.0)
+    _watch(r, s, 2, v, -1.0)
     _watch(r, s, 3, v_dc, 1.0)
     _watch(r, s, 4, v_dc, -1.0)
-    _watch(r, s, 5, omega_u, 1.0)
-    _watch(r, s, 6, omega_u, -1.0)
+    _watch(r, s, 5, omega, 1.0)
+    _watch(r, s, 6, omega, -1.0)
+    if r.places > 0:
+        for k in range(N_TRIPS, N_TRIPS + N_OVERLOADS):
+            _watch(r, s, k, s.i_rms, 1.0)
+
+
+@compiled
+def _look_back(r: Any, s: Any, i: float) -> None:
+    """Take the RMS of the current i and the speed of the voltage over the last cycle, or over the
+    ticks so far while they are fewer."""
+    a, b = s.v_before[0], s.v_before[1]
+    c, d = s.w[V, 0], s.w[V, 1]
+    if s.looked == 0:
+        s.omega_v = s.u_now[1]
+    elif min(a * a + b * b, c * c + d * d) > _LEAST_V * _LEAST_V:
+        s.sums[1] += math.atan2(a * d - b * c, a * c + b * d)
+    else:  # it goes on as it was
+        s.sums[1] += r.omega_b * r.T_s * (s.omega_v - 1.0)
+    s.v_before[0], s.v_before[1] = c, d
+    s.sums[0] += i * i
+    s.looked += 1
+    if s.looked % r.place_ticks != 0:
+        return
+    place = (s.looked // r.place_ticks) % r.places
+    ticks = r.places * r.place_ticks
+    if s.looked > ticks:
+        s.i_rms = math.sqrt(max(s.sums[0] - s.ring[place, 0], 0.0) / ticks)
+        s.omega_v = 1.0 + (s.sums[1] - s.ring[place, 1]) / (ticks * r.omega_b * r.T_s)
+    else:
+        s.i_rms = math.sqrt(s.sums[0] / s.looked)
+        if s.looked > 1:
+            s.omega_v = 1.0 + s.sums[1] / ((s.looked - 1) * r.omega_b * r.T_s)
+    s.ring[place, 0], s.ring[place, 1] = s.sums[0], s.sums[1]
 
 
 @compiled
@@ -59,7 +106,7 @@ def _watch(r: Any, s: Any, k: int, value: float, sign: float) -> None:
         return
     # The tick that first sees a crossing starts the time.
     if s.crossed[k] >= r.trip_ticks[k]:
-        trip(r, s, k + 1, value)
+        trip(r, s, k + 1 if k < N_TRIPS else OVERLOAD, value)
     s.crossed[k] += 1
 
 
@@ -76,9 +123,17 @@ def trip_reason(st: PlantRecord, par: PlantRecord) -> str:
         return f"command not finite: u held {value} {at}"
     if code == CONTROLLER:
         return NO_FRESH_U if value == SILENT else CONTROLLER_SAFE
-    _, quantity, sign = TRIPS[code - 1]
-    limit = par[0]["trip_limit"][code - 1]
-    persistence = int(par[0]["trip_ticks"][code - 1]) * T_s
+    if code == OVERLOAD:
+        ticks = par[0]["trip_ticks"][N_TRIPS:]
+        step = np.flatnonzero((ticks >= 0) & (st[0]["crossed"][N_TRIPS:] > ticks))[0]
+        k, quantity, sign = N_TRIPS + int(step), "RMS of i over a cycle", +1
+    else:
+        k = code - 1
+        _, quantity, sign = TRIPS[k]
+        if quantity == "omega_u" and par[0]["by_voltage"]:
+            quantity = "omega of V over a cycle"
+    limit = par[0]["trip_limit"][k]
+    persistence = int(par[0]["trip_ticks"][k]) * T_s
     lasting = f" for {persistence:.6g} s" if persistence else ""
     return (
         f"{TRIP_REASONS[code]}: {quantity} = {value:.6g} p.u. {'>' if sign > 0 else '<'}"

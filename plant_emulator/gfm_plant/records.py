@@ -22,6 +22,8 @@ OPERATING, BLOCKED, FAULTED = 0, 1, 2
 them + FAULTED."""
 N_MEASURED, N_COMMANDS = 10, 4  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
+N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
+N_RING = 256  # places of a ring that holds one cycle
 
 plant_par_dtype = np.dtype(
     [
@@ -44,8 +46,9 @@ plant_par_dtype = np.dtype(
         ("k_i", "f8"),
         ("i_max", "f8"),
         ("tau_dc", "f8"),  # its lag, s (0: none)
-        # the bridge: |E| <= m_max v_dc
+        # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
+        ("i_peak", "f8"),
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
@@ -89,8 +92,13 @@ plant_par_dtype = np.dtype(
         ("states", "f8", (N_CIRCUITS, N_W, N_W, 2)),
         ("modes", "f8", (N_CIRCUITS, N_W, N_W, 2)),
         # protection: threshold, and ticks it may stay crossed (-1: disabled)
-        ("trip_limit", "f8", (N_TRIPS,)),
-        ("trip_ticks", "i8", (N_TRIPS,)),
+        ("trip_limit", "f8", (N_TRIPS + N_OVERLOADS,)),
+        ("trip_ticks", "i8", (N_TRIPS + N_OVERLOADS,)),
+        # what is looked at over a cycle: places of the ring (0: nothing), ticks from one place to
+        # the next, and whether the frequency is that of the voltage
+        ("places", "i8"),
+        ("place_ticks", "i8"),
+        ("by_voltage", "i8"),
     ],
     align=True,
 )
@@ -141,7 +149,16 @@ plant_state_dtype = np.dtype(
         ("omega_g_slope", "f8"),
         ("brought", "f8"),
         # protection: ticks in a row that each threshold was crossed, and the latched trip
-        ("crossed", "i8", (N_TRIPS,)),
+        ("crossed", "i8", (N_TRIPS + N_OVERLOADS,)),
+        # one cycle: ticks looked at; sums over them of i^2 and of the turn of the capacitor's
+        # voltage in the common frame, rad, and a ring of what they were; the voltage at the last
+        # tick; RMS of the current and speed of the voltage
+        ("looked", "i8"),
+        ("sums", "f8", (2,)),
+        ("ring", "f8", (N_RING, 2)),
+        ("v_before", "f8", (2,)),
+        ("i_rms", "f8"),
+        ("omega_v", "f8"),
         ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
         ("trip_tick", "i8"),
         ("trip_value", "f8"),

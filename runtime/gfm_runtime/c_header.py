@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from gfm_runtime.error_maps import ERROR_MAPS, V_MIN
+from gfm_runtime.error_maps import ERROR_MAPS, R_MIN, V_MIN
 from gfm_runtime.inner import KINDS, NEGLIGIBLE, PRIORITIES
 from gfm_runtime.kernel import N_MAX, law_dtype, state_dtype
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
@@ -69,6 +69,7 @@ def c_header(real: DTypeLike = np.float64) -> str:
             f"#define NY_INNER {NY_INNER}",
             f"#define NU_INNER {NU_INNER}",
             f"#define V_MIN {V_MIN!r}",
+            f"#define R_MIN {R_MIN.hex()}",
             f"#define NEGLIGIBLE {NEGLIGIBLE.hex()}",
             *_numbered("ERROR", ERROR_MAPS),
             *_numbered("INNER", KINDS),

@@ -8,8 +8,8 @@ produces E_u itself, as in the paper. With one, the measured currents and voltag
   (X_v/omega_b) di*/dt = E - v - (R_v + j omega X_v) i*, which the limit cuts, then a current loop;
 * ``cascaded``: a PI voltage loop around v* = E - (R_v + j omega X_v) i_o gives i*, which the limit
   cuts, then the current loop;
-* ``threshold-impedance``: e = E - k (|i_f| - I_thr) (1 + j omega sigma) i_f beyond the threshold,
-  where i_f is the low-pass filtered current; there is no current loop.
+* ``threshold-impedance``: as ``cascaded``, and beyond the threshold v* falls by
+  k_thr (|i_f| - I_thr) (1 + j omega sigma) i_f besides, where i_f is the low-pass filtered current.
 
 The current loop is e = v_f + (k_c + k_ci/s) (i* - i) + j omega L_f i with the low-pass filtered
 voltage v_f, and |e| <= m v_dc. Around them: a power limiter that lowers (raises) omega_u while p is
@@ -34,7 +34,7 @@ from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.errors import LawError, Mistakes
 
 KINDS = {"none": 0, "virtual-stator": 1, "cascaded": 2, "threshold-impedance": 3}
-NONE, STATOR, CASCADED, THRESHOLD = KINDS.values()
+NONE, STATOR = KINDS["none"], KINDS["virtual-stator"]
 PRIORITIES = {"circular": 0, "d": 1, "q": 2, "angle": 3}
 _D, _Q, _ANGLE = 1, 2, 3
 
@@ -55,7 +55,7 @@ class Inner:
 
     Attributes:
         kind: a key of ``KINDS``.
-        I_max: limit of |i*|, p.u. (virtual-stator, cascaded).
+        I_max: limit of |i*|, p.u.
         priority: a key of ``PRIORITIES``: circular keeps the angle of i*; d (q) gives the active
             (reactive) current the whole limit first; angle sets the limited i* to ``angle``.
         angle: of the limited i* against the converter's d axis, degrees (priority angle).
@@ -63,8 +63,8 @@ class Inner:
         k_c, k_ci: current loop, p.u./p.u. and 1/s.
         L_f, C_f: the converter's own filter, p.u.
         f_v: bandwidth of the low-pass on v, Hz.
-        k_v, k_vi: voltage loop, p.u./p.u. and 1/s (cascaded).
-        k_ff: part of i_o that is fed forward (cascaded).
+        k_v, k_vi: voltage loop, p.u./p.u. and 1/s (not virtual-stator).
+        k_ff: part of i_o that is fed forward (not virtual-stator).
         I_thr, k_thr, sigma: threshold, p.u.; impedance per current beyond it; its X/R
             (threshold-impedance).
         f_i: bandwidth of the low-pass on i, Hz (threshold-impedance).
@@ -86,19 +86,19 @@ class Inner:
     L_f: float = 0.0174
     C_f: float = 0.2268
     f_v: float = 400.0
-    k_v: float = 0.5
-    k_vi: float = 50.0
-    k_ff: float = 1.0
+    k_v: float = 1.0
+    k_vi: float = 100.0
+    k_ff: float = 0.6
     I_thr: float = 1.0
     k_thr: float = 0.67
-    sigma: float = 5.0
-    f_i: float = 50.0
+    sigma: float = 1.0
+    f_i: float = 100.0
     m: float = SPACE_VECTOR
     freeze: bool = True
     P_max: float = math.inf
     P_min: float = -math.inf
-    k_P: float = 0.01
-    k_Pi: float = 0.1
+    k_P: float = 0.2
+    k_Pi: float = 5.0
     f_pll: float = 0.0
 
     def __post_init__(self) -> None:
@@ -140,6 +140,8 @@ class Inner:
         rec["I_sin"] = self.I_max * math.sin(math.radians(self.angle))
         for name in _PLAIN:
             rec[name] = np.clip(getattr(self, name), -_NEVER, _NEVER)
+        if self.kind != "threshold-impedance":
+            rec["k_thr"] = 0.0
         rec["one"], rec["half_turn"], rec["least_v"] = 1.0, turn / 2, _LEAST_V
         rec["negligible"] = NEGLIGIBLE
         if self.kind == "virtual-stator":
@@ -166,15 +168,15 @@ class Inner:
             LawError: the limit does not let the stage rest there.
         """
         Z_v = complex(self.R_v, omega * self.X_v)
-        if self.kind == "threshold-impedance":
-            beyond = max(abs(i) - self.I_thr, 0.0)
-            return e + self.k_thr * beyond * complex(1.0, omega * self.sigma) * i
         i_ref = i if self.k_ci > 0.0 else i + (e - v - 1j * omega * self.L_f * i) / self.k_c
         if abs(i_ref) > self.I_max:
             raise LawError(
                 "inner.I_max", f"{self.I_max:g} p.u.: this operating point needs {abs(i_ref):.4g}"
             )
-        return v + Z_v * (i_ref if self.kind == "virtual-stator" else i_o)
+        if self.kind == "virtual-stator":
+            return v + Z_v * i_ref
+        beyond = max(abs(i) - self.I_thr, 0.0) if self.kind == "threshold-impedance" else 0.0
+        return v + Z_v * i_o + self.k_thr * beyond * complex(1.0, omega * self.sigma) * i
 
 
 _PLAIN = (
@@ -298,10 +300,24 @@ def _stator(law, state, E_d, E_q):
 
 
 @inlined
+def _drop(law, state):
+    """The voltage over the threshold impedance, 0 below the threshold."""
+    d, q = state.i_f[0], state.i_f[1]
+    beyond = math.sqrt(d * d + q * q) - law.I_thr
+    if beyond < 0:
+        beyond = law.one - law.one
+    R = law.k_thr * beyond
+    X = R * state.omega * law.sigma
+    return R * d - X * q, R * q + X * d
+
+
+@inlined
 def _voltage_loop(law, state, E_d, E_q):
     """One tick of the cascaded voltage loop: i* from v* - v; it integrates only within the
     limit."""
     m, X = state.m, state.omega * law.X_v
+    drop_d, drop_q = _drop(law, state)
+    E_d, E_q = E_d - drop_d, E_q - drop_q
     error_d = E_d - law.R_v * m[I_OD] + X * m[I_OQ] - m[V_D]
     error_q = E_q - law.R_v * m[I_OQ] - X * m[I_OD] - m[V_Q]
     B = state.omega * law.C_f
@@ -311,6 +327,7 @@ def _voltage_loop(law, state, E_d, E_q):
     if not state.limited:
         state.x_v[0] += law.T_k_vi * error_d
         state.x_v[1] += law.T_k_vi * error_q
+    state.limited = state.limited or drop_d != 0 or drop_q != 0
 
 
 @inlined
@@ -322,20 +339,6 @@ def _current_loop(law, state):
     state.e[1] = state.v_f[1] + law.k_c * error_q + state.x_c[1] + X * m[I_D]
     state.x_c[0] += law.T_k_ci * error_d
     state.x_c[1] += law.T_k_ci * error_q
-
-
-@inlined
-def _drop(law, state, E_d, E_q):
-    """e = E less the drop over the threshold impedance."""
-    d, q = state.i_f[0], state.i_f[1]
-    beyond = math.sqrt(d * d + q * q) - law.I_thr
-    state.limited = beyond > 0
-    state.e[0], state.e[1] = E_d, E_q
-    if state.limited:
-        R = law.k_thr * beyond
-        X = R * state.omega * law.sigma
-        state.e[0] = E_d - R * d + X * q
-        state.e[1] = E_q - R * q - X * d
 
 
 @inlined
@@ -365,14 +368,11 @@ def shape(law, state, u, out):
     else:
         state.omega = _limit_power(law, state, state.omega)
         _follow(law, state)
-        if law.inner == THRESHOLD:
-            _drop(law, state, E_d, E_q)
+        if law.inner == STATOR:
+            _stator(law, state, E_d, E_q)
         else:
-            if law.inner == STATOR:
-                _stator(law, state, E_d, E_q)
-            else:
-                _voltage_loop(law, state, E_d, E_q)
-            _current_loop(law, state)
+            _voltage_loop(law, state, E_d, E_q)
+        _current_loop(law, state)
         most = law.m * state.m[V_DC]
         size = state.e[0] * state.e[0] + state.e[1] * state.e[1]
         if size > most * most:
@@ -416,24 +416,23 @@ def settle_inner(law, state, u, e_d, e_q):
     X = state.omega * law.L_f
     lack_d, lack_q = e_d - m[V_D] + X * m[I_Q], e_q - m[V_Q] - X * m[I_D]
     state.i_ref[0], state.i_ref[1] = m[I_D], m[I_Q]
-    if law.inner == THRESHOLD:
-        _drop(law, state, 0, 0)
-        need_d, need_q = e_d - state.e[0], e_q - state.e[1]
-    elif law.inner != NONE:
+    if law.inner != NONE:
         if law.T_k_ci > 0:
             state.x_c[0], state.x_c[1] = lack_d, lack_q
         else:
             state.i_ref[0] += lack_d / law.k_c
             state.i_ref[1] += lack_q / law.k_c
         through_d, through_q = state.i_ref[0], state.i_ref[1]
-        if law.inner == CASCADED:
+        drop_d, drop_q = law.one - law.one, law.one - law.one
+        if law.inner != STATOR:
+            drop_d, drop_q = _drop(law, state)
             B = state.omega * law.C_f
             state.x_v[0] = through_d - law.k_ff * m[I_OD] + B * m[V_Q]
             state.x_v[1] = through_q - law.k_ff * m[I_OQ] - B * m[V_D]
             through_d, through_q = m[I_OD], m[I_OQ]
         X = state.omega * law.X_v
-        need_d = m[V_D] + law.R_v * through_d - X * through_q
-        need_q = m[V_Q] + law.R_v * through_q + X * through_d
+        need_d = m[V_D] + law.R_v * through_d - X * through_q + drop_d
+        need_q = m[V_Q] + law.R_v * through_q + X * through_d + drop_q
     state.e[0], state.e[1] = e_d, e_q
     state.away[0], state.away[1] = need_d - u[2], need_q
 

@@ -28,8 +28,8 @@ class PowerLimiter(Table):
 
     P_max: Number = Field(description="p.u.")
     P_min: Number = Field(description="p.u.")
-    k_p: Number = Field(0.01, description="p.u. of omega_u per p.u. of power")
-    k_i: Number = Field(0.1, description="1/s")
+    k_p: Number = Field(0.2, description="p.u. of omega_u per p.u. of power")
+    k_i: Number = Field(5.0, description="1/s")
 
 
 class _Stage(Table):
@@ -63,26 +63,29 @@ class VirtualStator(_WithCurrentLoop):
     X_v: Number = Field(0.3, description="virtual reactance, p.u.")
 
 
-class Cascaded(_WithCurrentLoop):
-    """A voltage loop, a limit, and a current loop."""
-
-    type: Literal["cascaded"] = Field(description="kind of stage")
-    R_v: Number = Field(0.0, description="virtual resistance, p.u.")
-    X_v: Number = Field(0.0, description="virtual reactance, p.u.; without states")
-    k_v: Number = Field(0.5, description="voltage loop, p.u./p.u.")
-    k_vi: Number = Field(50.0, description="voltage loop, 1/s")
-    k_ff: Number = Field(1.0, description="part of i_o that is fed forward")
+class _WithVoltageLoop(_WithCurrentLoop):
+    R_v: Number = Field(0.1, description="virtual resistance, p.u.")
+    X_v: Number = Field(0.3, description="virtual reactance, p.u.; without states")
+    k_v: Number = Field(1.0, description="voltage loop, p.u./p.u.")
+    k_vi: Number = Field(100.0, description="voltage loop, 1/s")
+    k_ff: Number = Field(0.6, description="part of i_o that is fed forward")
     C_f: Number = Field(0.2268, description="the converter's filter capacitor, p.u.")
 
 
-class ThresholdImpedance(_Stage):
-    """A virtual impedance that grows with the current beyond a threshold."""
+class Cascaded(_WithVoltageLoop):
+    """A voltage loop, a limit, and a current loop."""
+
+    type: Literal["cascaded"] = Field(description="kind of stage")
+
+
+class ThresholdImpedance(_WithVoltageLoop):
+    """The cascaded loops behind a virtual impedance that grows beyond a threshold of current."""
 
     type: Literal["threshold-impedance"] = Field(description="kind of stage")
     I_thr: Number = Field(1.0, description="threshold, p.u.")
     k_thr: Number = Field(0.67, description="impedance per current beyond the threshold, p.u.")
-    sigma: Number = Field(5.0, description="X/R of that impedance")
-    f_i: Number = Field(50.0, description="low-pass on i, Hz")
+    sigma: Number = Field(1.0, description="X/R of that impedance")
+    f_i: Number = Field(100.0, description="low-pass on i, Hz")
 
 
 MODELS: dict[str, type[Table]] = {

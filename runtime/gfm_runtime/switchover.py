@@ -21,11 +21,12 @@ def settle_into(law, state, ref, y, u, trend):
     If u lies outside the law's limits the output is the limit, and the difference is a bump.
     """
     set_inputs(law, state, ref, y)
-    state.y[2] = u[1]
     for i in range(NU):
+        state.raw[i] = u[i]  # in the law's own precision; output writes raw anew below
         state.offset[i] = 0
-        state.u[i] = u[i] - trend[i]
         state.trend[i] = trend[i]
+        state.u[i] = state.raw[i] - state.trend[i]
+    state.y[2] = state.raw[1]
     for i in range(law.n):
         a = law.E_r[i, 0] * state.r[0]
         for j in range(1, NY):
@@ -33,13 +34,13 @@ def settle_into(law, state, ref, y, u, trend):
         for j in range(NY):
             a += law.E_y[i, j] * state.y[j]
         for j in range(NU):
-            wanted = u[j] - law.u_0[j]
+            wanted = state.raw[j] - law.u_0[j]
             for m in range(NY):
                 wanted -= law.D_u0[j, m] * state.ref[m]
-            a += law.F[i, j] * wanted + law.G[i, j] * trend[j]
-        state.x[i] = a
+            a += law.F[i, j] * wanted + law.G[i, j] * state.trend[j]
+        state.x[i] = a + 0  # never -0, as after a step: code that leaves out zeros gives +0
     # the offset takes the rest: all of it in a row without states, rounding in the others
-    i_u, omega_u, E_u = u[0], u[1], u[2]
+    i_u, omega_u, E_u = state.raw[0], state.raw[1], state.raw[2]
     output(law, state, u)
     state.offset[1] = (omega_u - state.raw[1]) / law.loop
     output(law, state, u)

@@ -21,6 +21,7 @@ from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
+from gfm_hil.scenario.profiles import read_profile
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 from gfm_hil.studies.campaign import loading
@@ -36,7 +37,6 @@ title = "two runs"
 scenario = "rig_pref_step"
 laws = ["vsg-2"]
 runs = 2
-ripple_max = 0.2
 [set]
 duration = 0.1
 "references.Q_ref" = 0.0
@@ -59,6 +59,12 @@ high = 1.3
 path = "plant.delay.samples"
 type = "choice"
 values = [1, 2]
+"""
+PROFILE = """# a course
+t,f_hz,V_g
+0.0,50.0,1.0
+0.5,49.9,0.98
+1.0,50.01,1.0
 """
 EVENTS = """
 title = "every event"
@@ -322,7 +328,22 @@ def _segments() -> st.SearchStrategy[bytes]:
     return head | blobs([whole[:512], whole])
 
 
+@contextlib.contextmanager
+def _profile(folder: Path) -> Iterator[Take]:
+    path = folder / "course.csv"
+
+    def take(message: bytes) -> None:
+        path.write_bytes(message)
+        with contextlib.suppress(UserError):
+            profile = read_profile(str(path), 50.0)
+            ticks = [k for k, _ in profile.points(1e-4)]
+            assert ticks == sorted(ticks)
+
+    yield take
+
+
 FILES = (
+    Parser("profile", _profile, lambda: texts([PROFILE])),
     Parser("scenario", _scenario, lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS])),
     Parser("law", _law, lambda: texts(_shipped(CATALOGUE))),
     Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),

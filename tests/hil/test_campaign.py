@@ -167,7 +167,7 @@ def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(
     found = gfmhil.campaign(whole / "small.toml")
     assert [json.dumps(r) for r in found.records] == stored(whole / "two")[1:]
     table = found.to_pandas()
-    assert list(table["verdict"]) == [verdict(r, 0.2) for r in found.records]
+    assert list(table["verdict"]) == [verdict(r) for r in found.records]
     assert list(table["plant.factors.L_g"]) == [
         r["drawn"]["plant.factors.L_g"] for r in found.records
     ]

@@ -70,7 +70,7 @@ def test_the_shipped_experiment_ends_as_it_expects(tmp_path):
     (event,) = run.summary["events"]
     assert event["cut_short"].startswith("over-current at 1.4")
     assert event["p_final"] is event["settling_s"] is event["overshoot_pct"] is None
-    assert event["oscillation_hz"] > 40 and event["p_peak"] is not None  # what led to the trip
+    assert event["fast_hz"] > 40 and event["p_peak"] is not None  # what led to the trip
     assert run.summary["reason"].startswith("over-current: ")
     assert run.summary["duration_s"] > 1.0
 

@@ -9,14 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gfm_hil.results.metrics import METRICS, dominant_oscillation, event_metrics
+from gfm_hil.results.cycles import cycle_means
+from gfm_hil.results.metrics import METRICS, event_metrics
+from gfm_hil.results.modes import fast_mode, swing
 
 T_s, F_N = 1e-3, 50.0
+COLUMNS = ("true_p", "true_omega_u", "true_V", "true_i")
 START, LENGTH = 200, 4000
 t = np.arange(LENGTH) * T_s
 
 
-def metrics(p=None, f=None, V=None, before=0.5):
+def metrics(p=None, f=None, V=None, i=None, before=0.5):
     """Metrics of a window of 4 s after 0.2 s of rest; each signal at rest unless given."""
 
     def whole(x, rest):
@@ -26,6 +29,7 @@ def metrics(p=None, f=None, V=None, before=0.5):
         "true_p": whole(p, before),
         "true_omega_u": whole(None if f is None else f / F_N, 1.0),
         "true_V": whole(V, 1.0),
+        "true_i": whole(i, 0.5),
     }
     return event_metrics(signals, START, START + LENGTH, T_s, F_N)
 
@@ -115,28 +119,95 @@ def test_an_unstable_oscillation_has_negative_damping():
 @given(st.floats(0.02, 0.8), st.floats(0.5, 20.0), st.floats(1e-2, 1.0))
 def test_the_dominant_oscillation_is_found_whatever_it_is(zeta, f, size):
     x = size * (second_order(zeta, f) - 1.0)
-    damping, frequency = dominant_oscillation(0.5 + x, T_s)
-    assert damping == pytest.approx(zeta, abs=0.05)
-    assert frequency == pytest.approx(f, rel=0.05)
+    found = swing(0.5 + x, T_s, F_N)
+    assert found.damping == pytest.approx(zeta, abs=0.01)
+    assert found.hz == pytest.approx(f, rel=0.01)
 
 
 def test_of_two_oscillations_the_stronger_is_named():
     x = 0.1 * np.exp(-t) * np.sin(2 * np.pi * 2 * t) + 0.02 * np.exp(-t) * np.sin(2 * np.pi * 9 * t)
-    _, frequency = dominant_oscillation(0.5 + x, T_s)
-    assert frequency == pytest.approx(2.0, rel=0.02)
+    assert swing(0.5 + x, T_s, F_N).hz == pytest.approx(2.0, rel=0.02)
 
 
 @pytest.mark.parametrize("length", [1, 2, 19])
 def test_a_window_of_a_few_ticks_says_nothing(length):
-    signals = {name: np.ones(300) for name in ("true_p", "true_omega_u", "true_V")}
+    signals = {name: np.ones(300) for name in COLUMNS}
     found = event_metrics(signals, 100, 100 + length, T_s, F_N)
     assert found == dict.fromkeys(METRICS)
 
 
 @pytest.mark.parametrize("length", [20, 50, 130])
 def test_a_short_window_has_what_it_can_have(length):
-    signals = {name: np.ones(300) for name in ("true_p", "true_omega_u", "true_V")}
+    signals = {name: np.ones(300) for name in COLUMNS}
     found = event_metrics(signals, 100, 100 + length, T_s, F_N)
     assert set(found) == set(METRICS)
     assert found["p_peak"] == 1.0
     assert (found["rocof_hz_s"] is None) == (length <= 100)
+
+
+@pytest.mark.parametrize("width", [1.0, 7.0, 20.0, 166.66666666666669])
+def test_means_over_a_cycle_are_those_worked_out_one_by_one(width, monkeypatch):
+    x = np.random.default_rng(1).normal(size=700)
+    n = math.ceil(width - 1e-6)
+    part = width - math.floor(width + 1e-6)
+    weights = np.ones(n)
+    if part > 1e-6:
+        weights[-1] = part
+    expected = [np.dot(x[k : k + n], weights) / width for k in range(50, 650 - n + 1)]
+    for piece in (1, 100, 1 << 18):
+        monkeypatch.setattr("gfm_hil.results.cycles.PIECE", piece)
+        found = np.concatenate(list(cycle_means(x, 50, 650, width)))
+        assert found == pytest.approx(np.array(expected), abs=1e-14)
+    assert not list(cycle_means(x, 0, n - 1, width))
+
+
+def test_a_ripple_of_the_nominal_frequency_moves_only_what_is_of_every_tick():
+    step = 1 - 0.5 * np.exp(-t / 0.1)
+    ripple = 0.1 * np.sin(2 * np.pi * 50 * t)
+    pure, found = metrics(step), metrics(step + ripple, V=1 + ripple, i=0.5 + ripple)
+    for name in ("p_final", "settling_s", "overshoot_pct", "p_peak_cycle"):
+        assert found[name] == pytest.approx(pure[name], abs=1e-9), name
+    assert found["p_peak"] == pytest.approx(1.1 - 0.1 * (1 - math.cos(0.1 * math.pi)), abs=6e-3)
+    assert (found["i_peak"], found["i_peak_cycle"]) == (
+        pytest.approx(0.6, abs=6e-3), pytest.approx(0.5, abs=1e-12),
+    )  # fmt: skip
+    assert (found["v_max"], found["v_max_cycle"]) == (
+        pytest.approx(1.1, abs=6e-3), pytest.approx(1.0, abs=1e-12),
+    )  # fmt: skip
+    assert found["damping_ratio"] is None  # the step itself does not swing
+    assert found["fast_hz"] == pytest.approx(50.0, rel=1e-6)
+    assert found["fast_damping_ratio"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_time_to_90_percent():
+    found = metrics(1 - 0.5 * np.exp(-t / 0.1))
+    assert found["t90_s"] == pytest.approx(0.1 * math.log(10), abs=2 * T_s)  # of the step
+    jump = metrics(0.5 + 0.2 * (t / 0.01) * np.exp(1 - t / 0.01))  # no step: of its peak at 10 ms
+    assert jump["t90_s"] == pytest.approx(0.01 * 0.6084, abs=T_s)  # x e^(1-x) = 0.9
+    assert metrics()["t90_s"] is None
+
+
+@pytest.mark.parametrize("hertz", [49.5, 120.0, 761.0, 2400.0])
+@pytest.mark.parametrize("sigma", [-20.0, 1.5])
+def test_a_fast_mode_is_found_beside_a_larger_swing_without_aliasing(hertz, sigma):
+    """761 Hz, taken every 50th tick without a filter, was shown as 39 Hz."""
+    now = np.arange(30_000) * 1e-4
+    size = 0.02 if sigma < 0 else 0.02 * math.exp(-1.5 * 2)
+    fast = size * np.exp(sigma * now) * np.cos(2 * np.pi * hertz * now)
+    slow = 0.2 * np.exp(-3 * now) * np.cos(2 * np.pi * 3 * now)
+    p = 0.7 + slow + fast
+    found, swings = fast_mode(p, 1e-4, F_N), swing(p, 1e-4, F_N)
+    assert found.hz == pytest.approx(hertz, rel=1e-4)
+    assert found.damping == pytest.approx(-sigma / math.hypot(sigma, 2 * np.pi * hertz), abs=1e-5)
+    assert swings.hz == pytest.approx(3.0, rel=1e-3)
+    assert swings.damping == pytest.approx(3 / math.hypot(3, 6 * np.pi), abs=1e-3)
+
+
+def test_the_offset_of_the_line_is_no_swing():
+    """A DC offset of the line shows in p at 50 Hz, dying with the line's R/L."""
+    p = 0.5 + 0.2 * np.exp(-30 * t) * np.cos(2 * np.pi * 50 * t)
+    assert swing(p, T_s, F_N) is None
+    found = fast_mode(p, T_s, F_N)
+    assert (found.hz, found.damping) == (
+        pytest.approx(50.0, rel=1e-6), pytest.approx(30 / math.hypot(30, 100 * np.pi), rel=1e-6),
+    )  # fmt: skip

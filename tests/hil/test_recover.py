@@ -380,11 +380,11 @@ def test_metrics_of_a_file_are_those_of_arrays(run, make):
 @pytest.mark.parametrize("piece", [7, 100, 1 << 18])
 def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeypatch):
     from gfm_hil.recording import columns
-    from gfm_hil.results import metrics
+    from gfm_hil.results import cycles, metrics
 
     whole = dict(run(duration=0.3, events=EVENTS).signals)
     expected = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
-    for module in (columns, metrics):
+    for module in (columns, cycles, metrics):
         monkeypatch.setattr(module, "PIECE", piece)
     found = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
     for name, value in expected.items():

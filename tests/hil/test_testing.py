@@ -284,11 +284,16 @@ def test_envelope_of_a_file_ends_with_its_lines(tmp_path: Path) -> None:
 
 def test_damped_reads_the_ratio() -> None:
     x = 1 + np.exp(-0.2 * 20 * T) * np.cos(20 * np.sqrt(1 - 0.2**2) * T)
-    assert damped(window(x), 0.19, 1e-3) is None
-    found = damped(window(x), 0.21, 1e-3)
+    assert damped(window(x), 0.19, 1e-3, 50.0) is None
+    found = damped(window(x), 0.21, 1e-3, 50.0)
     assert found is not None
     assert "has 0.2" in found.text
-    assert damped(window(np.ones(1001)), 0.9, 1e-3) is None
+    assert damped(window(np.ones(1001)), 0.9, 1e-3, 50.0) is None
+    offset = np.exp(-5 * T) * np.cos(100 * np.pi * T)
+    assert damped(window(x + offset), 0.19, 1e-3, 50.0) is None  # of the line, which decays
+    grows = 0.01 * np.exp(2 * T) * np.cos(100 * np.pi * T)
+    found = damped(window(x + grows), 0.19, 1e-3, 50.0)
+    assert found is not None and "at 50 Hz" in found.text and found.text.endswith("it grows.")
 
 
 def test_change_of_law_and_its_bump(lab: Lab) -> None:

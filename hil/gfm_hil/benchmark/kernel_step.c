@@ -3,7 +3,7 @@
  * "law.h" is made by gfm_runtime.c_header: real, law_t, state_t and the constants.
  * Compile with -ffp-contract=off: a fused multiply-add rounds once where the kernel rounds twice.
  */
-#include <tgmath.h> /* sin, atan2 and fabs in float where real is float */
+#include <tgmath.h> /* sqrt and fabs in float where real is float */
 #include "law.h"
 
 static real limited(const law_t *law, const state_t *state, int i)
@@ -18,9 +18,17 @@ static real at_least_v_min(real v)
     return (real)V_MIN > v ? (real)V_MIN : v;
 }
 
-static real angle_across(real p, real q, real V, real R, real X)
+static real sine_of_half(real x_a, real y_a, real x_b, real y_b)
 {
-    return atan2(X * p - R * q, V * V - (R * p + X * q));
+    const real half = 0.5;
+    real dot = x_a * x_b + y_a * y_b, cross = y_a * x_b - x_a * y_b;
+    real r = sqrt(dot * dot + cross * cross), larger, sine;
+    int a_below = y_a < 0, b_below = y_b < 0;
+    if (!(r >= (real)R_MIN))
+        return 0;
+    larger = sqrt(half + half * fabs(dot / r));
+    sine = dot >= 0 ? half * fabs(cross / r) / larger : larger;
+    return (a_below == b_below ? cross < 0 : a_below) ? -sine : sine;
 }
 
 static void map_errors(int64_t code, const real *parameters, real *r, real *y)
@@ -37,9 +45,8 @@ static void map_errors(int64_t code, const real *parameters, real *r, real *y)
         y[3] /= v * v;
     } else if (code == ERROR_HYBRID_ANGLE) {
         real R = parameters[0], X = parameters[1];
-        real target = angle_across(r[1], r[3], r[4], R, X);
-        real actual = angle_across(y[1], y[3], y[4], R, X);
-        r[1] = sin(half * (target - actual));
+        r[1] = sine_of_half(r[4] * r[4] - (R * r[1] + X * r[3]), X * r[1] - R * r[3],
+                            y[4] * y[4] - (R * y[1] + X * y[3]), X * y[1] - R * y[3]);
         y[1] = 0;
     }
 }

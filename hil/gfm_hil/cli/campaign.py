@@ -138,7 +138,7 @@ def _bar(campaign: Campaign, store: Store, quiet: bool) -> Iterator[tuple[Any, N
 
         def tell(records: list[Record]) -> None:
             for record in records:
-                counts[verdict(record, campaign.file.ripple_max)] += 1
+                counts[verdict(record)] += 1
             found = ", ".join(f"{n} {v.replace('-', ' ')}" for v, n in counts.items() if n)
             bar.update(task, advance=len(records), found=found)
 

@@ -33,7 +33,7 @@ from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario.toml_out import write_scenario
 from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import carried
@@ -67,7 +67,7 @@ def _run(
     bench = make_bench(scenario)
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
-        write_text(folder / "scenario.toml", scenario_toml(scenario))
+        write_scenario(folder, scenario)
     if scenario.mode == "realtime":
         keep_in_memory(folder, scenario.ticks, notice, bench.inner)
     part = Part.create(folder, role, scenario.ticks, bench.inner)

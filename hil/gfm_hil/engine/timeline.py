@@ -23,11 +23,14 @@ from gfm_hil.recording.log import Outcome, Status
 from gfm_hil.scenario.events import (
     CONTROLLER_EVENTS,
     Gains,
+    GridProfile,
     LawChange,
     Reference,
     Reset,
     apply_grid_event,
+    nominal_hz,
 )
+from gfm_hil.scenario.profiles import Point, read_profile
 from gfm_plant import trip_reason
 from gfm_plant.names import CONTROLLER
 from gfm_runtime.signals import U_NAMES, Y_NAMES
@@ -76,11 +79,15 @@ class Timeline:
         self._unwritten = b""
         self.failed = ""  # why the log cannot be written; empty if it can
         scenario = bench.scenario
-        self._todo = [
+        ours: list[tuple[int, Any]] = [
             (e.at(scenario.T_s), e)
             for e in scenario.sorted_events()
             if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in roles
         ]
+        for begin, e in [(k, e) for k, e in ours if isinstance(e, GridProfile)]:
+            profile = read_profile(e.file, nominal_hz(bench.par))
+            ours += [(begin + k, point) for k, point in profile.points(scenario.T_s)]
+        self._todo = deque[tuple[int, Any]](sorted(ours, key=lambda entry: entry[0]))
         self._inbox: deque[tuple[Any, Ticket]] = deque()
         self._changes = 0
         self._lines: deque[dict[str, Any]] = deque()
@@ -112,7 +119,10 @@ class Timeline:
     def carry_out(self, tick: int) -> None:
         """Carry out every event due at this tick, and the queued ones."""
         while self._todo and self._todo[0][0] <= tick:
-            event = self._todo.pop(0)[1]
+            event = self._todo.popleft()[1]
+            if isinstance(event, Point):
+                event.apply(self._bench.par, self._bench.st)
+                continue
             try:
                 self._carry_out(event, tick)
             except ValueError as problem:
@@ -139,6 +149,8 @@ class Timeline:
                 change_gains(self._bench.controller, event.values)
             case Reset():
                 self._bench.reset_controller()
+            case GridProfile() if "operator" not in more:
+                pass  # its points follow
             case _:
                 apply_grid_event(event, self._bench.par, self._bench.st)
         self.write(tick, event.type, label=event.label(), **more)

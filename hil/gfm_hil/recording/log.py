@@ -12,7 +12,7 @@ from gfm_hil.core.errors import UserError
 from gfm_plant.names import CONTROLLER_SAFE
 from gfm_runtime.states import PLANT_TRIP, REASONS
 
-Status = Literal["completed", "tripped", "safe", "interrupted"]
+Status = Literal["completed", "oscillating", "tripped", "safe", "interrupted"]
 
 PLANT_LEFT = "the plant ended before the scenario did"
 
@@ -21,7 +21,7 @@ CONTROLLER_LEFT = "the controller was stopped"
 #: reasons with which a role reports what the other role did
 _SECONDARY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
 
-SEVERITY: tuple[Status, ...] = ("completed", "interrupted", "safe", "tripped")
+SEVERITY: tuple[Status, ...] = ("completed", "oscillating", "interrupted", "safe", "tripped")
 
 
 @dataclass(frozen=True)

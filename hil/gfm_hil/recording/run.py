@@ -19,6 +19,7 @@ from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
 from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
 from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario.profiles import look_beside
 from gfm_plant import load_converter
 from gfm_runtime.toml_file import read_toml
 
@@ -164,7 +165,7 @@ class RecordedRun:
 
     @property
     def status(self) -> str:
-        """``completed``, ``tripped``, ``safe`` or ``interrupted``."""
+        """``completed``, ``oscillating``, ``tripped``, ``safe`` or ``interrupted``."""
         return str(self.summary["status"])
 
     def to_pandas(self) -> pandas.DataFrame:
@@ -234,7 +235,9 @@ def read_scenario(folder: Path) -> Scenario:
         UserError: there is none in the folder, or it is damaged.
     """
     try:
-        return Scenario.model_validate(read_toml(folder / "scenario.toml"))
+        content = read_toml(folder / "scenario.toml")
+        look_beside(content, folder)
+        return Scenario.model_validate(content)
     except ValidationError as problem:
         reason = "; ".join(lines(problem))
     except ValueError as problem:

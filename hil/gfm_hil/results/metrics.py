@@ -1,97 +1,143 @@
 """What an engineer asks of a response, computed from the recorded signals.
 
 All from the plant's true signals. For each event the window runs to the next event (or the end).
+Where p settles and how far it overshoots, and what a converter carries, is judged by means over one
+cycle of the nominal frequency, as power meters and thermal limits do: a ripple at that
+frequency or above leaves them alone. ``cycle`` in a name says so; ``p_peak``, ``i_peak``,
+``v_min``, ``v_max`` and ``t90_s`` are of every tick.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import PIECE, Columns, Rows, pieces
-
-Vector = NDArray[np.float64]
-
+from gfm_hil.results.cycles import Vector, cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.results.modes import LONGEST, fast_mode, swing
 
 ROCOF_WINDOW = 0.1  # s; df/dt is the slope over this window
 METRICS = (
-    "p_before", "p_peak", "p_final", "settling_s", "overshoot_pct", "f_nadir_hz", "f_peak_hz",
-    "rocof_hz_s", "v_min", "v_max", "damping_ratio", "oscillation_hz",
+    "p_before", "p_peak", "p_peak_cycle", "p_final", "t90_s", "settling_s", "overshoot_pct",
+    "i_peak", "i_peak_cycle", "f_nadir_hz", "f_peak_hz", "rocof_hz_s", "v_min", "v_max",
+    "v_min_cycle", "v_max_cycle", "damping_ratio", "oscillation_hz", "fast_damping_ratio",
+    "fast_hz",
 )  # fmt: skip
 _BAND = 0.02  # settling: within 2 % of the step (or 0.02 p.u. where there is no step)
-_GONE = 1e-6
 _NO_STEP = 0.02  # p.u.; a smaller change of p is no step
 _FEW = 20  # samples; a shorter window has no metrics
 
 
 def event_metrics(
-    signals: Columns, start: int, stop: int, T_s: float, f_n: float
+    signals: Columns, start: int, stop: int, T_s: float, f_n: float, lasts: int = 0
 ) -> dict[str, float | None]:
     """Metrics of the ticks [start, stop) after an event at ``start``.
 
     Args:
-        signals: columns with at least true_p, true_omega_u and true_V, shape (ticks,), p.u.;
-            arrays, or columns of a file, which are read piece by piece.
+        signals: columns with at least true_p, true_omega_u, true_V and true_i, shape (ticks,),
+            p.u.; arrays, or columns of a file, which are read piece by piece.
         start, stop: ticks.
         T_s: sampling time, s.
         f_n: nominal frequency, Hz.
+        lasts: ticks over which the event acts, as a sag or a ramp; modes are those of what follows.
 
     Returns:
-        p_before, p_peak (the extreme furthest from p_before), p_final, v_min, v_max in p.u.;
-        settling_s (2 %), overshoot_pct (of the step); f_nadir_hz, f_peak_hz; rocof_hz_s (largest
-        |df/dt| over 100 ms); damping_ratio and oscillation_hz of the dominant oscillation of p.
-        None where a quantity has no meaning, as overshoot without a step, or all of them in a
-        window of a few ticks.
+        By the names of ``METRICS``, with the units of their names, p.u. without one:
+        p_before, the mean of the last cycle before the event, and p_final, that of the end of the
+        window (its last twentieth, at least a cycle); p_peak and p_peak_cycle, the extreme of p
+        and of its one-cycle means that is furthest from p_before; t90_s, when p has first done
+        90 % of its step, or without a step of its way to p_peak; settling_s (2 %) and
+        overshoot_pct (of the step) of the one-cycle means, each at the middle of its cycle; i_peak
+        and i_peak_cycle of the magnitude of the bridge's current; f_nadir_hz, f_peak_hz;
+        rocof_hz_s (largest abs(df/dt) over ``ROCOF_WINDOW``); v_min, v_max and the extremes of
+        the one-cycle means of V; damping_ratio and oscillation_hz of the swing of p (below
+        f_n/2), fast_damping_ratio and fast_hz of its strongest oscillation above that
+        (``modes``). None where a quantity has no meaning, as overshoot without a step, or all of
+        them in a window of a few ticks.
     """
-    p, f, V = signals["true_p"], signals["true_omega_u"], signals["true_V"]
+    p, f, V, i = (signals[f"true_{name}"] for name in ("p", "omega_u", "V", "i"))
     length = stop - start
     if length < _FEW:
         return dict.fromkeys(METRICS)
-    rest = max(start - 1, 0)
-    before = float(p[rest : rest + 1][0])
-    tail = max(1, length // 20)
-    final = sum(float(np.sum(x)) for x in pieces(p, stop - tail, stop)) / tail
+    width = cycle_ticks(T_s, f_n)
+    cycle = whole_ticks(width)
+    before = _mean(p, max(start - cycle, 0), max(start, 1))
+    final = _mean(p, stop - min(length, max(cycle, length // 20)), stop)
     step = final - before
-    peak, least, most = before, math.inf, -math.inf
-    for x in pieces(p, start, stop):
-        furthest = float(x[np.argmax(np.abs(x - before))])
-        peak = furthest if abs(furthest - before) > abs(peak - before) else peak
-        least, most = min(least, float(x.min())), max(most, float(x.max()))
     stepped = abs(step) >= _NO_STEP
-    settled = _settled(p, start, stop, final, _BAND * abs(step) if stepped else _BAND)
-    beyond = (most - final if step > 0 else final - least) if stepped else 0.0
+    low, high = _extremes(pieces(p, start, stop))
+    peak = high if high - before > before - low else low
+    way = step if stepped else peak - before
+    band = _BAND * abs(step) if stepped else _BAND
+    settled, slow_low, slow_high = 0.0, math.inf, -math.inf
+    done = 0  # windows of a cycle
+    for x in cycle_means(p, start, stop, width):
+        slow_low, slow_high = min(slow_low, float(x.min())), max(slow_high, float(x.max()))
+        outside = np.flatnonzero(np.abs(x - final) > band)
+        if len(outside):
+            settled = done + int(outside[-1]) + 1 + 0.5 * (width - 1)
+        done += len(x)
+    # an oscillation that is still outside at the end of the window has not settled
+    has_settled = done > 0 and settled < 0.95 * length and settled < done
+    beyond = slow_high - final if step > 0 else final - slow_low
     nadir, top, slope = _frequency(f, start, stop, max(1, round(ROCOF_WINDOW / T_s)))
-    voltages = [(float(x.min()), float(x.max())) for x in pieces(V, start, stop)]
-    damping, frequency = dominant_oscillation(p[start : min(stop, start + _longest(T_s))], T_s)
-    return {
+    v_low, v_high = _extremes(pieces(V, start, stop))
+    free = start + lasts if stop - start - lasts >= _FEW else start
+    first = p[free : min(stop, free + round(LONGEST / T_s))]
+    slow, fast = swing(first, T_s, f_n), fast_mode(first, T_s, f_n)
+    found: dict[str, float | None] = dict.fromkeys(METRICS)
+    found |= {
         "p_before": before,
         "p_peak": peak,
         "p_final": final,
-        # an oscillation that is still outside at the end of the window has not settled
-        "settling_s": settled * T_s if settled < 0.95 * length else None,
-        "overshoot_pct": 100 * max(0.0, beyond) / abs(step) if stepped else None,
+        "t90_s": _crossed(p, start, stop, before, 0.9 * way, T_s) if abs(way) >= _NO_STEP else None,
+        "settling_s": settled * T_s if has_settled else None,
+        "i_peak": _extremes(pieces(i, start, stop))[1],
         "f_nadir_hz": nadir * f_n,
         "f_peak_hz": top * f_n,
         "rocof_hz_s": None if slope is None else slope * f_n / T_s,
-        "v_min": min(low for low, _ in voltages),
-        "v_max": max(high for _, high in voltages),
-        "damping_ratio": damping,
-        "oscillation_hz": frequency,
+        "v_min": v_low,
+        "v_max": v_high,
     }
+    if done:
+        v_slow = _extremes(cycle_means(V, start, stop, width))
+        found |= {
+            "p_peak_cycle": slow_high if slow_high - before > before - slow_low else slow_low,
+            "overshoot_pct": 100 * max(0.0, beyond) / abs(step) if stepped else None,
+            "i_peak_cycle": _extremes(cycle_means(i, start, stop, width))[1],
+            "v_min_cycle": v_slow[0],
+            "v_max_cycle": v_slow[1],
+        }
+    if slow is not None:
+        found |= {"damping_ratio": slow.damping, "oscillation_hz": slow.hz}
+    if fast is not None:
+        found |= {"fast_damping_ratio": fast.damping, "fast_hz": fast.hz}
+    return found
 
 
-def _settled(p: Rows, start: int, stop: int, final: float, band: float) -> int:
-    """Ticks after ``start`` from which on p stays within ``band`` of ``final``, to ``stop``."""
-    last = stop
-    while last > start:  # from the end, where it is found soon
-        first = max(start, last - PIECE)
-        outside = np.flatnonzero(np.abs(p[first:last] - final) > band)
-        if len(outside):
-            return first + int(outside[-1]) + 1 - start
-        last = first
-    return 0
+def _mean(column: Rows, first: int, last: int) -> float:
+    """The mean of a few ticks or many; exact where the column is constant."""
+    base = float(column[first : first + 1][0])
+    return base + sum(float(np.sum(x - base)) for x in pieces(column, first, last)) / (last - first)
+
+
+def _extremes(parts: Iterable[Vector]) -> tuple[float, float]:
+    """The least and the largest value of all pieces."""
+    low, high = math.inf, -math.inf
+    for x in parts:
+        low, high = min(low, float(x.min())), max(high, float(x.max()))
+    return low, high
+
+
+def _crossed(p: Rows, start: int, stop: int, before: float, way: float, T_s: float) -> float | None:
+    """Time after ``start`` at which p first has gone ``way`` from ``before``, s."""
+    for k, x in enumerate(pieces(p, start, stop)):
+        there = np.flatnonzero((x - before) * math.copysign(1.0, way) >= abs(way))
+        if len(there):
+            return (k * PIECE + int(there[0])) * T_s
+    return None
 
 
 def _frequency(f: Rows, start: int, stop: int, width: int) -> tuple[float, float, float | None]:
@@ -103,38 +149,3 @@ def _frequency(f: Rows, start: int, stop: int, width: int) -> tuple[float, float
         if len(x) > width:
             slope = max(slope or 0.0, float(np.abs(x[width:] - x[:-width]).max()) / width)
     return least, most, slope
-
-
-def _longest(T_s: float) -> int:
-    """Ticks that ``dominant_oscillation`` looks at."""
-    return round(2.0 / T_s)
-
-
-def dominant_oscillation(p: Vector, T_s: float) -> tuple[float | None, float | None]:
-    """Damping ratio and frequency [Hz] of the strongest oscillation in p, by the matrix pencil.
-
-    The signal is thinned to at most 400 samples of the first 2 s. Poles are those of the shifted
-    signal subspace (Hua and Sarkar, 1990); each mode's strength is the energy it contributes.
-    (None, None) if nothing oscillates by more than 1e-4 p.u.
-    """
-    window = p[: _longest(T_s)]
-    stride = max(1, len(window) // 400)
-    x = window[::stride] - np.mean(window[-max(1, len(window) // 10) :])
-    if len(x) < 40 or np.max(np.abs(x)) < 1e-4:
-        return None, None
-    columns = len(x) // 3
-    hankel = np.lib.stride_tricks.sliding_window_view(x, columns + 1)
-    _, weight, modes = np.linalg.svd(hankel, full_matrices=False)
-    rank = min(12, int(np.sum(weight > 1e-3 * weight[0])))
-    subspace = modes[:rank].T
-    z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
-    z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
-    s = np.log(z.astype(complex)) / (stride * T_s)
-    powers = np.exp(np.outer(np.arange(len(x)) * stride * T_s, s))
-    amplitude = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
-    energy = np.sum(np.abs(powers * amplitude) ** 2, axis=0)
-    oscillating = (s.imag > 2 * np.pi * 0.1) & (np.abs(amplitude) > 1e-4)
-    if not oscillating.any():
-        return None, None
-    k = np.flatnonzero(oscillating)[np.argmax(energy[oscillating])]
-    return float(-s[k].real / abs(s[k])), float(s[k].imag / (2 * np.pi))

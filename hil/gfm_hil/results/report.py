@@ -22,7 +22,7 @@ border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums}
 .scroll :is(th,td):not(:first-child){text-align:right}
 img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
 .status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
-.completed,.expected{background:#00734f} .tripped,.safe{background:#b34500}
+.completed,.expected{background:#00734f} .oscillating,.tripped,.safe{background:#b34500}
 .unmet{color:#b34500}
 pre{background:#f6f6f6;padding:1rem;overflow-x:auto;font-size:13px}
 """
@@ -32,15 +32,20 @@ EVENT_COLUMNS = (
     ("t", "t [s]"),
     ("p_peak", "p peak [p.u.]"),
     ("p_final", "p final [p.u.]"),
+    ("t90_s", "t 90 % [s]"),
     ("settling_s", "settling 2 % [s]"),
     ("overshoot_pct", "overshoot [%]"),
+    ("i_peak", "i peak [p.u.]"),
+    ("i_peak_cycle", "i peak, one cycle [p.u.]"),
     ("f_nadir_hz", "f nadir [Hz]"),
     ("f_peak_hz", "f peak [Hz]"),
     ("rocof_hz_s", "RoCoF [Hz/s]"),
     ("v_min", "V min [p.u.]"),
     ("v_max", "V max [p.u.]"),
-    ("damping_ratio", "damping ratio"),
-    ("oscillation_hz", "oscillation [Hz]"),
+    ("damping_ratio", "swing: damping ratio"),
+    ("oscillation_hz", "swing [Hz]"),
+    ("fast_damping_ratio", "fast mode: damping ratio"),
+    ("fast_hz", "fast mode [Hz]"),
     ("bump_pu", "bump [p.u.]"),
     ("cut_short", "cut short by"),
 )

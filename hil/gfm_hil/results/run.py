@@ -13,7 +13,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.run import RecordedRun
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario.toml_out import write_scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,7 +84,7 @@ class Run(RecordedRun):
                 law = folder.absolute() / "law.toml"
                 write_text(law, self.law_text)
                 scenario = scenario.model_copy(update={"law": str(law)})
-            write_text(folder / "scenario.toml", scenario_toml(scenario))
+            write_scenario(folder, scenario)
             laws = Table.of(laws=np.array(self.laws))
             write_npz(folder / "signals.npz", [laws, Table.of(**arrays)])
             write_npz(folder / "timing.npz", [])

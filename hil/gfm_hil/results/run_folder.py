@@ -34,6 +34,7 @@ from gfm_hil.recording.run import read_recording
 from gfm_hil.results.run import Run
 from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario.toml_out import write_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
@@ -243,7 +244,7 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.copy(plant.file("scenario.toml"), folder)
+        write_scenario(folder, plant.scenario)
         write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
         own = {k: v for k, v in controller.columns.items() if k not in ("tick", "t")}
         laws = Table.of(laws=np.array(controller.laws))

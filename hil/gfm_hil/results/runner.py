@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import ROLES
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compiled_bench
@@ -26,7 +25,7 @@ from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import INPROC, Scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario.toml_out import write_scenario
 
 __all__ = ["Notice", "Progress", "Run", "run_scenario"]
 
@@ -65,7 +64,7 @@ def run_scenario(
         try:
             with Interrupt() as interrupt:
                 try:
-                    write_text(folder / "scenario.toml", scenario_toml(scenario))
+                    write_scenario(folder, scenario)
                 except OSError as problem:
                     raise UserError(f"{folder}: {problem.strerror}") from None
                 if scenario.link.type == INPROC:

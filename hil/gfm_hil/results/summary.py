@@ -19,6 +19,7 @@ from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.recording.timing import ROUND_TRIP, count_misses
 from gfm_hil.results.doctor import verdict
 from gfm_hil.results.metrics import event_metrics
+from gfm_hil.results.ripple import remaining_ripple
 from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime import load_law
@@ -79,6 +80,11 @@ def summarise(
     met = [e for e in log if e["event"] == "handshake"]
     controller: str | None = met[0]["controller"] if met else OUR_CONTROLLER
     plant, ours = "true_p" in signals, "ref_P_ref" in signals
+    ripple = None
+    if plant and outcome.status == "completed":
+        ripple = remaining_ripple(scenario, signals, log, done)
+        if ripple is not None and ripple.oscillates:
+            outcome = Outcome("oscillating", ripple.words(), outcome.tick)
     trips = _trips(log, outcome, done, scenario.T_s)
     changes = [e for e in log if e["event"] == "law-active"]
     happened = [e for e in log if "label" in e]
@@ -86,6 +92,8 @@ def summarise(
     starts = np.array([e["tick"] for e in happened])  # in order, as the log is
     ends = [*np.searchsorted(starts, starts, side="right").tolist()]
     f_n = nominal_frequency(scenario)
+    T_s = scenario.T_s
+    lasting = {(e.at(T_s), e.type): round(e.lasts() / T_s) for e in scenario.events}
     laws = [scenario.law, *[e["law"] for e in changes]]
     events = []
     for k, e in enumerate(happened):
@@ -99,7 +107,8 @@ def summarise(
             if trip is not None and (trip["tick"] < stop or stop == done):
                 stop = min(stop, trip["tick"])
                 entry["cut_short"] = f"{reason_name(trip['reason'])} at {trip['t']:g} s"
-            entry.update(event_metrics(signals, e["tick"], stop, scenario.T_s, f_n))
+            over = lasting.get((e["tick"], e["event"]), 0)
+            entry.update(event_metrics(signals, e["tick"], stop, scenario.T_s, f_n, over))
             if "cut_short" in entry:
                 entry.update(dict.fromkeys(END_METRICS))
             if e["event"] not in _STEPS:
@@ -126,6 +135,7 @@ def summarise(
         },
         "e2e": {role: end["e2e"] for role, end in links.items()},
         "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
+        "ripple_pu": ripple.pu if ripple else None,
         "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
         "events": events,
         "run": met[0]["run"] if met else None,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -37,6 +38,10 @@ class _Event(BaseModel):
     def at(self, T_s: float) -> int:
         """The tick of the event; a time is rounded to the nearest tick."""
         return self.tick if self.tick is not None else round((self.t or 0.0) / T_s)
+
+    def lasts(self) -> float:
+        """How long it acts, s, if the event itself says so; 0 for a step and for what stays."""
+        return float(getattr(self, "duration", None) or getattr(self, "ramp_s", None) or 0.0)
 
 
 def reference_field(name: str, default: float | None) -> Any:
@@ -138,6 +143,24 @@ class GridVoltage(_Event):
 
     def label(self) -> str:
         return f"grid {self.V_g:g} p.u." + (f" for {self.duration:g} s" if self.duration else "")
+
+
+class GridProfile(_Event):
+    """The grid's frequency and voltage follow a CSV file: t [s after the event], and f_hz [Hz] or
+    omega_g [p.u.], V_g [p.u.], or both; straight between its lines, and at the end they stay."""
+
+    type: Literal["grid-profile"] = Field(description="kind of event")
+    file: str = Field(
+        min_length=1, description="path, from the scenario's folder or where you run the command"
+    )
+
+    def lasts(self) -> float:
+        from gfm_hil.scenario.profiles import last_time
+
+        return last_time(self.file)
+
+    def label(self) -> str:
+        return f"grid profile {PurePath(self.file).stem}"
 
 
 class PhaseJump(_Event):
@@ -254,6 +277,7 @@ Event = Annotated[
     | Reset
     | GridFrequency
     | GridVoltage
+    | GridProfile
     | PhaseJump
     | GridImpedance
     | GridLoad
@@ -267,17 +291,24 @@ Event = Annotated[
 CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 
+def nominal_hz(par: Any) -> float:
+    """Nominal frequency of a plant, Hz, from its record."""
+    return float(par[0]["omega_b"]) / (2 * math.pi)
+
+
 def apply_grid_event(event: Any, par: Any, st: Any) -> None:
     """Apply one of the plant's events to its records, between two ticks."""
     from gfm_plant import grid
 
-    f_b = float(par[0]["omega_b"]) / (2 * math.pi)
+    f_b = nominal_hz(par)
     match event:
         case GridFrequency():
             rate = event.rate / f_b if event.rate else None
             grid.grid_frequency(par, st, event.f_hz / f_b, rate)
         case GridVoltage():
             grid.grid_voltage(st, event.V_g, event.rate, event.duration)
+        case GridProfile():
+            raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
         case PhaseJump():
             grid.phase_jump(st, event.degrees)
         case GridImpedance():

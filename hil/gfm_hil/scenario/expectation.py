@@ -22,6 +22,7 @@ CONTROLLER_GONE = "the controller's process is gone"
 #: names of the possible reasons of a run's end, by its status
 END_REASONS: dict[str, tuple[str, ...]] = {
     "completed": (),
+    "oscillating": (),
     "tripped": (
         *(name for code, name in TRIP_REASONS.items() if code not in (0, CONTROLLER)),
         REASONS[PLANT_TRIP],  # the controller's side knows no more than this
@@ -47,7 +48,7 @@ def check_expectation(scenario: Scenario) -> list[str]:
     given = {"expect_reason": reason, "expect_after": scenario.expect_after}
     if not names:
         problems += [
-            f"{key} = {value!r}: needs expect = 'tripped' or 'safe', not 'completed'"
+            f"{key} = {value!r}: needs expect = 'tripped' or 'safe', not {scenario.expect!r}"
             for key, value in given.items()
             if value is not None
         ]

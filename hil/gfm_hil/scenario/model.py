@@ -23,13 +23,16 @@ from gfm_hil.scenario.events import (
     GridFrequency,
     GridImpedance,
     GridLoad,
+    GridProfile,
     LawChange,
     Reset,
     apply_grid_event,
     check_reference,
+    nominal_hz,
     reference_field,
 )
 from gfm_hil.scenario.expectation import check_expectation
+from gfm_hil.scenario.profiles import content_hash, look_beside, read_profile
 from gfm_plant import ConverterParameters, Plant, load_converter, make_plant
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
 from gfm_runtime.errors import meant, printable
@@ -141,8 +144,15 @@ class Scenario(_Model):
         "the path of a file, or none",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
-    expect: Literal["completed", "tripped", "safe"] = Field(
+    expect: Literal["completed", "oscillating", "tripped", "safe"] = Field(
         "completed", description="status with which the run counts as passed (exit code 0)"
+    )
+    expect_ripple: float = Field(
+        0.02,
+        gt=0,
+        le=1000,
+        description="p.u.; a run that lasts to its end but whose p, V, omega_u or abs(i) then "
+        "still oscillates by more, peak to peak, ends as oscillating",
     )
     expect_reason: str | None = Field(
         None,
@@ -197,14 +207,15 @@ class Scenario(_Model):
         """Hash of all that both sides must agree on: scenario, signal table, and the content of
         the law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "compare"}
-        about |= {"expect", "expect_reason", "expect_after"}
+        about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "inner", "events", "ready_laws"})
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
-        events = [
-            {**e.model_dump(), **({"law": names.index(e.law)} if isinstance(e, LawChange) else {})}
-            for e in self.sorted_events()
-        ]
+        events = []
+        for e in self.sorted_events():
+            known: dict[str, Any] = {"law": names.index(e.law)} if isinstance(e, LawChange) else {}
+            known |= {"file": content_hash(e.file)} if isinstance(e, GridProfile) else {}
+            events.append({**e.model_dump(), **known})
         return _hash([content, events, self.laws_digest(), table_hash()])
 
     def laws_digest(self) -> str:
@@ -336,6 +347,7 @@ def load_scenario(
             content = read_toml(where)
         except ValueError as problem:
             raise UserError(f"{where}: {problem}") from None
+        look_beside(content, Path(where).parent)
         if "phi" in content:
             raise UserError(f"{where}: is a law file; give it to a scenario as its law")
     elif isinstance(given, Scenario):
@@ -438,8 +450,12 @@ def _try_plant(scenario: Scenario) -> None:
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):
-        if isinstance(event, Fault | GridFrequency | GridImpedance | GridLoad):
+        if isinstance(event, Fault | GridFrequency | GridImpedance | GridLoad | GridProfile):
             try:
-                apply_grid_event(event, par, st)
-            except ValueError as problem:
+                if isinstance(event, GridProfile):
+                    profile = read_profile(event.file, nominal_hz(par))
+                    next(profile.points(scenario.T_s))[1].apply(par, st)
+                else:
+                    apply_grid_event(event, par, st)
+            except (UserError, ValueError) as problem:
                 raise UserError(f"events.{k}: {problem}") from None

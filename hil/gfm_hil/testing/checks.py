@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import unit_of
-from gfm_hil.results.metrics import dominant_oscillation
+from gfm_hil.results.modes import fast_mode, swing
 
 Vector = NDArray[np.float64]
 
@@ -125,10 +125,18 @@ def envelope(w: Window, low: Vector, high: Vector) -> Finding | None:
     return Finding(text, float(w.t[worst]), w.t, low, high)
 
 
-def damped(w: Window, min_ratio: float, T_s: float) -> Finding | None:
-    """The strongest oscillation after the step has at least this damping ratio."""
-    ratio, f = dominant_oscillation(w.x, T_s)
-    if ratio is None or ratio >= min_ratio:
+def damped(w: Window, min_ratio: float, T_s: float, f_n: float) -> Finding | None:
+    """The swing after the step has at least this damping ratio, and no faster oscillation grows.
+
+    The line's own DC offset, an oscillation at f_n, decays with the line's R/L whatever the law
+    does; so a faster oscillation need only not grow.
+    """
+    slow, fast = swing(w.x, T_s, f_n), fast_mode(w.x, T_s, f_n)
+    if slow is not None and slow.damping < min_ratio:
+        ratio, f = slow.damping, slow.hz
+    elif fast is not None and fast.damping < 0.0:
+        ratio, f = fast.damping, fast.hz
+    else:
         return None
     none = np.full(len(w.t), np.nan)
     text = (

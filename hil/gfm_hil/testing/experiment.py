@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.testing import checks
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps
@@ -73,11 +74,13 @@ class Experiment(Steps):
     def assert_damped(
         self, min_ratio: float, signal: str = "p", since: float | None = None
     ) -> None:
-        """The strongest oscillation after the last step has at least this damping ratio."""
+        """The swing after the last step (below half the nominal frequency) has at least this
+        damping ratio, and no faster oscillation grows."""
         __tracebackhide__ = True
         w = self._window(signal, since)
-        T_s = self.setting.scenario.T_s
-        self._judge(w.name, "damped", checks.damped(w, min_ratio, T_s))
+        scenario = self.setting.scenario
+        found = checks.damped(w, min_ratio, scenario.T_s, nominal_frequency(scenario))
+        self._judge(w.name, "damped", found)
 
     def assert_bump_below(self, limit: float) -> None:
         """No change of law moved an input by more than ``limit`` p.u. in its tick."""
@@ -111,11 +114,17 @@ class Experiment(Steps):
             )  # fmt: skip
 
     def assert_no_trip(self) -> None:
-        """The run completed."""
+        """The run completed; one that still oscillates at its end has not, unless its scenario
+        expects that."""
         __tracebackhide__ = True
         s = self.summary
-        if s["status"] != "completed":
-            end = s["duration_s"]
+        end = s["duration_s"]
+        if s["status"] == "oscillating" != s["expected"]:
+            self._fail(
+                f"The run should be at rest at its end, but it is {s['reason']}.",
+                "i", "oscillates", around=(end - _NEAR, end),
+            )  # fmt: skip
+        if s["status"] not in ("completed", "oscillating"):
             self._fail(
                 f"The run should last {self._ran * s['T_s']:g} s, but it ended at {end:.4f} s: "
                 f"{s['status']}: {s['reason']}.",

@@ -152,6 +152,11 @@ class Steps:
         else:
             self._planned.step("grid-voltage", V_g=V_g, rate=rate, duration=duration)
 
+    def grid_profile(self, file: str) -> None:
+        """The grid's frequency and voltage follow a CSV file from here on: t [s], and f_hz or
+        omega_g [p.u.], V_g [p.u.], or both."""
+        self._planned.step("grid-profile", file=beside(self._near, file))
+
     def phase_jump(self, degrees: float) -> None:
         """The grid's angle jumps ahead."""
         self._planned.step("grid-phase-jump", degrees=degrees)

@@ -72,7 +72,7 @@ def _panel(
     """One law; returns the verdicts that were drawn."""
     a = _spread(x, records, 1)
     b = _spread(y, records, 2) if y else np.array([r["run"] for r in records], dtype=float)
-    verdicts = np.array([verdict(r, campaign.file.ripple_max) for r in records], dtype=object)
+    verdicts = np.array([verdict(r) for r in records], dtype=object)
     dress(axes)
     axes.grid(False)
     if x.log:

@@ -64,7 +64,7 @@ class CampaignResult:
         rows = []
         for record in self.records:
             row = {k: v for k, v in record.items() if k not in ("drawn", "events")}
-            row["verdict"] = verdict(record, self.campaign.file.ripple_max)
+            row["verdict"] = verdict(record)
             row |= record["drawn"]
             for k, event in enumerate(record["events"]):
                 row |= {f"events.{k}.{name}": event[name] for name in METRICS if name in event}
@@ -127,11 +127,9 @@ def write_result(
     return content
 
 
-def verdict(record: Record, ripple_max: float) -> str:
-    """The status, with completed told apart: stable, or still oscillating at the end."""
-    if record["status"] != "completed":
-        return str(record["status"])
-    return "stable" if record["ripple_pu"] <= ripple_max else "oscillating"
+def verdict(record: Record) -> str:
+    """The status; a run that completed, and so is at rest at its end, is called stable."""
+    return "stable" if record["status"] == "completed" else str(record["status"])
 
 
 def summary(campaign: Campaign, records: Sequence[Record]) -> dict[str, Any]:
@@ -142,7 +140,7 @@ def summary(campaign: Campaign, records: Sequence[Record]) -> dict[str, Any]:
     laws = {}
     for law in campaign.file.laws:
         mine = [r for r in records if r["law"] == law]
-        verdicts = [verdict(r, campaign.file.ripple_max) for r in mine]
+        verdicts = [verdict(r) for r in mine]
         stable = [r for r, v in zip(mine, verdicts, strict=True) if v == "stable"]
         laws[law] = {
             "runs": len(mine),
@@ -155,7 +153,6 @@ def summary(campaign: Campaign, records: Sequence[Record]) -> dict[str, Any]:
         "campaign": campaign.name,
         "scenario": campaign.file.scenario,
         "seed": campaign.file.seed,
-        "ripple_max": campaign.file.ripple_max,
         "runs": campaign.file.runs,
         "done": len(records),
         "missing": campaign.file.runs * len(campaign.file.laws) - len(records),

@@ -73,9 +73,6 @@ class CampaignFile(Model):
     laws: list[str] = Field(min_length=1, description="each runs on the same draws")
     runs: int = Field(gt=0, le=10**7, description="number of draws")
     seed: int = Field(0, ge=0, lt=2**63, description="of all draws")
-    ripple_max: float = Field(
-        0.2, gt=0, description="p.u.; peak to peak of p over the last 0.2 s of a stable run"
-    )
     figure: Axes = Field(Axes(), description="what the figure is drawn over")
     set: dict[str, Any] = Field({}, description="dotted path = value, the same in every run")
     draw: list[Distribution] = Field(min_length=1, description="what is drawn in every run")
@@ -106,7 +103,8 @@ class Campaign:
             Scenario.model_validate({**self.base, "law": law}).digest()
             for law in self.laws.values()
         ]
-        text = json.dumps([decides, scenarios, version("gfmhil")], sort_keys=True)
+        limit = self.base["expect_ripple"]  # which the digests of scenarios leave out
+        text = json.dumps([decides, limit, scenarios, version("gfmhil")], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def content(self, run: int, law: str) -> tuple[dict[str, Any], dict[str, Any]]:

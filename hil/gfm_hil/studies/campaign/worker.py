@@ -21,7 +21,6 @@ from gfm_hil.studies.campaign.spec import Campaign
 Job = tuple[int, str]  # run number, law
 Record = dict[str, Any]
 
-_RIPPLE_WINDOW = 0.2  # s, ten periods of 50 Hz
 _EVENT_KEYS = ("t", "tick", "label", "cut_short")  # of a summary's event; the scenario has them
 
 
@@ -80,9 +79,9 @@ def record(
     p: NDArray[np.float64],
 ) -> Record:
     """What is kept of a run; ``docs/campaigns.md`` lists the keys."""
-    completed = summary["status"] == "completed"
+    lasted = summary["status"] in ("completed", "oscillating")
+    ripple = summary.get("ripple_pu")
     events = [{k: v for k, v in e.items() if k not in _EVENT_KEYS} for e in summary["events"]]
-    window = p[-max(1, round(_RIPPLE_WINDOW / scenario.T_s)) :]
     return finite(
         {
             "run": run,
@@ -91,8 +90,8 @@ def record(
             "drawn": drawn,
             "status": summary["status"],
             "reason": summary["reason"],
-            "end_s": None if completed or not len(p) else len(p) * scenario.T_s,
-            "ripple_pu": float(np.ptp(window)) if completed else None,
+            "end_s": None if lasted or not len(p) else len(p) * scenario.T_s,
+            "ripple_pu": max(ripple.values()) if ripple else None,
             "growth_1_s": max((g for e in events if (g := _growth(e)) is not None), default=None),
             "events": events,
         }
@@ -100,8 +99,10 @@ def record(
 
 
 def _growth(event: dict[str, Any]) -> float | None:
-    """Growth rate of an event's dominant oscillation, 1/s; negative: it decays."""
-    zeta, hertz = event.get("damping_ratio"), event.get("oscillation_hz")
-    if zeta is None or hertz is None:
-        return None
-    return -zeta * 2 * math.pi * hertz / math.sqrt(1 - zeta**2)
+    """Larger growth rate of an event's swing and fast mode, 1/s; negative: both decay."""
+    rates = [
+        -zeta * 2 * math.pi * event[hertz] / math.sqrt(1 - zeta**2)
+        for ratio, hertz in (("damping_ratio", "oscillation_hz"), ("fast_damping_ratio", "fast_hz"))
+        if (zeta := event.get(ratio)) is not None
+    ]
+    return max(rates, default=None)

@@ -101,6 +101,8 @@ def _bench(kind: str, key: str, digits: int = 3, first: bool = True) -> Callable
 
     def text(row: Row) -> str:
         run: Mapping[str, Any] = row["bench"][kind]
+        if run["status"] == "oscillating":
+            return "oscillates" if first else "–"
         if run["status"] != "completed":
             why = f"{run['reason'].split(':')[0]} after {number(run['end_s'], 2)} s"
             return why if first else "–"

@@ -1,0 +1,133 @@
+"""gfmhil firmware: laws as C99, their golden vectors, and the check on a processor."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.core.terminal import numbers, terminal
+from gfm_runtime import Law, law_names, load_law
+from gfm_runtime.firmware import (
+    CHECKED,
+    OPTIMISED,
+    REALS,
+    SHIPPED,
+    STYLES,
+    TARGETS,
+    Checked,
+    check,
+    export,
+    golden,
+    make_modules,
+)
+
+ALL = "all"
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
+    out = kinds.add_parser("export", help="write laws as C99, with golden vectors and a self-test")
+    _add_laws(out)
+    out.add_argument(
+        "--style", choices=STYLES, default=STYLES[0],
+        help="unrolled: constants in the code (default); records: a generic step for records",
+    )  # fmt: skip
+    out.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
+    out.set_defaults(call=call_export)
+    vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
+    _add_laws(vectors)
+    vectors.add_argument(
+        "--ticks", type=int, default=SHIPPED, metavar="N", help=f"rows of each law ({SHIPPED})"
+    )
+    vectors.add_argument("-o", "--out", type=Path, metavar="FILE", help="else to the screen")
+    vectors.set_defaults(call=call_golden)
+    proof = kinds.add_parser("check", help="build and run a folder, and compare every bit")
+    proof.add_argument("folder", type=Path, metavar="DIR", help="what export wrote")
+    proof.add_argument(
+        "--target", choices=list(TARGETS), default="host",
+        help="; ".join(f"{name}: {target.what}" for name, target in TARGETS.items()),
+    )  # fmt: skip
+    proof.add_argument("--flags", default=OPTIMISED, help=f"for the compiler ({OPTIMISED})")
+    proof.add_argument(
+        "--ticks", type=int, default=CHECKED, metavar="N", help=f"rows of each law ({CHECKED})"
+    )
+    proof.add_argument("--json", action="store_true", help="the result as JSON")
+    proof.set_defaults(call=call_check)
+
+
+def _add_laws(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
+    )
+    command.add_argument("--real", choices=REALS, default=REALS[0], help="precision (float32)")
+    command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
+
+
+def call_export(options: argparse.Namespace) -> int:
+    """Write the folder; returns the exit code."""
+    files = export(_laws(options.laws), options.T_s, options.real, options.style)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        write_text(options.out / name, text)
+    print(f"{options.out}: {', '.join(files)}")
+    return 0
+
+
+def call_golden(options: argparse.Namespace) -> int:
+    """Write or print the vectors; returns the exit code."""
+    modules = make_modules(_laws(options.laws), options.T_s, options.real)
+    text = golden(modules, _ticks(options.ticks)).csv()
+    if options.out is None:
+        print(text, end="")
+    else:
+        write_text(options.out, text)
+    return 0
+
+
+def call_check(options: argparse.Namespace) -> int:
+    """Check a folder and print a table; 3 if a bit differs."""
+    results = check(options.folder, options.target, options.flags, _ticks(options.ticks))
+    if options.json:
+        print(json.dumps([asdict(result) for result in results], indent=2))
+    else:
+        _print(results)
+    return EXIT_OTHERWISE if any(result.differ for result in results) else 0
+
+
+def _laws(names: Sequence[str]) -> dict[str, Law]:
+    """Laws by name; the stages of a scheduled law one by one."""
+    laws: dict[str, Law] = {}
+    for name in law_names() if list(names) == [ALL] else names:
+        found = load_law(name)
+        for k, law in enumerate(found.laws):
+            label = found.name if len(found.laws) == 1 else f"{found.name}[{k}]"
+            if label in laws:
+                raise UserError(f"law {label!r}: is named twice")
+            laws[label] = law
+    return laws
+
+
+def _ticks(ticks: int) -> int:
+    if ticks < 1:
+        raise UserError(f"--ticks {ticks}: must be at least 1")
+    return ticks
+
+
+def _print(results: Sequence[Checked]) -> None:
+    heads = ("rows", "words that differ", "instructions", "code [B]", "constants [B]", "state [B]",
+             "stack [B]")  # fmt: skip
+    table = numbers("law", *heads)
+    for r in results:
+        counted = "–" if r.instructions is None else f"{r.instructions[0]}…{r.instructions[1]}"
+        stack = "–" if r.stack is None else str(r.stack)
+        table.add_row(
+            r.name, str(r.rows), str(r.differ), counted, str(r.code), str(r.constants),
+            str(r.state), stack,
+        )  # fmt: skip
+    terminal().print(table, highlight=False)

@@ -1,0 +1,53 @@
+"""Means over one cycle of the nominal frequency, which take a column piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.recording.columns import PIECE, Rows
+
+Vector = NDArray[np.float64]
+
+
+def cycle_ticks(T_s: float, f_n: float) -> float:
+    """Ticks in a cycle, which need not be whole; at least 1."""
+    return max(1.0, 1.0 / (f_n * T_s))
+
+
+def whole_ticks(width: float) -> int:
+    """Ticks that a mean over ``width`` ticks reads."""
+    return int(np.ceil(width - 1e-6))
+
+
+def cycle_means(column: Rows, first: int, last: int, width: float) -> Iterator[Vector]:
+    """The mean of every window of ``width`` ticks that lies inside [first, last), in pieces.
+
+    Value k belongs to the window that begins at tick ``first`` + k, so to the time (width − 1)/2
+    ticks later, its middle. A fraction of a tick counts that part of the window's last tick.
+    Sums never run over more than two windows, so that they do not drift and do not depend on the
+    pieces.
+
+    Args:
+        column: shape (ticks,); an array, or a column of a file, of which a piece is read at a time.
+        first, last: ticks.
+        width: ticks, at least 1.
+    """
+    taken = whole_ticks(width)
+    n = int(width + 1e-6)
+    part = width - n if taken > n else 0.0
+    count = last - first - taken + 1
+    step = max(1, PIECE // n) * n
+    for begin in range(0, count, step):
+        have = min(step, count - begin)
+        x = np.asarray(column[first + begin : first + begin + have + taken - 1], np.float64)
+        blocks = -(-have // n) + 1
+        padded = np.zeros(blocks * n + 1)
+        padded[: len(x)] = x
+        # a window begins in one block of n ticks and ends in the next one
+        sums = np.zeros((blocks, n + 1))
+        np.cumsum(padded[:-1].reshape(blocks, n), axis=1, out=sums[:, 1:])
+        total = (sums[:-1, n:] - sums[:-1, :n] + sums[1:, :n]).ravel()[:have]
+        yield (total + part * padded[n : n + have]) / width

@@ -1,0 +1,146 @@
+"""Damping and frequency of the oscillations in a recorded signal, by the matrix pencil.
+
+The swing, below half the nominal frequency, comes from means over one cycle, in which the line's
+DC offset (at the nominal frequency in the dq frame) and its harmonics vanish. The fast mode, above
+that, comes from what these means leave. Before a signal is thinned, a filter takes out what the
+thinned signal cannot show. All filters are finite sums over ticks inside the window: they scale a
+damped exponential but leave its pole where it is, so they add no mode and move none.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import firwin, minimum_phase, oaconvolve
+
+from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
+
+Vector = NDArray[np.float64]
+
+LONGEST = 2.0  # s of a window that are looked at
+_SAMPLES = 400  # at most, for the pencil of the swing
+_FAST_SAMPLES = 300  # at most, for that of the fast mode
+_A_PERIOD = 5  # samples, at least, in a period of the fast mode
+_TAPS = 20  # of the filter, for each tick of the stride
+_LEAST = 1e-4  # p.u.; a smaller amplitude is no swing
+_LEAST_FAST = 3e-4  # p.u.; a smaller amplitude is no fast mode
+_SHARE = 0.3  # of the energy that a fast mode has at least; noise has no such mode
+_HALF = 0.5  # periods, at least, in what is looked at
+_RANK = 12  # poles, at most
+_FEW = 40  # samples; fewer tell no modes
+_GONE = 1e-6
+
+
+class Mode(NamedTuple):
+    """An oscillation.
+
+    Attributes:
+        damping: ratio; negative if it grows.
+        hz: frequency, Hz.
+    """
+
+    damping: float
+    hz: float
+
+
+def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
+    """The strongest oscillation below f_n/2 in the first 2 s of x; None without one.
+
+    Args:
+        x: p.u., shape (ticks,).
+        T_s: sampling time, s.
+        f_n: nominal frequency, Hz.
+    """
+    window = x[: round(LONGEST / T_s)]
+    slow = _means(window, cycle_ticks(T_s, f_n))
+    stride = max(1, len(slow) // _SAMPLES)
+    thin = _thinned(slow, stride)
+    longest = _HALF / max(len(thin) * stride * T_s, T_s)
+    return _strongest(thin, stride * T_s, (longest, 0.5 * f_n), _LEAST, 0.0)
+
+
+def fast_mode(x: Vector, T_s: float, f_n: float) -> Mode | None:
+    """The strongest oscillation above f_n/2 in the first 2 s of x; None without one.
+
+    It is sought around the largest line of the spectrum. Args as for ``swing``.
+    """
+    window = x[: round(LONGEST / T_s)]
+    width = cycle_ticks(T_s, f_n)
+    rest = _without_means(_without_means(window, width), width)  # a swing leaves 1e-4 of itself
+    if len(rest) < _FEW:
+        return None
+    spectrum = np.abs(np.fft.rfft(rest * np.hanning(len(rest))))
+    lines = np.fft.rfftfreq(len(rest), T_s)
+    spectrum[lines < 0.5 * f_n] = 0.0
+    hertz = max(float(lines[np.argmax(spectrum)]), 0.5 * f_n)
+    stride = 1 << max(0, int(np.log2(1.0 / (_A_PERIOD * hertz * T_s))))  # so that filters are few
+    ticks = (_FAST_SAMPLES + _TAPS) * stride
+    grows = 2 * int(np.argmax(np.abs(rest))) > len(rest)  # then the end shows it best
+    thin = _thinned(rest[-ticks:] if grows else rest[:ticks], stride)
+    band = (0.5 * f_n, np.inf)
+    return _strongest(thin[:_FAST_SAMPLES], stride * T_s, band, _LEAST_FAST, _SHARE)
+
+
+def _without_means(x: Vector, width: float) -> Vector:
+    """What the mean of the cycle around each tick leaves; empty without a whole cycle."""
+    slow = _means(x, width)
+    middle = (whole_ticks(width) - 1) // 2
+    return x[middle : middle + len(slow)] - slow
+
+
+def _means(x: Vector, width: float) -> Vector:
+    return np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), width)])
+
+
+def _thinned(x: Vector, stride: int) -> Vector:
+    """Every ``stride``-th sample of x after a low-pass at 0.8 of their Nyquist frequency.
+
+    The filter is one-sided, its weight on the earliest ticks of each window: what decays within a
+    few ticks is still seen.
+    """
+    if stride == 1 or len(x) <= _TAPS * stride:
+        return x
+    return oaconvolve(x, _filter(stride), "valid")[::stride]
+
+
+@cache
+def _filter(stride: int) -> Vector:
+    """Coefficients, latest tick of a window first as a convolution takes them."""
+    taps = _TAPS * stride + 1
+    least = minimum_phase(firwin(taps, 0.8 / stride), n_fft=32 * taps, half=False)
+    return np.asarray(least[::-1] / least.sum())
+
+
+def _strongest(
+    x: Vector, h: float, band: tuple[float, float], least: float, share: float
+) -> Mode | None:
+    """The mode in a band [Hz] that contributes the most energy to x, sampled every h s; None if its
+    amplitude is below ``least`` p.u. or its energy below a ``share`` of that of x.
+
+    Poles are those of the shifted signal subspace (Hua and Sarkar, 1990).
+    """
+    if len(x) < _FEW:
+        return None
+    x = x - np.mean(x[-max(1, len(x) // 10) :])
+    if not np.max(np.abs(x)) >= least:
+        return None
+    hankel = np.lib.stride_tricks.sliding_window_view(x, len(x) // 3 + 1)
+    _, weight, modes = np.linalg.svd(hankel, full_matrices=False)
+    rank = min(_RANK, int(np.sum(weight > 1e-3 * weight[0])))
+    subspace = modes[:rank].T
+    z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
+    z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
+    s = np.log(z.astype(complex)) / h
+    powers = np.exp(np.outer(np.arange(len(x)) * h, s))
+    amplitude = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
+    energy = np.sum(np.abs(powers * amplitude) ** 2, axis=0) * h
+    hertz = s.imag / (2 * np.pi)
+    enough = (np.abs(amplitude) > least) & (2 * energy > share * np.sum(x**2) * h)  # with its twin
+    found = np.flatnonzero((hertz > band[0]) & (hertz < band[1]) & enough)
+    if not len(found):
+        return None
+    k = found[np.argmax(energy[found])]
+    return Mode(float(-s[k].real / abs(s[k])), float(hertz[k]))

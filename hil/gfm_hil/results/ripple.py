@@ -1,0 +1,136 @@
+"""Whether a run that lasted still oscillates at its end.
+
+The ripple of a signal is the peak-to-peak value of its strongest sinusoid, so that noise, which is
+spread over all frequencies, counts for little. It is judged over the last second, or, if less time
+has passed since the last disturbance, over the second half of that time: what a disturbance set
+going has had as long to die away before. A ripple that has halved since the stretch before, of the
+same length, is dying away, and one that the last half of the stretch does not show was a step. An
+unbalance of the grid that is still there explains the even multiples of the grid's frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+from scipy.signal import detrend
+
+from gfm_hil.recording.columns import Columns
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.scenario.events import GridUnbalance
+from gfm_hil.scenario.model import Scenario
+
+_SIGNALS = {"p": "p", "V": "V", "omega_u": "omega_u", "i": "|i|"}
+_SPAN = 1.0  # s at the end that are judged, at most
+_LEAST = 0.1  # s, at least: five cycles
+_SLOWEST = 2.0  # periods in a span: a slower swing looks like a trend
+_NEAR = 2.5  # lines of the spectrum on each side over which a sinusoid spreads
+_NOISE = 50.0  # of a sensor's standard deviation; the rig's ripple is up to 36 times that
+_EQUAL = GridUnbalance(type="grid-unbalance", tick=0).label()
+
+
+class Ripple(NamedTuple):
+    """What still moves at the end of a run.
+
+    Attributes:
+        pu: peak to peak of the strongest sinusoid by signal, p.u.
+        hz: its frequency by signal, Hz.
+        span_s: the stretch at the end that was judged, s.
+        limit: above which a signal oscillates, p.u.
+        oscillates: a signal beyond the limit that is not dying away; "" without one.
+    """
+
+    pu: dict[str, float]
+    hz: dict[str, float]
+    span_s: float
+    limit: float
+    oscillates: str
+
+    def words(self) -> str:
+        """Signal, value, frequency, limit and stretch."""
+        name = self.oscillates
+        return (
+            f"still oscillating: {_SIGNALS[name]} by {self.pu[name]:.3g} p.u. peak to peak at "
+            f"{self.hz[name]:.4g} Hz > {self.limit:g} p.u. in the last {self.span_s:.3g} s"
+        )
+
+
+def remaining_ripple(
+    scenario: Scenario, signals: Columns, log: Sequence[dict[str, Any]], done: int
+) -> Ripple | None:
+    """The ripple at the end of a run; None if the run was at rest for less than 0.2 s.
+
+    Args:
+        scenario: of the run; its ``expect_ripple`` is the limit, unless the noise of its sensors
+            explains more.
+        signals: columns with true_p, true_V, true_omega_u, true_i and true_omega_g, p.u.
+        log: every line of the run's log.
+        done: ticks recorded.
+    """
+    T_s = scenario.T_s
+    rest = (done - _last_disturbance(scenario, log, done)) * T_s
+    span = min(_SPAN, 0.5 * rest)
+    n = round(span / T_s)
+    if span < _LEAST - 0.5 * T_s or n < 20:
+        return None
+    explained = _even_multiples(scenario, signals, log, done)
+    limit = max(
+        scenario.expect_ripple,
+        _NOISE * max(scenario.plant.sensors.noise_std.values(), default=0.0),
+    )
+    size, hertz, worst = {}, {}, ""
+    for name in _SIGNALS:
+        column = signals[f"true_{name}"]
+        size[name], hertz[name] = _sinusoid(np.asarray(column[done - n : done]), T_s, explained)
+        if size[name] <= max(limit, size.get(worst, 0.0)):
+            continue
+        if np.ptp(detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
+            continue
+        if done >= 2 * n:
+            before, _ = _sinusoid(np.asarray(column[done - 2 * n : done - n]), T_s, explained)
+            if size[name] <= 0.5 * before:
+                continue
+        worst = name
+    return Ripple(size, hertz, n * T_s, limit, worst)
+
+
+def _last_disturbance(scenario: Scenario, log: Sequence[dict[str, Any]], done: int) -> int:
+    """The tick at which the last event of a run, planned or an operator's, was over; a run without
+    events is judged as a whole, for it begins at rest."""
+    happened = [e["tick"] for e in log if "label" in e or e["event"] == "recovered"]
+    over = [e.at(scenario.T_s) + round(e.lasts() / scenario.T_s) for e in scenario.events]
+    return max([*happened, *over], default=-done)
+
+
+def _even_multiples(
+    scenario: Scenario, signals: Columns, log: Sequence[dict[str, Any]], done: int
+) -> list[float]:
+    """Frequencies, Hz, that an unbalance in force explains."""
+    last = next((e for e in reversed(log) if e["event"] == "grid-unbalance"), None)
+    if last is None or last["label"] == _EQUAL:
+        return []
+    for e in scenario.events:
+        over = isinstance(e, GridUnbalance) and e.duration is not None
+        if over and e.at(scenario.T_s) == last["tick"]:
+            return []
+    f_g = float(signals["true_omega_g"][done - 1 : done][0]) * nominal_frequency(scenario)
+    return [2 * f_g, 4 * f_g]
+
+
+def _sinusoid(x: NDArray[Any], T_s: float, explained: Sequence[float]) -> tuple[float, float]:
+    """Peak-to-peak value and frequency [Hz] of the strongest sinusoid in x, beside those of the
+    ``explained`` frequencies."""
+    n = len(x)
+    window = np.hanning(n)
+    length = next_fast_len(2 * n, real=True)  # lines half as far apart: it falls on none by 4 %
+    spectrum = np.abs(np.fft.rfft(detrend(x) * window, length))
+    lines = np.fft.rfftfreq(length, T_s)
+    apart = 1.0 / (n * T_s)
+    spectrum[lines < _SLOWEST * apart] = 0.0
+    for f in explained:
+        spectrum[np.abs(lines - f) < _NEAR * apart] = 0.0
+    k = int(np.argmax(spectrum))
+    return float(4.0 * spectrum[k] / window.sum()), float(lines[k])

@@ -1,0 +1,21 @@
+from .check import OPTIMISED, TARGETS, Checked, check
+from .folder import REALS, STYLES, export
+from .golden import CHECKED, SHIPPED, Golden, golden
+from .module import Module, Style, make_modules
+
+__all__ = [
+    "CHECKED",
+    "OPTIMISED",
+    "REALS",
+    "SHIPPED",
+    "STYLES",
+    "TARGETS",
+    "Checked",
+    "Golden",
+    "Module",
+    "Style",
+    "check",
+    "export",
+    "golden",
+    "make_modules",
+]

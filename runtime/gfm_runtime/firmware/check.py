@@ -1,0 +1,230 @@
+"""Builds a firmware folder for a target, runs it, and compares every bit with the kernel's.
+
+A target is a compiler and, for a bare processor, a machine of QEMU (system emulation, semihosting).
+Under ``-icount`` QEMU's clock counts instructions, so their number is the same in every run.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from gfm_runtime.errors import LawError
+from gfm_runtime.firmware.golden import CHECKED, golden
+from gfm_runtime.firmware.report import read_report
+
+_HARNESS = files("gfm_runtime.firmware").joinpath("harness")
+#: also what CMakeLists.txt gives; sqrt is one instruction without errno
+FLAGS = ("-std=c99", "-ffp-contract=off", "-fno-math-errno")
+OPTIMISED = "-O2"
+_SHIFT = 10  # one instruction takes 2^10 ns of QEMU's time: many ticks of the board's timer
+_QEMU = (
+    "-display", "none", "-monitor", "none", "-serial", "none",
+    "-semihosting-config", "enable=on,target=native",
+    "-icount", f"shift={_SHIFT},align=off,sleep=off",
+)  # fmt: skip
+_TIMEOUT_S = 300
+
+
+@dataclass(frozen=True)
+class Target:
+    """A compiler and where its programs run.
+
+    Attributes:
+        what: in words.
+        prefix: of the compiler and its tools.
+        compiler: the compiler's name after the prefix.
+        packages: from apt, for the compiler and the machine.
+        flags: for the processor.
+        link: for the linker.
+        machine: QEMU's command, or () for this machine.
+        tick_ns: of the clock that counts instructions.
+    """
+
+    what: str
+    prefix: str
+    compiler: str
+    packages: str
+    flags: tuple[str, ...] = ()
+    link: tuple[str, ...] = ()
+    machine: tuple[str, ...] = ()
+    tick_ns: int = 0
+
+
+def _cortex(cpu: str, fpu: str, machine: str, what: str) -> Target:
+    return Target(
+        what,
+        "arm-none-eabi-",
+        "gcc",
+        "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm",
+        (f"-mcpu={cpu}", "-mthumb", f"-mfpu={fpu}", "-mfloat-abi=hard"),
+        ("-nostartfiles", "-T", str(_HARNESS.joinpath("arm.ld")), "-lm"),
+        ("qemu-system-arm", "-machine", machine),
+        40,
+    )
+
+
+TARGETS = {
+    "host": Target("this machine, gcc", "", "gcc", "gcc libc6-dev", link=("-lm",)),
+    "clang": Target("this machine, clang", "", "clang", "clang libc6-dev", link=("-lm",)),
+    "m4f": _cortex("cortex-m4", "fpv4-sp-d16", "mps2-an386", "Cortex-M4F in QEMU"),
+    "m7": _cortex("cortex-m7", "fpv5-d16", "mps2-an500", "Cortex-M7 in QEMU"),
+    "rv64": Target(
+        "RISC-V rv64gc in QEMU",
+        "riscv64-unknown-elf-",
+        "gcc",
+        "gcc-riscv64-unknown-elf picolibc-riscv64-unknown-elf qemu-system-misc",
+        ("-march=rv64gc", "-mabi=lp64d", "-mcmodel=medany", "--specs=picolibc.specs"),
+        ("-nostartfiles", "-T", str(_HARNESS.joinpath("riscv.ld")), "-lm"),
+        ("qemu-system-riscv64", "-machine", "virt", "-bios", "none"),
+        1,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a law gave on a target.
+
+    Attributes:
+        name: the law.
+        rows: golden rows that it was stepped through.
+        differ: words of outputs and state, over all rows, that are not the kernel's.
+        instructions: fewest and most of a step, or None where they are not counted.
+        code, constants: bytes of the law's object file.
+        state: bytes of one instance.
+        stack: bytes that a step needs at most, or None where the compiler does not say.
+    """
+
+    name: str
+    rows: int
+    differ: int
+    instructions: tuple[int, int] | None
+    code: int
+    constants: int
+    state: int
+    stack: int | None
+
+
+def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKED) -> list[Checked]:
+    """Build, run and compare a folder that ``export`` wrote.
+
+    Args:
+        folder: with report.json and the sources.
+        target: one of ``TARGETS``.
+        flags: more for the compiler, e.g. ``"-O3"``.
+        ticks: golden rows of each law.
+
+    Raises:
+        LawError: no such folder, a missing tool (the apt package is named), a build that fails, or
+            a program that does not end as it should.
+    """
+    found, where = read_report(folder), TARGETS[target]
+    for tool in (where.prefix + where.compiler, where.prefix + "size", *where.machine[:1]):
+        if shutil.which(tool) is None:
+            raise LawError(
+                f"target {target}", f"{tool} is not there; apt-get install {where.packages}"
+            )
+    rows = golden(found.modules, ticks)
+    with tempfile.TemporaryDirectory(prefix="gfmhil-firmware-") as work:
+        at = Path(work)
+        (at / "golden.bin").write_bytes(
+            rows.words.astype(rows.words.dtype.newbyteorder("<")).tobytes()
+        )
+        names = [m.prefix for m in found.modules]
+        names += ["gfm"] * (found.style == "records")
+        _build(folder.resolve(), at, where, names, flags)
+        said = _run([*where.machine, *(_QEMU if where.machine else ())], at, bool(where.machine))
+        out = []
+        for k, m in enumerate(found.modules):
+            line = re.search(rf"^law {k} (\d+) (\d+) (\d+) (\d+) (\d+)$", said, re.MULTILINE)
+            if line is None:
+                raise LawError(f"target {target}", f"the program said no result of {m.name}")
+            counted, differ, least, most, state = map(int, line.groups())
+            instructions = None
+            if where.tick_ns:
+                least, most = (round(t * where.tick_ns / 2**_SHIFT) for t in (least, most))
+                instructions = least, most
+            step = "gfm" if found.style == "records" else m.prefix
+            code, constants = _sections(at, where, {step, m.prefix})
+            out.append(
+                Checked(
+                    m.name,
+                    counted,
+                    differ,
+                    instructions,
+                    code,
+                    constants,
+                    state,
+                    _stack(at / f"{step}.su", f"{step}_step"),
+                )
+            )
+        return out
+
+
+def _build(folder: Path, at: Path, where: Target, names: Sequence[str], flags: str) -> None:
+    compiler = [where.prefix + where.compiler, *FLAGS, *where.flags, *shlex.split(flags)]
+    own = [str(folder / f"{name}.c") for name in names]
+    _call([*compiler, "-fstack-usage", f"-I{folder}", "-c", *own], at)
+    rest = [str(folder / "selftest.c"), str(_HARNESS.joinpath("harness.c"))]
+    hooks = ["-DGOLDEN_NO_MAIN", "-DGOLDEN_CLOCK=clock_now"]
+    _call([*compiler, "-std=gnu99", *hooks, f"-I{folder}", "-c", *rest], at)
+    objects = [f"{name}.o" for name in (*names, "selftest", "harness")]
+    _call([*compiler, *objects, "-o", "check.elf", *where.link], at)
+
+
+def _run(machine: Sequence[str], at: Path, bare: bool) -> str:
+    command = [*machine, "-kernel", "check.elf"] if bare else ["./check.elf"]
+    return _call(command, at)
+
+
+def _call(command: Sequence[str], at: Path) -> str:
+    """Run a program in a folder; what it says.
+
+    Raises:
+        LawError: it fails, or takes too long.
+    """
+    try:
+        done = subprocess.run(
+            command, cwd=at, capture_output=True, text=True, check=False, timeout=_TIMEOUT_S,
+            stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise LawError(command[0], f"has not ended after {_TIMEOUT_S} s") from None
+    said = done.stdout + done.stderr
+    if done.returncode:
+        errors = [line for line in said.splitlines() if "error" in line] or said.splitlines()
+        raise LawError(command[0], f"failed: {next(iter(errors), f'code {done.returncode}')}")
+    return said
+
+
+def _sections(at: Path, where: Target, names: set[str]) -> tuple[int, int]:
+    """Bytes of code and of constants of object files."""
+    said = _call([where.prefix + "size", "-A", *(f"{name}.o" for name in sorted(names))], at)
+    code = constants = 0
+    for section, size in re.findall(r"^(\.\S+)\s+(\d+)\s", said, re.MULTILINE):
+        if section.startswith(".text"):
+            code += int(size)
+        elif section.startswith((".rodata", ".srodata")):
+            constants += int(size)
+    return code, constants
+
+
+def _stack(usage: Path, step: str) -> int | None:
+    """Bytes of stack: those of the step and of all functions of the file that are not public."""
+    if not usage.exists():
+        return None
+    prefix, total = step.removesuffix("step"), 0
+    for line in usage.read_text(encoding="utf-8").splitlines():
+        place, size, _ = line.split("\t")
+        function = place.rsplit(":", 1)[-1]
+        if function == step or not function.startswith(prefix):
+            total += int(size)
+    return total

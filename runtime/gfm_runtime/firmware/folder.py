@@ -1,0 +1,113 @@
+"""The folder that ``gfmhil firmware export`` writes: sources, golden vectors, self-test, report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+import numpy as np
+
+from gfm_runtime.error_maps import HYBRID_ANGLE
+from gfm_runtime.firmware.c_text import filled, template
+from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
+from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
+from gfm_runtime.firmware.report import reports
+from gfm_runtime.law import Law
+
+REALS = ("float32", "float64")
+STYLES: tuple[Style, ...] = get_args(Style)
+
+
+def export(laws: Mapping[str, Law], T_s: float, real: str, style: Style) -> dict[str, str]:
+    """The files of a firmware folder by name.
+
+    Args:
+        laws: the laws by name; a change between any two of them is bumpless.
+        T_s: sampling time, s.
+        real: one of ``REALS``.
+        style: one of ``STYLES``, see ``gfm_runtime.firmware.module``.
+
+    Raises:
+        LawError: as ``make_modules``.
+    """
+    modules = make_modules(laws, T_s, real)
+    rows = golden(modules, SHIPPED)
+    return {
+        **sources(modules, T_s, style),
+        **selftest(modules, style),
+        "golden.h": _golden_header(rows, np.dtype(real)),
+        "golden.csv": rows.csv(),
+        "CMakeLists.txt": _cmake(modules, style),
+        **reports(modules, T_s, style),
+    }
+
+
+def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
+    """selftest.h and selftest.c."""
+    adapters, table, names, sizes = [], [], [], []
+    parts = ("init", "reset", "step", "look", "settle", "change", "view")
+    for m in modules:
+        own = style == "unrolled"
+        keys = {
+            "P": m.prefix,
+            "T": m.prefix if own else "gfm",
+            "ARGUMENT": "" if own else f"&{m.prefix}_law, ",
+            "N": str(m.n),
+        }
+        adapters.append(filled(template("adapter.c"), keys))
+        table.append("    {" + ", ".join(f"{m.prefix}_do_{part}" for part in parts) + "},")
+        names.append(f'    "{m.prefix}",')
+        sizes.append(f"    sizeof({keys['T']}_t),")
+    states = max([1, *(m.n for m in modules)])
+    keys = {
+        "MADE": MADE,
+        **C_TYPES[str(modules[0].real)],
+        "LAWS": str(len(modules)),
+        "NX": str(states),
+        "WORDS": str(len(columns(states))),
+        "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),
+        "ADAPTERS": "".join(adapters).rstrip("\n") + "\n",
+        "TABLE": "\n".join(table),
+        "NAMES": "\n".join(names),
+        "SIZES": "\n".join(sizes),
+    }
+    return {name: filled(template(name), keys) for name in ("selftest.h", "selftest.c")}
+
+
+def _golden_header(rows: Golden, real: np.dtype[Any]) -> str:
+    bits = 8 * real.itemsize
+    suffix = "U" if bits == 32 else "ULL"
+    lines = [
+        "    {" + ",".join(f"0x{w:x}{suffix}" for w in row) + "}," for row in rows.words.tolist()
+    ]
+    return "\n".join(
+        [
+            f"/* {MADE} Words of a row: {', '.join(rows.columns)}. */",
+            "#ifndef GFM_GOLDEN_H",
+            "#define GFM_GOLDEN_H",
+            "",
+            "#include <stdint.h>",
+            "",
+            f"enum {{ GOLDEN_ROWS = {len(rows.words)} }};",
+            "",
+            f"static const uint{bits}_t golden[][{len(rows.columns)}] = {{",
+            *lines,
+            "};",
+            "",
+            "#endif",
+            "",
+        ]
+    )
+
+
+def _cmake(modules: Sequence[Module], style: Style) -> str:
+    names = [f"{m.prefix}.c" for m in modules] + ["gfm.c"] * (style == "records")
+    root = style == "records" or any(needs_sqrt(m) for m in modules)
+    keys = {"MADE": MADE, "SOURCES": " ".join(names), "LIBM": " m" if root else ""}
+    return re.sub(r"@(MADE|SOURCES|LIBM)@", lambda f: keys[f[1]], template("CMakeLists.txt"))
+
+
+def needs_sqrt(m: Module) -> bool:
+    """Whether a law's unrolled step takes a square root."""
+    return int(m.record["error_map"]) == HYBRID_ANGLE

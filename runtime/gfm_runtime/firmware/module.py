@@ -1,0 +1,301 @@
+"""The C modules of a set of laws: one header and one source for each, in one of two styles.
+
+* ``unrolled``: each law is a module of its own with its constants in the code.
+* ``records``: each law is a constant record (``gfm_<law>_law``) for the generic step of
+  ``gfm.h`` and ``gfm.c``. Firmware that changes gains while it runs keeps such a record in RAM.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, HYBRID_ANGLE, R_MIN, V_MIN
+from gfm_runtime.errors import LawError
+from gfm_runtime.firmware.c_text import filled, identifier, literal, literals, plain, template
+from gfm_runtime.firmware.unrolled import Unrolled
+from gfm_runtime.inner import NEGLIGIBLE
+from gfm_runtime.kernel import pack_law
+from gfm_runtime.law import Law
+from gfm_runtime.signals import TABLE_VERSION, Signal, group, table_hash
+from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
+from gfm_runtime.tustin import discretise
+
+MADE = "Made by gfmhil firmware export; do not edit."
+
+Style = Literal["unrolled", "records"]
+
+#: what a step returns; the bench's scenario refuses a reference out of range before it gets here
+BAD_REF = len(REASONS)
+RESULTS = {
+    "OK": (OK, "runs"),
+    "BAD_Y": (BAD_Y, REASONS[BAD_Y]),
+    "BAD_U": (BAD_U, REASONS[BAD_U]),
+    "BAD_REF": (BAD_REF, "a reference is not finite or out of range"),
+}
+#: by precision, what the templates say of the C type
+C_TYPES = {
+    "float32": {"C_REAL": "float", "BITS": "32", "DIG": "FLT_MANT_DIG", "MANTISSA": "24"},
+    "float64": {"C_REAL": "double", "BITS": "64", "DIG": "DBL_MANT_DIG", "MANTISSA": "53"},
+}
+#: fields of a law's record that are integers, and those in its precision
+INTEGERS = ("n", "error_map")
+NUMBERS = (
+    "error_parameters", "A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "loop", "low", "high",
+    "W", "decay", "follow", "E_r", "E_y", "F", "G",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Module:
+    """A law on its way to C.
+
+    Attributes:
+        name: the law's name, with its stage if it has several.
+        law: the law itself; None for one that was read back from a report.
+        record: the law as ``pack_law`` gives it.
+    """
+
+    name: str
+    law: Law | None
+    record: np.void
+
+    @property
+    def prefix(self) -> str:
+        """What the names of its module begin with, e.g. ``gfm_vsg_1``."""
+        return f"gfm_{identifier(self.name)}"
+
+    @property
+    def n(self) -> int:
+        """States of the law."""
+        return int(self.record["n"])
+
+    @property
+    def real(self) -> np.dtype[Any]:
+        """float32 or float64."""
+        return np.dtype(self.record["u_0"].dtype)
+
+
+def make_modules(laws: Mapping[str, Law], T_s: float, real: DTypeLike) -> list[Module]:
+    """The laws by name, discretised at T_s [s] and packed in float32 or float64.
+
+    Raises:
+        LawError: a law that does not discretise, one with an inner stage, a name without a letter,
+            or two names that are the same in C.
+    """
+    for name, law in laws.items():
+        if law.inner is not None:
+            raise LawError(f"law {name!r}", "has an inner stage, which has no C code yet")
+    modules = [
+        Module(name, law, pack_law(discretise(law, T_s), real)[0]) for name, law in laws.items()
+    ]
+    taken: dict[str, str] = {}
+    for module in modules:
+        if module.prefix == "gfm_":
+            raise LawError(f"law {module.name!r}", "its name has no letter or digit for C")
+        if module.prefix in taken:
+            other = taken[module.prefix]
+            raise LawError(f"law {module.name!r}", f"{other!r} has the same name in C")
+        taken[module.prefix] = module.name
+    return modules
+
+
+def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
+    """The headers and sources by file name."""
+    if style == "unrolled":
+        return {
+            f"{m.prefix}{end}": text
+            for m in modules
+            for end, text in ((".h", _header(m, T_s)), (".c", _unrolled(m)))
+        }
+    states = max([1, *(m.n for m in modules)])
+    real = modules[0].real
+    common = _keys("gfm", real, states) | {"TYPES": filled(template("records.h"), {})}
+    common |= {"LAW": "const gfm_law_t *law, ", "law": "law, ", "LOOP": "law->loop"}
+    common["TICK"] = "".join(
+        f"    real {name}[{size}]; /* {text} */\n"
+        for name, size, text in (
+            ("ref", "GFM_NREF", "references as given"),
+            ("r", "GFM_NREF", "references after the error map"),
+            ("y", "GFM_NY", "measurements after the error map; omega_u is the law's own"),
+        )
+    )
+    maps = [name for name, code in ERROR_MAPS.items() if code]
+    body = _maps(maps, real) + filled(template("records.c"), _codes())
+    out = {
+        "gfm.h": f"/* The generic step of a law. {MADE} */\n"
+        + filled(template("interface.h"), common),
+        "gfm.c": filled(template("shell_top.c"), common)
+        + body
+        + filled(template("shell_end.c"), common),
+    }
+    for m in modules:
+        guard = f"{m.prefix.upper()}_H"
+        out[f"{m.prefix}.h"] = "\n".join(
+            [
+                _about(m, T_s),
+                f"#ifndef {guard}",
+                f"#define {guard}",
+                "",
+                '#include "gfm.h"',
+                "",
+                f"extern const gfm_law_t {m.prefix}_law;",
+                "",
+                "#endif",
+                "",
+            ]
+        )
+        out[f"{m.prefix}.c"] = (
+            f'#include "{m.prefix}.h"\n\nconst gfm_law_t {m.prefix}_law = {_record(m, states)};\n'
+        )
+    return out
+
+
+def _header(m: Module, T_s: float) -> str:
+    keys = _keys(m.prefix, m.real, m.n) | {"TYPES": "", "LAW": "", "law": ""}
+    return _about(m, T_s) + "\n" + filled(template("interface.h"), keys).replace("\n\n\n", "\n")
+
+
+def _unrolled(m: Module) -> str:
+    loop = literal(m.record["loop"], m.real)
+    keys = _keys(m.prefix, m.real, m.n) | {"LAW": "", "law": "", "LOOP": loop}
+    used = [name for name, code in ERROR_MAPS.items() if code and code == m.record["error_map"]]
+    keys["TICK"] = Unrolled(m.record).tick()
+    return (
+        filled(template("shell_top.c"), keys)
+        + _maps(used, m.real)
+        + Unrolled(m.record).text(m.prefix)
+        + "\n"
+        + filled(template("shell_end.c"), keys)
+    )
+
+
+def _about(m: Module, T_s: float) -> str:
+    """The comment at the top: the law, its source, its parameters with units and sources."""
+    lines = [f"{m.name}. {MADE}", ""]
+    if m.law is not None:
+        lines[0] = f"{m.name}: {m.law.title}. {MADE}"
+        lines += [f"Source: {m.law.source}", f"Errors: {m.law.error_map}. Parameters:"]
+        lines += [
+            f"  {name} = {p.value:g} {p.unit} ({p.source})" for name, p in m.law.parameters.items()
+        ]
+        lines += [
+            f"Limits of (i_u, omega_u, E_u): {m.law.limits.low} to {m.law.limits.high} p.u.; "
+            f"anti-windup T_t = {m.law.limits.T_t:g} s, bumpless change T_off = "
+            f"{m.law.limits.T_off:g} s"
+        ]
+    lines += [
+        f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.real}.",
+        "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
+    ]
+    return "/* " + "\n * ".join(_wrapped(lines)) + "\n */"
+
+
+def _wrapped(lines: Sequence[str], width: int = 96) -> list[str]:
+    out: list[str] = []
+    for line in lines:
+        indent = line[: len(line) - len(line.lstrip())]
+        out += textwrap.wrap(
+            plain(line), width, initial_indent=indent, subsequent_indent=indent + "    "
+        ) or [""]
+    return [line.rstrip() for line in out]
+
+
+def _keys(prefix: str, real: np.dtype[Any], n: int) -> dict[str, str]:
+    """What the templates of a module ask for."""
+    y, u, ref = group("y"), group("u"), group("ref")
+    guard = prefix.upper()
+    rows = []
+    for letter, signals in (("REF", ref), ("Y", y), ("U", u)):
+        members = [
+            f"    {guard}_{letter}_{s.name.upper()}, /* {s.description}, {s.unit} of {s.base}, "
+            f"{s.low:g} to {s.high:g} */"
+            for s in signals
+        ]
+        rows += ["enum {", *members, f"    {guard}_N{letter}", "};", ""]
+    rows.append(f"enum {{ {guard}_NX = {max(1, n)} }};")
+    where = f"/* The signal table of gfmhil, version {TABLE_VERSION} ({table_hash()}): the order of"
+    return {
+        "P": prefix,
+        "GUARD": guard,
+        **C_TYPES[str(real)],
+        "SIGNALS": "\n".join([where, " * ref, y and u. */", *rows]),
+        "REASONS": _enumerators(guard),
+        "Y_CHECKS": _checks("y", y, real),
+        "REF_CHECKS": _checks("ref", ref, real),
+        "fabs": "fabsf" if real == np.float32 else "fabs",
+        "U_DEFAULT": literals([s.default for s in u], real),
+        "NEGLIGIBLE": literal(NEGLIGIBLE, real),
+    }
+
+
+def _enumerators(guard: str) -> str:
+    rows = [f"    {guard}_{name} = {code}" for name, (code, _) in RESULTS.items()]
+    ends = [","] * (len(rows) - 1) + [""]
+    texts = [text for _, text in RESULTS.values()]
+    return "\n".join(
+        f"{row}{end} /* {text} */" for row, end, text in zip(rows, ends, texts, strict=True)
+    )
+
+
+def _checks(vector: str, signals: Sequence[Signal], real: np.dtype[Any]) -> str:
+    """An expression up to its last colon: the first signal that is NaN or out of range."""
+    lines = []
+    for j, s in enumerate(signals):
+        low, high, value = literal(s.low, real), literal(s.high, real), f"{vector}[{j}]"
+        inside = f"{value} >= {low} && {value} <= {high}"
+        if s.low == -s.high:
+            inside = f"{'fabsf' if real == np.float32 else 'fabs'}({value}) <= {high}"
+        lines.append(f"!({inside}) ? {j}")
+    return "\n             : ".join(lines)
+
+
+def _codes() -> dict[str, str]:
+    return {
+        "DC_ENERGY": str(DC_ENERGY),
+        "DVOC": str(DVOC),
+        "HYBRID_ANGLE": str(HYBRID_ANGLE),
+    }
+
+
+def _maps(names: Sequence[str], real: np.dtype[Any]) -> str:
+    """The C functions of the error maps that a module needs."""
+    numbers = {"0.5": 0.5, "V_MIN": V_MIN, "R_MIN": R_MIN}
+    keys = {key: literal(value, real) for key, value in numbers.items()}
+    end = "f" if real == np.float32 else ""
+    keys |= {"sqrt": f"sqrt{end}", "fabs": f"fabs{end}"}
+    _, *parts = template("maps.c").split("/* @map ")
+    by_name = dict(part.split("@ */\n", 1) for part in parts)
+    return "".join(filled(by_name[name], keys) for name in names)
+
+
+def _record(m: Module, states: int) -> str:
+    """A law's record as an initialiser, for a generic step with room for ``states``."""
+    lines = ["{"]
+    for field in (*INTEGERS, *NUMBERS):
+        value = m.record[field]
+        number = field in INTEGERS
+        text = str(int(value)) if number else _braced(_cut(field, value, states), m.real)
+        lines.append(f"    .{field} = {text},")
+    return "\n".join([*lines, "}"])
+
+
+def _cut(field: str, value: NDArray[Any], states: int) -> NDArray[Any]:
+    if field == "A":
+        return value[:states, :states]
+    if field == "C":
+        return value[:, :states]
+    return value[:states] if field in ("B_r", "B_y", "W", "E_r", "E_y", "F", "G") else value
+
+
+def _braced(value: NDArray[Any], real: np.dtype[Any]) -> str:
+    if value.ndim == 0:
+        return literal(value, real)
+    if value.ndim == 1:
+        return "{" + literals(value, real) + "}"
+    return "{\n        " + ",\n        ".join(_braced(row, real) for row in value) + "}"

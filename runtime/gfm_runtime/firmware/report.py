@@ -1,0 +1,194 @@
+"""report.json and report.md of a firmware folder: what was exported, and what a step costs.
+
+report.json also holds each law's record as hexadecimal numbers. ``read_report`` makes the record
+anew from them, so that ``gfmhil firmware check`` needs no law file.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
+from gfm_runtime.errors import LawError
+from gfm_runtime.firmware.c_text import literal, template
+from gfm_runtime.firmware.module import INTEGERS, NUMBERS, Module, Style
+from gfm_runtime.firmware.unrolled import Unrolled
+from gfm_runtime.kernel import law_dtype
+from gfm_runtime.signals import NU, NY, group, table_hash
+
+FORMAT = 1  # of report.json
+
+
+class Exported(NamedTuple):
+    """What a firmware folder holds."""
+
+    modules: list[Module]
+    real: str
+    style: Style
+    T_s: float
+
+
+def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
+    """report.json and report.md."""
+    laws = [
+        {
+            "name": m.name,
+            "prefix": m.prefix,
+            "title": m.law.title if m.law else "",
+            "source": " ".join(m.law.source.split()) if m.law else "",
+            "states": m.n,
+            "bytes": sizes(m, style),
+            "operations": operations(m, style),
+            "record": {name: _hex(m.record[name]) for name in (*INTEGERS, *NUMBERS)},
+        }
+        for m in modules
+    ]
+    real = str(modules[0].real)
+    whole = {
+        "format": FORMAT,
+        "signal_table": table_hash(),
+        "T_s": T_s,
+        "real": real,
+        "style": style,
+        "laws": laws,
+    }
+    return {
+        "report.json": json.dumps(whole, indent=1, ensure_ascii=False) + "\n",
+        "report.md": _page(laws, T_s, real, style),
+    }
+
+
+def read_report(folder: Path) -> Exported:
+    """What ``report.json`` of a folder says.
+
+    Raises:
+        LawError: there is none, or it is not of this format.
+    """
+    path = folder / "report.json"
+    try:
+        whole = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise LawError(str(path), "is not there; gfmhil firmware export writes it") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as problem:
+        raise LawError(str(path), f"is not JSON: {problem}") from None
+    try:
+        if whole["format"] != FORMAT:
+            raise LawError(str(path), f"format {whole['format']!r} must be {FORMAT}")
+        dtype = law_dtype(whole["real"])
+        modules = [
+            Module(law["name"], None, _record(law["record"], dtype)) for law in whole["laws"]
+        ]
+        return Exported(modules, whole["real"], whole["style"], whole["T_s"])
+    except (KeyError, TypeError, ValueError) as problem:
+        if isinstance(problem, LawError):
+            raise
+        raise LawError(
+            str(path), f"is not a report of gfmhil firmware export: {problem!r}"
+        ) from None
+
+
+def _hex(value: Any) -> str | int:
+    """Numbers of a precision, in their order, between blanks; or an integer."""
+    if isinstance(value, np.integer):
+        return int(value)
+    return " ".join(literal(v, value.dtype).rstrip("f") for v in np.ravel(value))
+
+
+def _record(fields: Mapping[str, Any], dtype: np.dtype[Any]) -> np.void:
+    out = np.zeros(1, dtype)
+    for name in (*INTEGERS, *NUMBERS):
+        text = fields[name]
+        if name in INTEGERS:
+            out[0][name] = text
+        else:
+            numbers = [float.fromhex(word) for word in text.split()]
+            out[0][name] = np.reshape(numbers, dtype[name].shape)
+    return out[0]
+
+
+def sizes(m: Module, style: Style) -> dict[str, int]:
+    """Bytes of one instance's numbers, and of a law's constants in a step.
+
+    A compiler may keep a constant in its code, or once for several uses; ``gfmhil firmware check``
+    measures what came of it.
+    """
+    state = max(1, m.n) + 3 * NU
+    if style == "records":
+        n, of = m.n, 2 * NY + NU
+        constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
+    else:
+        text = "".join(Unrolled(m.record).step_lines())
+        constants = len(set(re.findall(r"-?0x[\w.]+p[-+]\d+", text)))
+    return {
+        "state": state * m.real.itemsize,
+        "constants": constants * m.real.itemsize,
+    }
+
+
+def operations(m: Module, style: Style) -> dict[str, int]:
+    """Floating-point operations of a step in which all limits clamp, the refusal included."""
+    n = m.n
+    if style == "records":
+        products = NU * (n + 3 * NY - 1) + 3 + NU * n + 2 * NU + n * (2 * NY + n)
+        sums = NU * (n + 3 * NY) + 2 + NU * n + NU + 3 * NU + n * (2 * NY - 1 + n)
+        text, limits, faded, excess = "", NU, 2 * NU + n, NU
+    else:
+        text = "\n".join(Unrolled(m.record).step_lines())
+        products, sums = 0, 0
+        limits, faded, excess = (text.count(part) for part in ("limited(", "faded(", "!= 0"))
+    ranges = sum(1 if s.low == -s.high else 2 for s in (*group("y"), *group("ref")))
+    for name, code in ERROR_MAPS.items():
+        if code and code == m.record["error_map"]:
+            text += template("maps.c").split(f"/* @map {name}@ */\n")[1].split("/* @map")[0]
+    said = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    half_angle = bool(m.record["error_map"] == HYBRID_ANGLE)
+    return {
+        "multiplications": products + said.count(" * "),
+        "additions": sums + len(re.findall(r" \+=? | -=? ", said)) + 2 * NU - 1,
+        "divisions": len(re.findall(r" /=? ", said)),
+        "square_roots": 2 * half_angle,
+        "comparisons": 2 * limits
+        + faded
+        + excess  # whether a limit clamped
+        + len(re.findall(r" [<>]=? ", said))
+        + ranges  # of the inputs
+        + 1,  # whether u is finite
+    }
+
+
+def _page(laws: Sequence[Mapping[str, Any]], T_s: float, real: str, style: str) -> str:
+    rows = [
+        (law["name"], law["states"], *law["bytes"].values(), *law["operations"].values())
+        for law in laws
+    ]
+    heads = ("law", "states", "bytes of state", "bytes of constants", "×", "+ −", "÷", "√",
+             "comparisons")  # fmt: skip
+    return "\n".join(
+        [
+            "# Firmware of gfmhil",
+            "",
+            f"{len(laws)} law{'s' * (len(laws) > 1)} as C99, {real}, style {style}, "
+            f"T_s = {T_s:g} s, signal table {table_hash()}.",
+            "",
+            _line(heads),
+            "|---" * len(heads) + "|",
+            *map(_line, rows),
+            "",
+            "The operations are those of one step in which every limit clamps. "
+            "`gfmhil firmware check` counts instructions, code and stack on a target.",
+            "",
+            "Bits: compile without `-ffast-math` and with `-ffp-contract=off`; `selftest.c` "
+            "compares every output and state with `golden.h`, bit by bit.",
+            "",
+        ]
+    )
+
+
+def _line(cells: Sequence[Any]) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"

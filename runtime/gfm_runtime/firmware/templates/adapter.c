@@ -1,0 +1,44 @@
+static @T@_t @P@_of[2];
+
+static void @P@_do_init(int k)
+{
+    @T@_init(&@P@_of[k]);
+}
+
+static void @P@_do_reset(int k)
+{
+    @T@_reset(&@P@_of[k]);
+}
+
+static int @P@_do_step(int k, const golden_real *ref, const golden_real *y, golden_real *u)
+{
+    unsigned long start = GOLDEN_CLOCK();
+    int result = @T@_step(@ARGUMENT@&@P@_of[k], ref, y, u);
+    golden_elapsed = GOLDEN_CLOCK() - start;
+    return result;
+}
+
+static int @P@_do_look(int k, const golden_real *ref, const golden_real *y, golden_real *u)
+{
+    return @T@_look(@ARGUMENT@&@P@_of[k], ref, y, u);
+}
+
+static int @P@_do_settle(int k, const golden_real *ref, const golden_real *y, golden_real *u,
+    const golden_real *trend)
+{
+    return @T@_settle(@ARGUMENT@&@P@_of[k], ref, y, u, trend);
+}
+
+static int @P@_do_change(int k, const golden_real *ref, const golden_real *y, golden_real *u,
+    const golden_real *trend, golden_real *bump)
+{
+    return @T@_switch(@ARGUMENT@&@P@_of[k], ref, y, u, trend, bump);
+}
+
+static view_t @P@_do_view(int k)
+{
+    const @T@_t *s = &@P@_of[k];
+    const view_t view = {s->x, s->offset, s->u, s->trend, @N@};
+    return view;
+}
+

@@ -1,0 +1,58 @@
+#ifndef @GUARD@_H
+#define @GUARD@_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef @C_REAL@ @P@_real;
+
+@SIGNALS@
+
+/* What step, look, settle and switch return. All but OK is the safe state: the plant must block its
+ * bridge. It is latched: only init and reset leave it. */
+enum {
+@REASONS@
+};
+
+@TYPES@
+
+/* One instance. All that changes is in here, so there may be several. Treat it as read-only. */
+typedef struct {
+    @P@_real x[@GUARD@_NX];      /* states of the law, scaled */
+    @P@_real offset[@GUARD@_NU]; /* p.u., what a change of law left in u; decays */
+    @P@_real u[@GUARD@_NU];      /* the last u, p.u. */
+    @P@_real trend[@GUARD@_NU];  /* p.u. per tick, filtered u[k] - u[k-1] */
+    int reason;                 /* 0, or why it is in the safe state */
+    int channel;                /* which signal was the reason, or -1 */
+} @P@_t;
+
+/* Makes an instance ready: states 0, the last u as by default in the signal table. */
+void @P@_init(@P@_t *s);
+
+/* Leaves the safe state: states 0, and the last good u stays. Call settle before the next step. */
+void @P@_reset(@P@_t *s);
+
+/* One tick: from the references and measurements at tick k to u[k], and the state to k + 1.
+ * u stays as it is when the result is not OK. */
+int @P@_step(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
+    @P@_real u[]);
+
+/* u[k] without a step. */
+int @P@_look(@LAW@const @P@_t *s, const @P@_real ref[], const @P@_real y[],
+    @P@_real u[]);
+
+/* Sets the state so that u[k] is u, and goes on with the slope trend (p.u. per tick). On return u is
+ * what comes out: the same but for rounding, or this law's limit. u and trend are not parts of s. */
+int @P@_settle(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
+    @P@_real u[], const @P@_real trend[]);
+
+/* Changes to this law without a bump, in one tick: look at the old law for u, switch with that u and
+ * the old law's trend, and go on with step of this one. bump is max |change of u|, p.u. */
+int @P@_switch(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
+    @P@_real u[], const @P@_real trend[], @P@_real *bump);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

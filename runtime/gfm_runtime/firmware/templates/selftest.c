@@ -1,0 +1,122 @@
+/* @MADE@
+ *
+ * On any machine: cc -std=c99 -O2 -ffp-contract=off *.c && ./a.out
+ * It returns 0 when every bit of every output and state is that of golden.h. A board without a screen
+ * calls golden_row for the rows of golden.h, and looks at the result. */
+#include "selftest.h"
+
+#include <string.h>
+
+@LAW_INCLUDES@
+
+/* Counts up, if given: e.g. -DGOLDEN_CLOCK=DWT->CYCCNT on a Cortex-M counts cycles of a step. */
+#ifdef GOLDEN_CLOCK
+unsigned long GOLDEN_CLOCK(void);
+#else
+#define GOLDEN_CLOCK() 0UL
+#endif
+
+unsigned long golden_elapsed;
+
+/* One instance of a law, for any law. */
+typedef struct {
+    const golden_real *x, *offset, *u, *trend;
+    int n;
+} view_t;
+
+typedef struct {
+    void (*init)(int k);
+    void (*reset)(int k);
+    int (*step)(int k, const golden_real *ref, const golden_real *y, golden_real *u);
+    int (*look)(int k, const golden_real *ref, const golden_real *y, golden_real *u);
+    int (*settle)(int k, const golden_real *ref, const golden_real *y, golden_real *u,
+        const golden_real *trend);
+    int (*change)(int k, const golden_real *ref, const golden_real *y, golden_real *u,
+        const golden_real *trend, golden_real *bump);
+    view_t (*view)(int k);
+} law_t;
+
+@ADAPTERS@
+static const law_t laws[] = {
+@TABLE@
+};
+
+const char *const golden_names[] = {
+@NAMES@
+};
+
+const unsigned golden_sizes[] = {
+@SIZES@
+};
+
+static unsigned compare(const golden_real *found, const golden_word *expected, int n)
+{
+    golden_word bits;
+    unsigned differ = 0;
+    int i;
+    for (i = 0; i < n; i++) {
+        memcpy(&bits, &found[i], sizeof bits);
+        differ += bits != expected[i];
+    }
+    return differ;
+}
+
+unsigned golden_row(const golden_word row[])
+{
+    static const golden_real none[3];
+    static golden_real u[3], bump;
+    static int law, k;
+    golden_real ref[5], y[5];
+    unsigned differ;
+    view_t now;
+    int result;
+    memcpy(ref, &row[3], sizeof ref);
+    memcpy(y, &row[8], sizeof y);
+    switch ((int)row[0]) {
+    case 1: /* init */
+        law = (int)row[1];
+        k = 0;
+        laws[law].init(k);
+        u[0] = u[1] = u[2] = bump = 0;
+        break;
+    case 2: /* change to the row's law */
+        now = laws[law].view(k);
+        laws[law].look(k, ref, y, u);
+        law = (int)row[1];
+        k = 1 - k;
+        laws[law].init(k);
+        laws[law].change(k, ref, y, u, now.trend, &bump);
+        break;
+    case 3: /* leave the safe state */
+        laws[law].reset(k);
+        memcpy(u, laws[law].view(k).u, sizeof u);
+        laws[law].settle(k, ref, y, u, none);
+        break;
+    default:
+        break;
+    }
+    result = laws[law].step(k, ref, y, u);
+    now = laws[law].view(k);
+    differ = (golden_word)result != row[2];
+    row += 13;
+    differ += compare(u, row, 3) + compare(&bump, row + 3, 1);
+    differ += compare(now.x, row + 4, now.n);
+    row += 4 + GOLDEN_NX;
+    differ += compare(now.offset, row, 3) + compare(now.u, row + 3, 3);
+    return differ + compare(now.trend, row + 6, 3);
+}
+
+#ifndef GOLDEN_NO_MAIN
+#include "golden.h"
+
+#include <stdio.h>
+
+int main(void)
+{
+    unsigned long i, differ = 0;
+    for (i = 0; i < GOLDEN_ROWS; i++)
+        differ += golden_row(golden[i]);
+    printf("%lu rows, %lu words differ\n", (unsigned long)GOLDEN_ROWS, differ);
+    return differ != 0;
+}
+#endif

@@ -1,0 +1,20 @@
+/* Steps the laws of this folder through golden rows, and compares bits. @MADE@ */
+#ifndef GFM_SELFTEST_H
+#define GFM_SELFTEST_H
+
+#include <stdint.h>
+
+typedef @C_REAL@ golden_real;
+typedef uint@BITS@_t golden_word;
+
+enum { GOLDEN_LAWS = @LAWS@, GOLDEN_NX = @NX@, GOLDEN_WORDS = @WORDS@ };
+
+/* One row: the numbers of words that differ. Rows go in their order; the first row starts anew. */
+unsigned golden_row(const golden_word row[]);
+
+/* Names and sizes of the laws, and what GOLDEN_CLOCK counted during the last step. */
+extern const char *const golden_names[GOLDEN_LAWS];
+extern const unsigned golden_sizes[GOLDEN_LAWS];
+extern unsigned long golden_elapsed;
+
+#endif

@@ -1,0 +1,110 @@
+/* 0, or the reason to refuse these inputs: the state, or the ranges of the signal table. */
+static int refused(const @P@_t *s, const real ref[], const real y[], int *channel)
+{
+    if (s->reason != @GUARD@_OK) {
+        *channel = s->channel;
+        return s->reason;
+    }
+    *channel = @Y_CHECKS@
+             : -1;
+    if (*channel >= 0)
+        return @GUARD@_BAD_Y;
+    *channel = @REF_CHECKS@
+             : -1;
+    return *channel >= 0 ? @GUARD@_BAD_REF : @GUARD@_OK;
+}
+
+void @P@_init(@P@_t *s)
+{
+    static const real u[] = {@U_DEFAULT@};
+    int i;
+    @P@_reset(s);
+    for (i = 0; i < @GUARD@_NU; i++)
+        s->u[i] = u[i];
+}
+
+void @P@_reset(@P@_t *s)
+{
+    int i;
+    for (i = 0; i < @GUARD@_NX; i++)
+        s->x[i] = 0;
+    for (i = 0; i < @GUARD@_NU; i++)
+        s->offset[i] = s->trend[i] = 0;
+    s->reason = @GUARD@_OK;
+    s->channel = -1;
+}
+
+int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+{
+    tick_t t;
+    int reason = refused(s, ref, y, &s->channel);
+    if (reason != @GUARD@_OK)
+        return s->reason = reason;
+    set_inputs(@law@&t, ref, y);
+    output(@law@s, &t);
+    advance(@law@s, &t);
+    /* An inner stage (current limiter, voltage and current loops) would act on t.u here. */
+    if (!((t.u[1] - t.u[1]) + (t.u[0] - t.u[0]) + (t.u[2] - t.u[2]) == 0)) {
+        /* omega_u first: column 3 takes it to the others */
+        s->channel = !(t.u[1] - t.u[1] == 0) ? 1 : !(t.u[0] - t.u[0] == 0) ? 0 : 2;
+        return s->reason = @GUARD@_BAD_U;
+    }
+    u[0] = t.u[0];
+    u[1] = t.u[1];
+    u[2] = t.u[2];
+    return @GUARD@_OK;
+}
+
+int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
+{
+    tick_t t;
+    int i, channel, reason = refused(s, ref, y, &channel);
+    if (reason != @GUARD@_OK)
+        return reason;
+    set_inputs(@law@&t, ref, y);
+    output(@law@s, &t);
+    for (i = 0; i < @GUARD@_NU; i++)
+        u[i] = t.u[i];
+    return @GUARD@_OK;
+}
+
+int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[])
+{
+    tick_t t;
+    int i, channel, reason = refused(s, ref, y, &channel);
+    if (reason != @GUARD@_OK)
+        return reason;
+    set_inputs(@law@&t, ref, y);
+    for (i = 0; i < @GUARD@_NU; i++) {
+        s->offset[i] = 0;
+        s->trend[i] = trend[i];
+        s->u[i] = u[i] - trend[i];
+    }
+    set_states(@law@s, &t, u);
+    /* the offset takes the rest: all of it in a row without states, rounding in the others */
+    output(@law@s, &t);
+    s->offset[1] = (u[1] - t.raw[1]) / @LOOP@;
+    output(@law@s, &t);
+    s->offset[0] = u[0] - t.raw[0];
+    s->offset[2] = u[2] - t.raw[2];
+    output(@law@s, &t);
+    for (i = 0; i < @GUARD@_NU; i++)
+        u[i] = t.u[i];
+    return @GUARD@_OK;
+}
+
+int @P@_switch(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[],
+    real *bump)
+{
+    real old[@GUARD@_NU], change;
+    int i, reason;
+    for (i = 0; i < @GUARD@_NU; i++)
+        old[i] = u[i];
+    reason = @P@_settle(@law@s, ref, y, u, trend);
+    *bump = 0;
+    for (i = 0; i < @GUARD@_NU; i++) {
+        change = u[i] < old[i] ? old[i] - u[i] : u[i] - old[i];
+        *bump = change > *bump ? change : *bump;
+    }
+    return reason;
+}

@@ -1,0 +1,139 @@
+"""Courses of the grid from CSV files: what the plant makes of them, and wrong files."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.run import load_run
+from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.events import GridProfile
+from gfm_hil.scenario.model import check_scenario, load_scenario
+
+TEXT = """# a fall of the frequency and of the voltage
+t, f_hz, V_g
+0.01, 50.0, 1.0
+0.03, 49.9, 0.99
+0.05, 49.9, 1.0
+
+0.0512, 50.05, 1.0
+"""
+
+
+def content(file: Path | str, **changed: Any) -> dict[str, Any]:
+    event = {"t": 0.02, "type": "grid-profile", "file": str(file)}
+    return {"title": "course", "duration": 0.1, "law": "vsg-2", "events": [event], **changed}
+
+
+@pytest.fixture
+def course(tmp_path: Path) -> Path:
+    path = tmp_path / "course.csv"
+    path.write_text(TEXT, encoding="utf-8")
+    return path
+
+
+def expected(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """omega_g and V_g by NumPy's interpolation of the file's lines."""
+    since = t - 0.02
+    omega = np.interp(since, [0.01, 0.03, 0.05, 0.0512], np.array([50, 49.9, 49.9, 50.05]) / 50)
+    return omega, np.interp(since, [0.01, 0.03, 0.05], [1.0, 0.99, 1.0])
+
+
+def test_the_grid_follows_the_lines_at_every_tick(course):
+    run = gfmhil.run(content(course))
+    omega, V = expected(run.signals["t"])
+    # the plant's value at a tick is that of the tick, which the point before it set out for
+    assert run.signals["omega_g"] == pytest.approx(omega, abs=1e-12)
+    assert run.signals["V_g"] == pytest.approx(V, abs=1e-12)
+    (event,) = run.summary["events"]
+    assert event["label"] == "grid profile course"
+
+
+@pytest.mark.processes
+def test_it_is_the_same_over_a_link_and_its_file_is_kept(course, tmp_path):
+    here = gfmhil.run(content(course))
+    scenario = check_scenario(content(course, link={"type": "shm"}), "test")
+    run = run_scenario(scenario, tmp_path / "run", figures=False)
+    for name in ("omega_g", "V_g", "p"):
+        np.testing.assert_array_equal(run.signals[name], here.signals[name])
+    copy = tmp_path / "run" / "profiles" / "course.csv"
+    assert copy.read_text() == TEXT
+    course.unlink()
+    shutil.move(tmp_path / "run", tmp_path / "moved")  # the folder is whole wherever it is
+    again = load_scenario(str(tmp_path / "moved" / "scenario.toml"), in_process=True)
+    np.testing.assert_array_equal(gfmhil.run(again).signals["p"], here.signals["p"])
+    assert load_run(tmp_path / "moved").scenario.events[0].lasts() == 0.0512
+    here = gfmhil.run(again)
+    here.save(tmp_path / "saved")
+    assert (tmp_path / "saved" / "profiles" / "course.csv").read_text() == TEXT
+
+
+def test_the_content_of_the_file_is_what_both_sides_agree_on(course, tmp_path):
+    other = tmp_path / "elsewhere.csv"
+    other.write_text(TEXT)
+    one, two = (check_scenario(content(f), "test").digest() for f in (course, other))
+    assert one == two
+    other.write_text(TEXT.replace("49.9, 1.0", "49.8, 1.0"))
+    assert check_scenario(content(other), "test").digest() != one
+
+
+def test_the_file_is_looked_for_beside_the_scenario(course, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path.parent)
+    (tmp_path / "s.toml").write_text(
+        'title = "s"\nduration = 0.1\n[[events]]\nt = 0\ntype = "grid-profile"\n'
+        'file = "course.csv"\n'
+    )
+    event = load_scenario(str(tmp_path / "s.toml"), in_process=True).events[0]
+    assert isinstance(event, GridProfile) and Path(event.file) == course
+    assert event.lasts() == 0.0512
+
+
+WRONG = {
+    "t,f_hz\n0,50\n0,50\n": "line 3: t = 0: must be larger than in the line before",
+    "t,f_hz\n0,50\n1,nan\n": "line 3: f_hz = nan: must lie in [40, 60]",
+    "t,f_hz\n0,70\n": "line 2: f_hz = 70: must lie in [40, 60]",
+    "t,omega_g\n0,50\n": "line 2: omega_g = 50: must lie in [0.8, 1.2]",
+    "t,V_g\n-1,1\n": "line 2: t = -1: must lie in [0, 86400]",
+    "t,V_g\n0,1.6\n": "line 2: V_g = 1.6: must lie in [0, 1.5]",
+    "# c\nt,V_g\n0,x\n": "line 3: V_g = 'x': must be a number",
+    "t,V_g\n0,1,2\n": "line 2: has 3 fields, but the first line has 2",
+    "V_g,t\n1,0\n": "columns V_g,t: must be t, then",
+    "t,f\n0,1\n": "columns t,f: must be t, then",
+    "t,f_hz,omega_g\n0,50,1\n": "columns t,f_hz,omega_g: must be t, then",
+    "t\n0\n": "columns t: must be t, then",
+    "t,V_g\n": "has no line with numbers",
+    "": "has no line with numbers",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_wrong_file_is_refused_with_its_line(text, tmp_path):
+    path = tmp_path / "wrong.csv"
+    path.write_text(text)
+    with pytest.raises(UserError) as found:
+        check_scenario(content(path), "test.toml")
+    said = str(found.value)
+    assert "\n" not in said and "events.0: " in said and "wrong.csv" in said
+    assert WRONG[text] in said
+
+
+def test_files_that_are_none_are_refused(tmp_path):
+    (tmp_path / "bytes.csv").write_bytes(b"t,V_g\n\xff\xfe,1\n")
+    for file in ("none.csv", "bytes.csv", ".", "x" * 5000):
+        with pytest.raises(UserError, match=r"events\.0: "):
+            check_scenario(content(tmp_path / file), "test.toml")
+
+
+def test_a_finite_grid_takes_a_voltage_only(course, tmp_path):
+    finite = {"grid": {"finite": {"S": 5.0, "H": 4.0}}}
+    with pytest.raises(UserError, match="such a grid sets its own frequency"):
+        check_scenario(content(course, plant=finite), "test")
+    (tmp_path / "v.csv").write_text("t,V_g\n0,1.0\n0.02,0.98\n")
+    run = gfmhil.run(content(tmp_path / "v.csv", plant=finite))
+    assert run.signals["V_g"][-1] == 0.98

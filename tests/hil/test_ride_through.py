@@ -1,0 +1,100 @@
+"""With an inner stage a converter rides through what trips it without one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.run import Run
+from gfm_hil.results.runner import run_in_memory
+from gfm_hil.scenario.model import check_scenario
+
+CYCLE = 200  # ticks
+LIMITED = ("virtual-stator", "cascaded", "threshold-impedance")
+
+
+def run(event: dict[str, Any], after: float, law: str = "vsg-2", **changed: Any) -> Run:
+    """SCR 3, half of the rated power, one sample and a third of delay; an event at 0.2 s."""
+    plant = {
+        "grid": {"scr": 3.0, "x_over_r": 6.0},
+        "delay": {"samples": 1, "fraction": 0.3},
+        "modulation": "space-vector",
+        **changed.pop("plant", {}),
+    }
+    content = {"title": "limited", "duration": 0.2 + after, "law": law, "plant": plant}
+    content |= {"link": {"type": "inproc"}, "inner": "virtual-stator", **changed}
+    events = [{"t": 0.2, **event}]
+    return run_in_memory(check_scenario({**content, "events": events}, "test"))
+
+
+def cycle_mean(x: np.ndarray) -> np.ndarray:
+    return np.convolve(x, np.ones(CYCLE) / CYCLE, "valid")
+
+
+def on_its_feet(found: Run) -> None:
+    """It ends where it began: P within 0.02 p.u., and not a turn away."""
+    s = {name: np.asarray(x[:]) for name, x in found.signals.items()}
+    assert found.summary["status"] == "completed"
+    assert abs(s["true_p"][-1] - 0.5) <= 0.02
+    assert abs(s["true_delta"][-1] - s["true_delta"][0]) < 0.3
+
+
+@pytest.mark.parametrize("inner", ["none", *LIMITED])
+def test_it_starts_at_rest(inner: str) -> None:
+    """The operating point is that of plant, law and stage together."""
+    s = run({"type": "reference", "P_ref": 0.5}, 0.1, inner=inner).signals
+    for name in ("true_p", "true_V", "true_i", "u_E_u", "u_omega_u"):
+        assert np.ptp(s[name][:]) < 1e-11, name
+
+
+@pytest.mark.parametrize("law", ["vsg-2", "droop-3"])
+def test_a_jump_of_25_degrees_stays_within_the_rating(law: str) -> None:
+    found = run({"type": "grid-phase-jump", "degrees": -25.0}, 2.0, law)
+    i = np.asarray(found.signals["true_i"][:])
+    assert cycle_mean(i).max() <= 1.22 and i.max() <= 1.35
+    on_its_feet(found)
+    free = run({"type": "grid-phase-jump", "degrees": -25.0}, 0.1, law, inner="none")
+    assert cycle_mean(np.asarray(free.signals["true_i"][:])).max() > 1.6
+
+
+def test_the_grid_gone_for_150_ms() -> None:
+    found = run({"type": "grid-voltage", "V_g": 0.0, "duration": 0.15}, 2.0)
+    s = found.signals
+    assert np.asarray(s["true_i"][:]).max() <= 2.0
+    on_its_feet(found)
+    e = np.hypot(s["u_E_u"][:], s["u_E_q"][:])
+    assert (e <= 1.3026 * s["y_v_dc"][:]).all()
+
+
+@pytest.mark.parametrize("inner", LIMITED)
+def test_a_bolted_fault_at_the_terminal_with_a_peak_limit(inner: str) -> None:
+    bolted = {"type": "fault", "position": 0.0, "R": 0.001, "duration": 0.15}
+    found = run(bolted, 2.0, inner=inner, plant={"i_peak": 2.5})
+    assert np.asarray(found.signals["true_i"][:]).max() <= 2.55
+    on_its_feet(found)
+    assert run(bolted, 0.1, inner=inner).summary["status"] == "tripped"
+
+
+def test_a_grid_at_49_hz_is_left_at_the_power_limit() -> None:
+    """A droop of 1 % asks for 2.5 p.u. there; without the power limiter VSG-2 slips."""
+    fall = {"type": "grid-frequency", "f_hz": 49.0, "rate": 4.0}
+    s = run(fall, 3.0).signals
+    assert s["true_p"][-1:][0] == pytest.approx(1.0, abs=1e-3)
+    assert np.asarray(s["true_i"][:]).max() <= 1.2
+
+
+def test_the_stage_must_carry_the_operating_point() -> None:
+    with pytest.raises(UserError, match=r"inner.I_max: 1.2 p.u.: this operating point needs 1\.4"):
+        run({"type": "reference", "P_ref": 0.5}, 0.1, references={"P_ref": 1.4})
+
+
+def test_a_law_of_its_own_stage_changes_to_one_without() -> None:
+    """The bridge's voltage goes on; what the stage stood for decays in 0.2 s."""
+    found = run({"type": "law", "law": "droop-5"}, 2.0, inner=None, law="vsg-2")
+    assert "u_E_q" not in found.signals
+    found = run({"type": "law", "law": "droop-5"}, 2.0)
+    assert np.asarray(found.signals["true_i"][:]).max() < 0.8
+    on_its_feet(found)

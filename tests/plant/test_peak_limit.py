@@ -1,0 +1,42 @@
+"""The bridge's peak-current limit: within the limit while the DC voltage can hold it there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gfm_plant import Plant, make_plant, plant_advance, plant_equilibrium, plant_init
+from gfm_plant.grid import fault
+
+T_S, LIMIT = 1e-4, 2.0
+
+
+def current(i_peak: float | None, R: float, modulation: str = "space-vector") -> np.ndarray:
+    """|i| of a bridge that goes on as before while its terminal is short-circuited through R."""
+    options = {"i_peak": i_peak, "modulation": modulation, "grid": {"scr": 3.0, "x_over_r": 6}}
+    off = {name: {"enabled": False} for name in ("over_current", "under_voltage")}
+    par, st = make_plant(Plant.model_validate({**options, "protection": off}), T_S)
+    x, u = plant_equilibrium(par, 0.5, 1.0)
+    plant_init(par, st, x, u)
+    seen = []
+    for k in range(300):
+        if k == 20:
+            fault(par, st, 0.0, R, 0.01)
+        plant_advance(par, st, u)
+        seen.append(np.hypot(*st["x"][0, :2]))
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("R", [0.01, 0.1, 0.5])
+def test_the_current_stays_within_the_limit_in_a_fault(R: float) -> None:
+    limited, free = current(LIMIT, R), current(None, R)
+    within = slice(20, 120)  # while the fault lasts, v is far below what the bridge can give
+    assert free[within].max() > 1.5 * LIMIT
+    assert limited[within].max() <= 1.01 * LIMIT
+    assert limited[within].max() >= 0.99 * LIMIT
+
+
+def test_a_limit_that_is_not_reached_changes_nothing() -> None:
+    """The same circuit is solved in shorter pieces: E does not depend on v_dc here."""
+    once, often = (current(limit, 0.5, "unlimited") for limit in (None, 1e3))
+    assert np.abs(once - often).max() < 1e-11

@@ -1,0 +1,243 @@
+"""Firmware compiled: every bit of every law on this machine and on processors in QEMU."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.cli import main
+from gfm_runtime.firmware import CHECKED, REALS, STYLES, check, export, golden, make_modules
+from gfm_runtime.kernel import state_dtype, step
+from gfm_runtime.states import BAD_U, BAD_Y, OK
+
+from ..support.laws import LAWS, REF, wander
+
+pytestmark = [pytest.mark.apt, pytest.mark.timeout(300)]
+
+T_S = 1e-4
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic",
+          "-Werror", "-ffp-contract=off"]  # fmt: skip
+
+
+def exported(folder: Path, real: str, style: Any, *names: str) -> Path:
+    """A folder with laws, all by default."""
+    laws = {name: LAWS[name] for name in names} or LAWS
+    for name, text in export(laws, T_S, real, style).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], Path]:
+    """A folder with all laws for each precision and style."""
+    return {
+        (real, style): exported(tmp_path_factory.mktemp(f"{style}-{real}"), real, style)
+        for real in REALS
+        for style in STYLES
+    }
+
+
+def differing(folder: Path, target: str, flags: str) -> int:
+    """Words that differ over all laws; each law must have gone through all its rows."""
+    found = check(folder, target, flags)
+    assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
+    return sum(c.differ for c in found)
+
+
+@pytest.mark.parametrize("real", REALS)
+@pytest.mark.parametrize(
+    ("target", "style", "flags"),
+    [
+        *[("host", "unrolled", f"-O{level}") for level in range(4)],
+        ("host", "records", "-O2"),
+        ("clang", "unrolled", "-O2"),
+    ],
+)
+def test_every_law_has_the_kernels_bits(
+    folders: Any, real: str, target: str, style: str, flags: str
+) -> None:
+    assert differing(folders[real, style], target, flags) == 0
+
+
+@pytest.mark.parametrize(
+    ("target", "real", "style"),
+    [
+        ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
+        ("m7", "float64", "unrolled"), ("rv64", "float64", "unrolled"),
+    ],
+)  # fmt: skip
+def test_every_law_has_the_kernels_bits_on_a_processor(
+    folders: Any, target: str, real: str, style: str
+) -> None:
+    assert differing(folders[real, style], target, "-O2") == 0
+
+
+def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
+    folder = exported(tmp_path, "float32", "unrolled", "droop-1", "mimo-gfm")
+    first, again = (check(folder, "m4f", ticks=210) for _ in range(2))
+    assert first == again
+    droop, mimo = (c.instructions for c in first)
+    assert droop is not None and mimo is not None
+    assert 100 < droop[0] <= droop[1] < mimo[0] <= mimo[1] < 1000
+
+
+@pytest.mark.skipif(
+    " fma " not in Path("/proc/cpuinfo").read_text(), reason="the processor has no FMA"
+)
+@pytest.mark.parametrize("real", REALS)
+def test_fused_multiply_add_is_found(tmp_path: Path, real: str) -> None:
+    """The negative control: with it the bits differ, and the command says so by its exit code."""
+    folder = str(exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle"))
+    assert main(["firmware", "check", folder]) == 0
+    flags = "--flags=-O3 -march=haswell -ffp-contract=fast"
+    assert main(["firmware", "check", folder, flags]) == 3
+
+
+def cc(folder: Path, *arguments: str, compiler: str = "gcc") -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("real", REALS)
+def test_the_code_compiles_without_a_warning(
+    folders: Any, real: str, style: str, compiler: str
+) -> None:
+    folder = folders[real, style]
+    sources = sorted(p.name for p in folder.glob("*.c"))
+    done = cc(folder, *STRICT, "-fsyntax-only", *sources, compiler=compiler)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_sanitizers_find_nothing_and_the_self_test_passes(
+    folders: Any, style: str, tmp_path: Path
+) -> None:
+    folder = folders["float32", style]
+    program = str(tmp_path / "selftest")
+    done = cc(
+        folder, *STRICT, "-O1", "-fsanitize=undefined,address,float-divide-by-zero",
+        "-fno-sanitize-recover=all", *sorted(p.name for p in folder.glob("*.c")),
+        "-o", program, "-lm",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    ran = subprocess.run([program], capture_output=True, text=True, check=False)
+    rows = golden(make_modules(LAWS, T_S, "float32"), 210)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert ran.stdout == f"{len(rows.words)} rows, 0 words differ\n"
+
+
+@pytest.mark.parametrize("real", REALS)
+def test_no_symbol_of_libm_but_sqrt(folders: Any, real: str, tmp_path: Path) -> None:
+    folder = folders[real, "unrolled"]
+    sources = [str(folder / f"gfm_{law}.c") for law in ("vsg_1", "psc_dc", "dvoc", "hybrid_angle")]
+    for flags in ("-O0", "-O2"):
+        assert cc(tmp_path, *STRICT, flags, "-c", *sources).returncode == 0
+        objects = [p.name for p in tmp_path.glob("*.o")]
+        said = cc(tmp_path, "-P", *objects, compiler="nm").stdout  # name, kind, place
+        kinds: dict[str, set[str]] = {}
+        for name, kind in (line.split()[:2] for line in said.splitlines() if " " in line):
+            kinds.setdefault(kind, set()).add(name)
+        root = "sqrtf" if real == "float32" else "sqrt"
+        assert root in kinds["U"]
+        assert kinds["U"] <= {root, "memset", "memcpy", "_GLOBAL_OFFSET_TABLE_"}
+        assert set(kinds) <= set("UTtr"), "code and constants, no variables"
+
+
+@pytest.mark.parametrize(
+    ("flag", "why"),
+    [("-ffast-math", "-ffast-math changes"), ("-mfpmath=387", "rounded to their own type")],
+)
+def test_what_would_change_bits_does_not_compile(folders: Any, flag: str, why: str) -> None:
+    done = cc(folders["float32", "unrolled"], "-std=c99", flag, "-fsyntax-only", "gfm_vsg_1.c")
+    assert done.returncode != 0 and why in done.stderr
+
+
+def test_cmake_builds_a_folder(folders: Any, tmp_path: Path) -> None:
+    folder = folders["float64", "records"]
+    for arguments in (["-S", str(folder), "-B", "build"], ["--build", "build"]):
+        done = cc(tmp_path, *arguments, compiler="cmake")
+        assert done.returncode == 0, done.stdout + done.stderr
+    ran = subprocess.run([tmp_path / "build" / "selftest"], check=False, capture_output=True)
+    assert ran.returncode == 0
+
+
+# --- instances, driven from here ---
+
+
+class Instance:
+    """An instance of vsg-1 in float64, in memory that only this object holds."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._of, self._memory = library, np.full(64, np.nan)  # init must set all it uses
+        self._call("init")
+
+    def _call(self, name: str, *arrays: Any) -> int:
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (self._memory, *arrays)]
+        return int(getattr(self._of, f"gfm_vsg_1_{name}")(*pointers))
+
+    def step(self, ref: Any, y: Any, u: Any) -> int:
+        return self._call("step", ref, y, u)
+
+    def settle(self, ref: Any, y: Any, u: Any, trend: Any) -> int:
+        return self._call("settle", ref, y, u, trend)
+
+    def reset(self) -> None:
+        self._call("reset")
+
+    @property
+    def x(self) -> Any:
+        return self._memory[:3]
+
+
+@pytest.fixture(scope="module")
+def library(folders: Any, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    at = tmp_path_factory.mktemp("library") / "vsg_1.so"
+    arguments = [*STRICT, "-O2", "-shared", "-fPIC", "gfm_vsg_1.c", "-o", str(at)]
+    assert cc(folders["float64", "unrolled"], *arguments).returncode == 0
+    return ctypes.CDLL(str(at))
+
+
+def test_two_instances_do_not_see_each_other(library: ctypes.CDLL) -> None:
+    """Interleaved, each gives what the kernel gives alone."""
+    record = make_modules({"vsg-1": LAWS["vsg-1"]}, T_S, "float64")[0].record
+    states = np.zeros(2, state_dtype())
+    states["u"] = [0.0, 1.0, 1.0]
+    both = [Instance(library), Instance(library)]
+    inputs = [wander(300, seed=seed) for seed in (1, 2)]
+    u, expected = np.zeros(3), np.zeros(3)
+    for k in range(300):
+        for instance, state, (refs, ys) in zip(both, states, inputs, strict=True):
+            assert instance.step(refs[k], ys[k], u) == OK
+            step(record, state, refs[k], ys[k], expected)
+            np.testing.assert_array_equal(u, expected)
+
+
+def test_the_safe_state_holds_until_a_reset(library: ctypes.CDLL) -> None:
+    vsg, u, good = Instance(library), np.zeros(3), np.zeros(3)
+    assert vsg.step(REF, REF, good) == OK
+    u[:] = good
+    bad = REF.copy()
+    bad[1] = np.nan
+    assert vsg.step(REF, bad, u) == BAD_Y
+    assert vsg.step(REF, REF, u) == BAD_Y, "latched"
+    assert vsg.settle(REF, REF, u, np.zeros(3)) == BAD_Y
+    np.testing.assert_array_equal(u, good)
+    vsg.reset()
+    assert vsg.settle(REF, REF, u, np.zeros(3)) == OK
+    assert vsg.step(REF, REF, u) == OK
+    np.testing.assert_allclose(u, good, rtol=0, atol=1e-14)
+
+
+def test_a_state_that_is_not_finite_is_found(library: ctypes.CDLL) -> None:
+    vsg, u = Instance(library), np.array([7.0, 8.0, 9.0])
+    vsg.x[0] = np.nan
+    assert vsg.step(REF, REF, u) == BAD_U
+    assert u.tolist() == [7.0, 8.0, 9.0]
