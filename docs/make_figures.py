@@ -14,6 +14,7 @@ from pathlib import Path
 from _ext.outputs import command
 from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
+from _figures.inner_stage import inner_stage
 from _figures.limit_cycle import limit_cycles
 from _figures.services import services
 from _figures.start import start
@@ -49,6 +50,7 @@ def main() -> None:
     eigenvalues.couplings_table()
     eigenvalues.q_droop_table()
     limit_cycles()
+    inner_stage()
     failed_assertion()
     from_mf4()
     services()

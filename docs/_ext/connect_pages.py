@@ -78,7 +78,7 @@ def signals() -> str:
             f"`{s.group}`", f"`{s.name}` (${s.symbol}$)", f"`{s.base}`", f"{s.low:g} … {s.high:g}",
             f"{s.scale:g}", s.description,
         ]
-        for vector in ("y", "u", "ref", "d")
+        for vector in ("y", "y_inner", "u", "u_inner", "ref", "d")
         for s in group(vector)
     ]  # fmt: skip
     heads = ["vector", "signal", "base", "range, p.u.", "on CAN, p.u. a count", ""]

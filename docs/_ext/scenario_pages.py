@@ -15,7 +15,7 @@ from gfm_hil.scenario import events
 from gfm_hil.scenario import model as scenario
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
-from gfm_runtime import lawfile
+from gfm_runtime import inner_file, lawfile
 
 
 def _table_of(key: str) -> type[BaseModel]:
@@ -51,6 +51,10 @@ LAW_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[home_grid]", lawfile.GridSpec),
     ("[schedule]", lawfile.Schedule),
     ("one of schedule.stages", lawfile.Stage),
+)
+INNER_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
+    *((f'type = "{kind}"', model) for kind, model in inner_file.MODELS.items()),
+    ("[inner.power]", inner_file.PowerLimiter),
 )
 
 _BOUNDS = (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤"))
@@ -145,6 +149,11 @@ def event_tables() -> str:
         lines += [f'**`type = "{kind}"`** {inspect.cleandoc(model.__doc__ or "")}', ""]
         lines += [table(model, ("type", "t", "tick")), ""]
     return "\n".join(lines)
+
+
+def inner_tables() -> str:
+    """Every kind of inner stage, and its power limiter."""
+    return _tables(INNER_TABLES)
 
 
 def law_tables() -> str:

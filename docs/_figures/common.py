@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
+from matplotlib.patches import FancyBboxPatch
+
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
 from gfm_hil.core.terminal import markdown
@@ -24,7 +27,7 @@ RIG: dict[str, Any] = {
     "sensors": {"bandwidth_hz": 300.0},
     "dc_source": {"mode": "regulated"},
 }
-GREY = "#888888"
+GREY, INK = "#888888", "#222222"
 
 
 def scenario(name: str, **changed: Any) -> Scenario:
@@ -68,3 +71,28 @@ def signed(value: float) -> str:
 def write_table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A Markdown table for the page to include."""
     (TABLES / f"{name}.md").write_text(markdown(head, rows) + "\n", encoding="utf-8")
+
+
+def box(
+    axes: Axes, at: tuple[float, float], size: tuple[float, float], text: str, colour: str,
+    faint: bool = False,
+) -> None:  # fmt: skip
+    """A rounded box with a text in its middle."""
+    style = "round,pad=0,rounding_size=0.08"
+    axes.add_patch(
+        FancyBboxPatch(
+            at, *size, boxstyle=style, fc="#fafafa" if faint else "white", ec=colour,
+            lw=0.8 if faint else 1.2,
+        )
+    )  # fmt: skip
+    x, y = at[0] + size[0] / 2, at[1] + size[1] / 2
+    axes.text(x, y, text, ha="center", va="center", fontsize=8.5, color=INK)
+
+
+def arrow(
+    axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str,
+    both: bool = False,
+) -> None:  # fmt: skip
+    """An arrow with a head at its end, or at both."""
+    style = {"arrowstyle": "<|-|>" if both else "-|>", "color": colour, "lw": 1.0}
+    axes.annotate("", end, start, arrowprops={**style, "shrinkA": 0, "shrinkB": 0})

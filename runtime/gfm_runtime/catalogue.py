@@ -96,8 +96,7 @@ def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
     """
     file = law_file(name)
     if inner is not None:
-        named_inner(inner)  # its mistakes are not those of the law
-        file = file.model_copy(update={"inner": inner})
+        file = file.model_copy(update={"inner": named_inner(inner)})
     stages = sorted(file.schedule.stages, key=lambda stage: stage.X) if file.schedule else []
     sets = [{**stage.parameters, **changed} for stage in stages] or [changed]
     try:

@@ -6,6 +6,7 @@ parameters of the law that has the table.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
@@ -87,6 +88,11 @@ class ThresholdImpedance(_WithVoltageLoop):
     f_i: Number = Field(100.0, description="low-pass on i, Hz")
 
 
+MODELS: dict[str, type[Table]] = {
+    "virtual-stator": VirtualStator,
+    "cascaded": Cascaded,
+    "threshold-impedance": ThresholdImpedance,
+}
 InnerSpec = Annotated[VirtualStator | Cascaded | ThresholdImpedance, Field(discriminator="type")]
 _ADAPTER: TypeAdapter[InnerSpec] = TypeAdapter(InnerSpec)
 
@@ -105,6 +111,15 @@ def build_inner(spec: InnerSpec, parameters: Mapping[str, float]) -> Inner:
     words: dict[str, Any] = {k: given.pop(k) for k in ("priority", "freeze") if k in given}
     numbers: dict[str, Any] = {k: evaluate(f"inner.{k}", v, parameters) for k, v in given.items()}
     return Inner(spec.type, **words, **numbers)
+
+
+def acting(inner: Inner) -> dict[str, Any]:
+    """The parameters of a stage that act, by their names in ``Inner``: those of its kind, and of
+    the power limiter if it has one."""
+    names = [name for name in MODELS[inner.kind].model_fields if name not in ("type", "power")]
+    if math.isfinite(inner.P_max) or math.isfinite(inner.P_min):
+        names += ["P_max", "P_min", "k_P", "k_Pi"]
+    return {name: getattr(inner, name) for name in names}
 
 
 @cache

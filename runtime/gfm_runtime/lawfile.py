@@ -28,6 +28,10 @@ def _listed(value: Any) -> Any:
     return [value] if isinstance(value, dict) else value
 
 
+def _stage(value: Any) -> Any:
+    return named_inner(value) if isinstance(value, str) else value
+
+
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
@@ -144,7 +148,9 @@ class LawFile(Table):
     )
     limits: LimitsSpec = Field(LimitsSpec(), description="clamps of u, anti-windup")
     home_grid: GridSpec = Field(GridSpec(), description="where the defaults are meant to be used")
-    inner: InnerSpec | str | None = Field(
+    inner: Annotated[
+        InnerSpec | None, BeforeValidator(_stage, json_schema_input_type=InnerSpec | str | None)
+    ] = Field(
         None,
         description="the inner stage between the law and the bridge: a table, or the name of a "
         "shipped one or of a file; none if not given",
@@ -264,8 +270,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
         limits = Limits(low, high, file.limits.T_t, file.limits.T_off)
     inner = None
     with mistakes.noting():
-        spec = named_inner(file.inner) if isinstance(file.inner, str) else file.inner
-        inner = None if spec is None else build_inner(spec, numbers)
+        inner = None if file.inner is None else build_inner(file.inner, numbers)
     law = None
     with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
         law = Law(

@@ -54,12 +54,12 @@ def _line(error: Any, model: Any) -> str:
     if error["type"] == "extra_forbidden":
         *parents, last = error["loc"]
         return f"{path} = {shown}: unknown key" + meant(last, _fields(model, parents))
-    if error["type"] in ("model_type", "dict_type"):
+    if error["type"] in ("model_type", "dict_type", "model_attributes_type"):
         models = _models_at(model, error["loc"])
         keys = [k for m in models for k, field in m.model_fields.items() if field.is_required()]
         # a file is always a table; only a message as a whole, in JSON, can be something else
         text = "must be a table" if path else "must be an object"
-        text += f" with {', '.join(keys)}" if keys else ""
+        text += f" with {', '.join(dict.fromkeys(keys))}" if keys else ""
     if error["type"] == "literal_error":
         text += meant(error["input"], _quoted(context["expected"]))
     return f"{path}: {text}, not {shown}" if path else f"{text}, not {shown}"

@@ -104,13 +104,14 @@ JUMP = {"tick": 100, "type": "grid-phase-jump", "degrees": -25.0}
 @pytest.mark.parametrize(("every", "fd"), [(1, True), (2, True), (8, False)])
 def test_with_an_inner_stage(every, fd, portable, make, run, tmp_path, endpoint):
     content = {"law": "vsg-2", "plant": {"grid": {"scr": 3.0, "x_over_r": 10.0}}}
-    content |= {"duration": 0.0304, "link": PATIENT, "events": [*EVENTS, JUMP][: 2 + (every == 1)]}
-    # the shipped current loops do not stand the delay of two ticks
-    content["inner"] = "virtual-stator" if every == 1 else "threshold-impedance"
+    content |= {"inner": "virtual-stator", "duration": 0.0304, "link": PATIENT}
+    content["events"] = [*EVENTS, JUMP]
+    if every > 1:  # the current loop does not stand that delay: end before the plant trips
+        content |= {"duration": 0.008, "events": EVENTS[:1]}
     options = {"every": every, "fd": fd, "portable": portable}
     apart, found = both_roles(make(**content), tmp_path, endpoint, **options)
     expected = quantised_run(make(**content), tmp_path, every)
-    assert "y_i_oq" in expected and (every > 1 or np.ptp(apart["u_E_q"]) > 0)
+    assert "y_i_oq" in expected and (apart["u_E_q"] != 0).all()
     for name, column in expected.items():
         assert apart[name].tobytes() == column.tobytes(), name
     for faults, counters in found.values():

@@ -16,6 +16,7 @@ from gfm_hil.cli import main
 from gfm_hil.scenario.model import shipped_scenarios
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime import law_names
+from gfm_runtime.inner_file import inner_names
 
 from ..support.laws import every_law
 
@@ -74,7 +75,7 @@ def test_laws_lists_the_catalogue(call):
     assert code == 0
     assert_fits(out)
     listed = [line.split()[0] for line in out.splitlines() if line and line[0] != " "]
-    assert listed == ["law", *law_names()]
+    assert listed == ["law", *law_names(), "inner", *inner_names()]
 
 
 def test_laws_as_json_is_a_list_of_objects_with_names(call):
@@ -253,8 +254,9 @@ def test_names_of_laws_are_whole_in_a_terminal_and_in_a_pipe(call, monkeypatch):
     monkeypatch.delenv("COLUMNS")
     out = call(*command, "--out", "wide")[1]
     assert out.splitlines()[0].split() == laws  # one table
-    rows = call("laws")[1].splitlines()
-    assert [row.split()[0] for row in rows] == ["law", *law_names()]  # no row is wrapped
+    rows = [row for row in call("laws")[1].splitlines() if row]
+    listed = ["law", *law_names(), "inner", *inner_names()]
+    assert [row.split()[0] for row in rows] == listed  # no row is wrapped
 
 
 def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):

@@ -21,6 +21,7 @@ LAWS = Path(str(files("gfm_runtime"))) / "laws"
 SHIPPED = {
     "scenario": [*SCENARIOS.glob("*.toml"), EXAMPLES / "my-scenario.toml"],
     "law": [*LAWS.rglob("*.toml"), EXAMPLES / "my-law.toml", EXAMPLES / "droop-5-integral.toml"],
+    "inner": [*LAWS.parent.glob("inner_stages/*.toml")],
     "campaign": [*SCENARIOS.glob("campaigns/*.toml")],
 }
 

@@ -1,8 +1,9 @@
-"""gfmhil laws: the catalogue, and one law with its matrices."""
+"""gfmhil laws: the catalogue, the inner stages, and one law with its matrices."""
 
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 from dataclasses import asdict
 from typing import Any
@@ -13,6 +14,7 @@ from rich.table import Column, Table
 from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.law import cell_text
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
+from gfm_runtime.inner_file import acting, inner_names, named_inner
 from gfm_runtime.lawfile import LawFile
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -32,7 +34,7 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """List the catalogue, or its tuned laws."""
+    """List the catalogue, or its tuned laws, and the inner stages."""
     rows = []
     for name in tuned_names() if options.tuned else law_names():
         laws, file = load_law(name), law_file(name)
@@ -61,7 +63,15 @@ def call(options: argparse.Namespace) -> int:
         cells = "  ".join(f"φ{k} {v}" for k, v in row["elements"].items())  # type: ignore[attr-defined]
         weak = "" if row["home_grid"]["L_g"] == 1 else " [dim](weak grid)[/]"  # type: ignore[index]
         table.add_row(str(row["name"]), str(row["order"]), cells, f"{row['title']}{weak}")
-    terminal().print(table)
+    console = terminal()
+    console.print(table)
+    stages = Table(Column("inner stage", no_wrap=True), "what it is", box=None, pad_edge=False)
+    for name in inner_names():
+        spec = named_inner(name)
+        about = "the bridge produces E_u itself" if spec is None else inspect.getdoc(type(spec))
+        stages.add_row(name, about)
+    console.print()
+    console.print(stages)
     return 0
 
 
@@ -85,6 +95,9 @@ def call_show(options: argparse.Namespace) -> int:
     for name, p in first.parameters.items():
         names.add_row(name, f"{p.value:g}", p.unit, p.source)
     console.print(names)
+    if first.inner is not None:
+        values = ", ".join(f"{k} = {_value(v)}" for k, v in acting(first.inner).items())
+        console.print(f"inner stage: {first.inner.kind} ({values})")
     for k, d in enumerate(discrete):
         stage = f", stage {k}" if len(discrete) > 1 else ""
         console.print(f"[bold]discrete, T_s = {d.T_s:g} s{stage}[/]: {d.order} states")
@@ -96,6 +109,10 @@ def call_show(options: argparse.Namespace) -> int:
                 )
                 console.print(f"{name} =\n{text}".replace("[", "\\["))
     return 0
+
+
+def _value(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value).lower()
 
 
 def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
@@ -110,6 +127,7 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
             n: {"value": p.value, "unit": p.unit, "source": p.source}
             for n, p in law.parameters.items()
         },
+        "inner": None if law.inner is None else {"type": law.inner.kind, **acting(law.inner)},
         "home_grid": asdict(law.home_grid),
         "order": discrete[0].order,
         "discrete": [

@@ -1,23 +1,29 @@
-"""gfmhil schema: what a scenario, law or campaign file may hold, as JSON Schema for editors."""
+"""gfmhil schema: what a scenario, law, inner stage or campaign file may hold, as JSON Schema."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
-from pydantic import BaseModel
+from pydantic import TypeAdapter
 
 from gfm_hil.core.files import write_text
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
+from gfm_runtime.inner_file import InnerSpec
 from gfm_runtime.lawfile import LawFile
 
-MODELS: dict[str, type[BaseModel]] = {
-    "scenario": Scenario,
-    "law": LawFile,
-    "campaign": CampaignFile,
+MODELS: dict[str, TypeAdapter[Any]] = {
+    "scenario": TypeAdapter(Scenario),
+    "law": TypeAdapter(LawFile),
+    "inner": TypeAdapter(InnerSpec),
+    "campaign": TypeAdapter(CampaignFile),
 }
+
+
+_NAMES = {"inner": "inner stage"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -33,8 +39,8 @@ def call(options: argparse.Namespace) -> int:
     """Print or write the schema; returns the exit code."""
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **MODELS[options.kind].model_json_schema(),
-        "title": f"gfmhil {options.kind} file",
+        **MODELS[options.kind].json_schema(),
+        "title": f"gfmhil {_NAMES.get(options.kind, options.kind)} file",
     }
     text = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
     if options.out is None:

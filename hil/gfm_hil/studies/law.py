@@ -16,6 +16,7 @@ from gfm_hil.scenario.toml_out import toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import DiscreteLaw, LawError, build_law, discretise, law_file, law_names, parse_law
 from gfm_runtime import Law as BuiltLaw
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import ElementSpec, LawFile
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
@@ -113,6 +114,29 @@ class Law:
         content = self.file.model_dump(mode="json", exclude_none=True)
         for gain, value in (tied(self.file, gains) | gains).items():
             content["parameters"][gain] |= {"value": float(value), "source": "with_gains"}
+        content["name"] = name or f"{self.name.removesuffix('-changed')}-changed"
+        return Law.from_toml(toml_text(content))
+
+    def with_inner(self, inner: str, name: str | None = None, **changed: Any) -> Law:
+        """The same law with an inner stage between it and the bridge.
+
+        Args:
+            inner: name of a shipped stage (``virtual-stator``, ``cascaded``,
+                ``threshold-impedance``), path of a file, or ``none``.
+            name: of the new law; ``<name>-changed`` if None.
+            changed: keys of the stage, e.g. ``I_max=1.1``, ``priority="q"``,
+                ``power={"P_max": 1.0, "P_min": -1.0}``.
+
+        Raises:
+            LawError: no such stage or key, or a value that is not allowed.
+        """
+        spec = named_inner(inner)
+        if spec is None and changed:
+            raise LawError("inner", f"none has no keys; given are {[*changed]}")
+        content = self.file.model_dump(mode="json", exclude_none=True)
+        content.pop("inner", None)
+        if spec is not None:
+            content["inner"] = spec.model_dump(mode="json", exclude_none=True) | changed
         content["name"] = name or f"{self.name.removesuffix('-changed')}-changed"
         return Law.from_toml(toml_text(content))
 
