@@ -12,6 +12,7 @@ the same on every machine.
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -87,8 +88,8 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     now, bump = np.zeros(3, np.int64), np.zeros(1, real)
     u, new_u, zero = np.zeros(NU, real), np.zeros(NU, real), np.zeros(NU, real)
     parts = []
-    for k in range(len(modules)):
-        op, refs, ys = inputs(k, ticks, real)
+    for k, module in enumerate(modules):
+        op, refs, ys = inputs(zlib.crc32(module.prefix.encode()), ticks, real)
         op[0] = INIT if k == 0 else SWITCH
         result, out = np.zeros(ticks, np.int64), np.zeros((ticks, len(names) - 3), real)
         _drive(
