@@ -26,7 +26,9 @@ from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 from gfm_hil.studies.campaign import loading
 from gfm_hil.telemetry.follow import Follower
-from gfm_runtime import LawError, discretise, load_law
+from gfm_runtime import LawError, discretise, get_law, load_law
+from gfm_runtime.firmware import STYLES, golden, make_modules
+from gfm_runtime.firmware.report import read_report, reports
 
 from .conftest import Parser, Take
 from .mutations import blobs, texts
@@ -157,6 +159,25 @@ def _law(place: Path) -> Iterator[Take]:
             short(str(problem))
 
     yield take
+
+
+@contextlib.contextmanager
+def _firmware(place: Path) -> Iterator[Take]:
+    file = place / "report.json"
+
+    def take(text: bytes) -> None:
+        file.write_bytes(text)
+        try:
+            golden(read_report(place).modules, 3)
+        except LawError as problem:
+            short(str(problem))
+
+    yield take
+
+
+def _reports() -> list[str]:
+    modules = make_modules({"psc-1": get_law("psc-1")}, 1e-4, "float32")
+    return [reports(modules, 1e-4, style)["report.json"] for style in STYLES]
 
 
 @contextlib.contextmanager
@@ -346,6 +367,7 @@ FILES = (
     Parser("profile", _profile, lambda: texts([PROFILE])),
     Parser("scenario", _scenario, lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS])),
     Parser("law", _law, lambda: texts(_shipped(CATALOGUE))),
+    Parser("firmware", _firmware, lambda: texts(_reports())),
     Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
     Parser("run_folder", _run_folder, _run_files),
     Parser("segment", _segment, _segments),

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from gfm_hil.cli.main import main
-from gfm_hil.studies.law_comparison.experiments import AT, TRACE_EVERY, experiment
+from gfm_hil.studies.law_comparison.experiments import AT, EXPERIMENTS, TRACE_EVERY, experiment
 from gfm_hil.studies.law_comparison.row import as_shipped
-from gfm_hil.studies.law_comparison.tables import number
+from gfm_hil.studies.law_comparison.tables import markdown, number
 from gfm_runtime import law_file
 
 Capture = pytest.CaptureFixture[str]
@@ -35,6 +35,21 @@ def test_rows(folder: Path) -> None:
     assert droop["gamma"] is None
     assert "50.7" in droop["reason"]
     assert "bench" not in droop
+
+
+def test_a_run_that_oscillates_has_no_figures_in_the_table() -> None:
+    done = {
+        "status": "completed",
+        "reason": "",
+        "overshoot_pct": 1.5,
+        "settling_s": 0.25,
+        "dp": 0.0,
+    }
+    still = {**done, "status": "oscillating", "reason": "still oscillating: p by 0.1 p.u."}
+    bench = {kind: still if kind == "p_ref" else done for kind in EXPERIMENTS}
+    row = {"law": "x", "gamma": 1.0, "bench": bench}
+    cells = markdown("law_comparison_bench", [row]).splitlines()[-1].split(" | ")
+    assert cells[1:4] == ["oscillates", "–", "1.50"]
 
 
 def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Capture) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,42 @@ def test_a_grid_at_49_hz_is_left_at_the_power_limit() -> None:
 def test_the_stage_must_carry_the_operating_point() -> None:
     with pytest.raises(UserError, match=r"inner.I_max: 1.2 p.u.: this operating point needs 1\.4"):
         run({"type": "reference", "P_ref": 0.5}, 0.1, references={"P_ref": 1.4})
+
+
+# limits of the current by five means, each with faults of two lengths and three depths
+LIMITERS = {
+    "circular": 'type = "virtual-stator"',
+    "tight": 'type = "virtual-stator"\nI_max = 1.05',
+    "d first": 'type = "virtual-stator"\npriority = "d"',
+    "q first": 'type = "virtual-stator"\npriority = "q"',
+    "cascaded": 'type = "cascaded"',
+}
+FAULTS = [(V_g, duration) for V_g in (0.0, 0.25, 0.5) for duration in (0.15, 0.25)]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("limiter", LIMITERS)
+@pytest.mark.parametrize(("V_g", "duration"), FAULTS)
+def test_mimo_gfm_practical_holds_synchronism(
+    limiter: str, V_g: float, duration: float, tmp_path: Path
+) -> None:
+    """mimo-gfm-deployable slips in most of them: its phi_15 fills the DC link in a fault."""
+    stage = tmp_path / "stage.toml"
+    stage.write_text(LIMITERS[limiter])
+    fault = {"type": "grid-voltage", "V_g": V_g, "duration": duration}
+    found = run(fault, 2.0, "mimo-gfm-practical", inner=str(stage))
+    on_its_feet(found)
+    assert np.ptp(found.signals["true_v_dc"][:]) < 0.2
+
+
+def test_the_gain_that_lets_mimo_gfm_deployable_slip() -> None:
+    fault = {"type": "grid-voltage", "V_g": 0.0, "duration": 0.15}
+    slips = run(fault, 1.0, "mimo-gfm-deployable")
+    assert np.max(slips.signals["true_v_dc"][:]) > 1.2
+    assert np.abs(slips.signals["true_delta"][:]).max() > 2.0
+    held = run(fault, 1.0, "mimo-gfm-practical")
+    assert np.max(held.signals["true_v_dc"][:]) < 1.1
+    assert np.abs(held.signals["true_delta"][:]).max() < 1.0
 
 
 def test_a_law_of_its_own_stage_changes_to_one_without() -> None:

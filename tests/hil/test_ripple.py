@@ -125,3 +125,10 @@ def test_the_limit_cycle_of_the_rounded_output_fails_a_run_everywhere(tmp_path, 
             assert "Hz &gt; 0.025 p.u. in the last 1 s" in report  # the noise allows 0.025
         if name == "exact":
             assert found["ripple_pu"]["p"] < 0.02
+
+
+def test_a_comparison_says_which_law_oscillates(tmp_path, capsys):
+    arguments = ["compare", "rig_pref_step", "--laws", "mimo-gfm,droop-5", "--link", "inproc"]
+    assert main([*arguments, "--out", str(tmp_path / "out"), "--quiet"]) == 3
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("status")]
+    assert line.split()[1:] == ["completed", "oscillating"]

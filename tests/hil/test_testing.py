@@ -296,6 +296,18 @@ def test_damped_reads_the_ratio() -> None:
     assert found is not None and "at 50 Hz" in found.text and found.text.endswith("it grows.")
 
 
+def test_a_run_that_still_oscillates_fails_unless_that_is_expected(lab: Lab) -> None:
+    """Droop-5 on the rig, whose D/A keeps an oscillation going (docs/experiments.md)."""
+    bench = lab("rig_pref_step", law="droop-5")
+    bench.run()
+    for check in (bench.assert_no_trip, lambda: bench.assert_settles("p", to=1.0, within=2.5)):
+        with pytest.raises(AssertionError, match="should be at rest at its end, but it is still"):
+            check()
+    bench = lab("rig_pref_step", law="droop-5", expect="oscillating")
+    bench.run()
+    bench.assert_no_trip()
+
+
 def test_change_of_law_and_its_bump(lab: Lab) -> None:
     bench = lab(plant__dc_source={"mode": "regulated"})
     bench.run(0.01)

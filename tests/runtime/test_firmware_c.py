@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,17 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_runtime.firmware import CHECKED, REALS, STYLES, check, export, golden, make_modules
+from gfm_runtime import get_law
+from gfm_runtime.firmware import (
+    CHECKED,
+    REALS,
+    STYLES,
+    TARGETS,
+    check,
+    export,
+    golden,
+    make_modules,
+)
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
@@ -20,6 +31,10 @@ from ..support.laws import LAWS, REF, wander
 pytestmark = [pytest.mark.apt, pytest.mark.timeout(300)]
 
 T_S = 1e-4
+PAGES = Path(__file__).parents[2] / "docs"
+FUSES = pytest.mark.skipif(
+    " fma " not in Path("/proc/cpuinfo").read_text(), reason="the processor has no FMA"
+)
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic",
           "-Werror", "-ffp-contract=off"]  # fmt: skip
 
@@ -74,7 +89,17 @@ def test_every_law_has_the_kernels_bits(
 def test_every_law_has_the_kernels_bits_on_a_processor(
     folders: Any, target: str, real: str, style: str
 ) -> None:
-    assert differing(folders[real, style], target, "-O2") == 0
+    found = check(folders[real, style], target)
+    assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
+    assert sum(c.differ for c in found) == 0
+    table = (PAGES / "tables" / "firmware_laws.md").read_text(encoding="utf-8")
+    compiler = TARGETS[target].prefix + TARGETS[target].compiler
+    if cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0] in table:
+        rows = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()]
+        at = next(k for k, head in enumerate(rows[0]) if f"{target} {real}, {style}" in head)
+        kept = {row[1]: row[at : at + 2] for row in rows[2:] if len(row) > at}
+        counts = {c.name: c.instructions or (0, 0) for c in found}
+        assert kept == {c.name: ["{}…{}".format(*counts[c.name]), str(c.code)] for c in found}
 
 
 def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
@@ -86,16 +111,28 @@ def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
     assert 100 < droop[0] <= droop[1] < mimo[0] <= mimo[1] < 1000
 
 
-@pytest.mark.skipif(
-    " fma " not in Path("/proc/cpuinfo").read_text(), reason="the processor has no FMA"
+@pytest.mark.parametrize(
+    ("target", "real", "flags"),
+    [
+        pytest.param("host", "float32", "-O3 -march=haswell", marks=FUSES),
+        pytest.param("host", "float64", "-O3 -march=haswell", marks=FUSES),
+        ("m4f", "float32", "-O2"),
+    ],
 )
-@pytest.mark.parametrize("real", REALS)
-def test_fused_multiply_add_is_found(tmp_path: Path, real: str) -> None:
+def test_fused_multiply_add_is_found(tmp_path: Path, target: str, real: str, flags: str) -> None:
     """The negative control: with it the bits differ, and the command says so by its exit code."""
     folder = str(exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle"))
-    assert main(["firmware", "check", folder]) == 0
-    flags = "--flags=-O3 -march=haswell -ffp-contract=fast"
-    assert main(["firmware", "check", folder, flags]) == 3
+    command = ["firmware", "check", folder, "--target", target]
+    assert main(command) == 0
+    assert main([*command, f"--flags={flags} -ffp-contract=fast"]) == 3
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_a_change_of_gains_has_the_kernels_bits(tmp_path: Path, style: Any) -> None:
+    laws = {"vsg-2": get_law("vsg-2"), "softer": get_law("vsg-2", D_p=0.02)}
+    for name, text in export(laws, T_S, "float32", style).items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    assert [c.differ for c in check(tmp_path, "host")] == [0, 0]
 
 
 def cc(folder: Path, *arguments: str, compiler: str = "gcc") -> subprocess.CompletedProcess[str]:
@@ -158,6 +195,16 @@ def test_no_symbol_of_libm_but_sqrt(folders: Any, real: str, tmp_path: Path) -> 
 def test_what_would_change_bits_does_not_compile(folders: Any, flag: str, why: str) -> None:
     done = cc(folders["float32", "unrolled"], "-std=c99", flag, "-fsyntax-only", "gfm_vsg_1.c")
     assert done.returncode != 0 and why in done.stderr
+
+
+def test_the_page_s_example_compiles(folders: Any) -> None:
+    page = (PAGES / "firmware.md").read_text(encoding="utf-8")
+    code = re.search(r"```c\n(.*?)```", page, re.DOTALL)
+    assert code is not None
+    folder = folders["float32", "unrolled"]
+    (folder / "example.txt").write_text("void block_the_bridge(void);\n" + code[1])
+    done = cc(folder, *STRICT, "-fsyntax-only", "-x", "c", "example.txt")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_cmake_builds_a_folder(folders: Any, tmp_path: Path) -> None:

@@ -21,8 +21,8 @@ from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
 Vector = NDArray[np.float64]
 
 LONGEST = 2.0  # s of a window that are looked at
-_SAMPLES = 400  # at most, for the pencil of the swing
-_FAST_SAMPLES = 300  # at most, for that of the fast mode
+_SAMPLES = 240  # at most, for the pencil of the swing
+_FAST_SAMPLES = 240  # at most, for that of the fast mode
 _A_PERIOD = 5  # samples, at least, in a period of the fast mode
 _TAPS = 20  # of the filter, for each tick of the stride
 _LEAST = 1e-4  # p.u.; a smaller amplitude is no swing

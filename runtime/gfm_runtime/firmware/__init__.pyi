@@ -1,7 +1,7 @@
 from .check import OPTIMISED, TARGETS, Checked, check
-from .folder import REALS, STYLES, export
+from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
-from .module import Module, Style, make_modules
+from .module import REALS, STYLES, Module, Style, make_modules
 
 __all__ = [
     "CHECKED",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modul
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.law import Law
 
-REALS = ("float32", "float64")
-STYLES: tuple[Style, ...] = get_args(Style)
-
 
 def export(laws: Mapping[str, Law], T_s: float, real: str, style: Style) -> dict[str, str]:
     """The files of a firmware folder by name.
@@ -25,8 +22,8 @@ def export(laws: Mapping[str, Law], T_s: float, real: str, style: Style) -> dict
     Args:
         laws: the laws by name; a change between any two of them is bumpless.
         T_s: sampling time, s.
-        real: one of ``REALS``.
-        style: one of ``STYLES``, see ``gfm_runtime.firmware.module``.
+        real: float32 or float64.
+        style: see ``gfm_runtime.firmware.module``.
 
     Raises:
         LawError: as ``make_modules``.

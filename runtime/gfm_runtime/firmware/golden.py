@@ -4,8 +4,9 @@ A row is one tick: what is done before the step, the references and measurements
 returns and leaves. All are the bits of numbers of the law's precision, or small integers, in words
 of its size. The inputs are 30 ticks each of: noise about the operating point; ramps of the
 references; the whole ranges of the signal table at random; the same extreme for long, so that u is
-limited; subnormal powers; measurements that are not finite or out of range, the safe state and its
-end; changes of law. They come from integers of PCG64, so they are the same on every machine.
+limited; powers that are subnormal or zeros of both signs; measurements that are not finite or out
+of range, the safe state and its end; changes of law. They come from integers of PCG64, so they are
+the same on every machine.
 """
 
 from __future__ import annotations
@@ -209,7 +210,9 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any]) -> Inputs:
             tiny = float(np.finfo(real).tiny)
             for values in (refs, ys):
                 values[at] = rest
-                values[at, 1], values[at, 3] = tiny * uniform(2, n)
+                signs = np.resize([1.0, -1.0, 0.0, -0.0], n)  # zeros of both signs too
+                values[at, 1], values[at, 3] = tiny * uniform(2, n) * [signs, np.roll(signs, 1)]
+            op[start + n // 2] = SWITCH
         elif kind == 5 and n == SEGMENT:
             bad, where = (uniform(2) * [6, NY]).astype(int)
             wrong = (np.nan, np.inf, -np.inf, y_low[where] - 1, y_high[where] + 1, np.nan)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -20,7 +20,7 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import filled, identifier, literal, literals, plain, template
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.inner import NEGLIGIBLE
-from gfm_runtime.kernel import pack_law
+from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
 from gfm_runtime.signals import TABLE_VERSION, Signal, group, table_hash
 from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
@@ -29,6 +29,8 @@ from gfm_runtime.tustin import discretise
 MADE = "Made by gfmhil firmware export; do not edit."
 
 Style = Literal["unrolled", "records"]
+STYLES: tuple[Style, ...] = get_args(Style)
+REALS = ("float32", "float64")
 
 #: what a step returns; the bench's scenario refuses a reference out of range before it gets here
 BAD_REF = len(REASONS)
@@ -85,8 +87,7 @@ def make_modules(laws: Mapping[str, Law], T_s: float, real: DTypeLike) -> list[M
     """The laws by name, discretised at T_s [s] and packed in float32 or float64.
 
     Raises:
-        LawError: a law that does not discretise, one with an inner stage, a name without a letter,
-            or two names that are the same in C.
+        LawError: a law that does not discretise, one with an inner stage, and as ``check_modules``.
     """
     for name, law in laws.items():
         if law.inner is not None:
@@ -94,15 +95,32 @@ def make_modules(laws: Mapping[str, Law], T_s: float, real: DTypeLike) -> list[M
     modules = [
         Module(name, law, pack_law(discretise(law, T_s), real)[0]) for name, law in laws.items()
     ]
+    check_modules(modules)
+    return modules
+
+
+def check_modules(modules: Sequence[Module]) -> None:
+    """Refuse what C cannot hold.
+
+    Raises:
+        LawError: a number of states or an error map that the kernel does not know, a constant that
+            is not finite, a name without a letter, or two names that are the same in C.
+    """
     taken: dict[str, str] = {}
     for module in modules:
+        where = f"law {module.name!r}"
+        if not 0 <= module.n <= N_MAX:
+            raise LawError(where, f"{module.n} states must be 0 to {N_MAX}")
+        if int(module.record["error_map"]) not in ERROR_MAPS.values():
+            raise LawError(where, f"error map {module.record['error_map']} is not known")
+        for field in NUMBERS:
+            if not np.isfinite(module.record[field]).all():
+                raise LawError(where, f"{field} must be finite in {module.real}")
         if module.prefix == "gfm_":
-            raise LawError(f"law {module.name!r}", "its name has no letter or digit for C")
+            raise LawError(where, "its name has no letter or digit for C")
         if module.prefix in taken:
-            other = taken[module.prefix]
-            raise LawError(f"law {module.name!r}", f"{other!r} has the same name in C")
+            raise LawError(where, f"{taken[module.prefix]!r} has the same name in C")
         taken[module.prefix] = module.name
-    return modules
 
 
 def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:

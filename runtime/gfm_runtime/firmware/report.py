@@ -17,7 +17,15 @@ import numpy as np
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal, template
-from gfm_runtime.firmware.module import INTEGERS, NUMBERS, Module, Style
+from gfm_runtime.firmware.module import (
+    INTEGERS,
+    NUMBERS,
+    REALS,
+    STYLES,
+    Module,
+    Style,
+    check_modules,
+)
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.kernel import law_dtype
 from gfm_runtime.signals import NU, NY, group, table_hash
@@ -31,7 +39,6 @@ class Exported(NamedTuple):
     modules: list[Module]
     real: str
     style: Style
-    T_s: float
 
 
 def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
@@ -72,25 +79,36 @@ def read_report(folder: Path) -> Exported:
     """
     path = folder / "report.json"
     try:
-        whole = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise LawError(str(path), "is not there; gfmhil firmware export writes it") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as problem:
+    except UnicodeDecodeError:
+        raise LawError(str(path), "is not a text in UTF-8") from None
+    try:
+        whole = json.loads(text)
+    except (ValueError, RecursionError) as problem:
         raise LawError(str(path), f"is not JSON: {problem}") from None
     try:
-        if whole["format"] != FORMAT:
-            raise LawError(str(path), f"format {whole['format']!r} must be {FORMAT}")
-        dtype = law_dtype(whole["real"])
-        modules = [
-            Module(law["name"], None, _record(law["record"], dtype)) for law in whole["laws"]
-        ]
-        return Exported(modules, whole["real"], whole["style"], whole["T_s"])
-    except (KeyError, TypeError, ValueError) as problem:
-        if isinstance(problem, LawError):
-            raise
-        raise LawError(
-            str(path), f"is not a report of gfmhil firmware export: {problem!r}"
-        ) from None
+        return _exported(whole)
+    except LawError as problem:
+        raise problem.within(str(path)) from None
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, IndexError):
+        raise LawError(str(path), "is not as gfmhil firmware export writes it") from None
+
+
+@np.errstate(over="ignore")  # what overflows is refused
+def _exported(whole: Any) -> Exported:
+    for key, allowed in (("format", (FORMAT,)), ("real", REALS), ("style", STYLES)):
+        if whole[key] not in allowed:
+            raise LawError(key, f"{whole[key]!r} must be {' or '.join(map(str, allowed))}")
+    dtype = law_dtype(whole["real"])
+    modules = [
+        Module(str(law["name"]), None, _record(law["record"], dtype)) for law in whole["laws"]
+    ]
+    if not modules:
+        raise LawError("laws", "there must be one")
+    check_modules(modules)
+    return Exported(modules, whole["real"], whole["style"])
 
 
 def _hex(value: Any) -> str | int:
@@ -105,7 +123,7 @@ def _record(fields: Mapping[str, Any], dtype: np.dtype[Any]) -> np.void:
     for name in (*INTEGERS, *NUMBERS):
         text = fields[name]
         if name in INTEGERS:
-            out[0][name] = text
+            out[0][name] = int(text)
         else:
             numbers = [float.fromhex(word) for word in text.split()]
             out[0][name] = np.reshape(numbers, dtype[name].shape)

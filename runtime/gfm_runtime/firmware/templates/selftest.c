@@ -9,7 +9,8 @@
 
 @LAW_INCLUDES@
 
-/* Counts up, if given: e.g. -DGOLDEN_CLOCK=DWT->CYCCNT on a Cortex-M counts cycles of a step. */
+/* -DGOLDEN_CLOCK=name: your function that reads a counter, e.g. DWT->CYCCNT of a Cortex-M; after
+ * each row golden_elapsed is what a step took. */
 #ifdef GOLDEN_CLOCK
 unsigned long GOLDEN_CLOCK(void);
 #else

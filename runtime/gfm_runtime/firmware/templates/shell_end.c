@@ -55,6 +55,12 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
     return @GUARD@_OK;
 }
 
+/* The output for all but step. */
+static void evaluate(@LAW@const @P@_t *s, tick_t *t)
+{
+    output(@law@s, t);
+}
+
 int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
 {
     tick_t t;
@@ -62,7 +68,7 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
     if (reason != @GUARD@_OK)
         return reason;
     set_inputs(@law@&t, ref, y);
-    output(@law@s, &t);
+    evaluate(@law@s, &t);
     for (i = 0; i < @GUARD@_NU; i++)
         u[i] = t.u[i];
     return @GUARD@_OK;
@@ -82,12 +88,12 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
     }
     set_states(@law@s, &t, u);
     /* the offset takes the rest: all of it in a row without states, rounding in the others */
-    output(@law@s, &t);
+    evaluate(@law@s, &t);
     s->offset[1] = (u[1] - t.raw[1]) / @LOOP@;
-    output(@law@s, &t);
+    evaluate(@law@s, &t);
     s->offset[0] = u[0] - t.raw[0];
     s->offset[2] = u[2] - t.raw[2];
-    output(@law@s, &t);
+    evaluate(@law@s, &t);
     for (i = 0; i < @GUARD@_NU; i++)
         u[i] = t.u[i];
     return @GUARD@_OK;
