@@ -38,17 +38,18 @@ _RUN = "0123456789abcdef"
 
 
 def frame_layout() -> str:
-    """Both frames side by side, a row a field."""
-    layouts = {name: frame_dtype(name) for name in ("y", "u")}
+    """Both frames side by side, and those of a run with an inner stage, a row a field."""
+    layouts = {(name, inner): frame_dtype(name, inner) for inner in (False, True) for name in "yu"}
     rows = []
-    names = dict.fromkeys(name for d in layouts.values() for name in (d.names or ())[:-1])
+    names = dict.fromkeys(n for d in layouts.values() for n in (d.names or ())[:-1])
     for name in (*names, "crc"):
         places = {g: d.fields[name] for g, d in layouts.items() if d.fields and name in d.fields}
         kind = next(iter(places.values()))[0].str.lstrip("|")
         cells = [str(places[g][1]) if g in places else "–" for g in layouts]
         rows.append([f"`{name}`", _KINDS[kind], *cells, _MEANING.get(name, "p.u.")])
     rows.append(["size", "", *(str(d.itemsize) for d in layouts.values()), "bytes"])
-    return markdown(["field", "type", "at byte of $y$", "at byte of $u$", ""], rows)
+    heads = [f"at byte of ${n}$" + ", inner stage" * inner for n, inner in layouts]
+    return markdown(["field", "type", *heads, ""], rows)
 
 
 def frame_examples() -> str:

@@ -89,9 +89,13 @@ def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[2])
     before = cached(root)
     assert before
-    for link in link_names():
-        scenario = make(link={"type": link, "peer_timeout_s": 60.0}, duration=0.01)
-        run = run_scenario(scenario, tmp_path / link, notice=said.append, figures=False)
+    kinds = [(link, inner) for link in link_names() for inner in ("none", "virtual-stator")]
+    for link, inner in kinds:
+        options = {"every": 2} if link == "can" else {}
+        about = {"type": link, "peer_timeout_s": 60.0, "options": options}
+        scenario = make(link=about, duration=0.005, inner=inner)
+        folder = tmp_path / f"{link}-{inner}"
+        run = run_scenario(scenario, folder, notice=said.append, figures=False)
         assert run.summary["status"] == "completed"
-    assert said == ["starting controller and plant …"] * len(link_names())
+    assert said == ["starting controller and plant …"] * len(kinds)
     assert cached(root) == before

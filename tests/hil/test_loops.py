@@ -22,10 +22,11 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, Port, open_link, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
+from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime.signals import names
+from gfm_runtime.signals import carried
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 
 from ..support.frames import resealed
@@ -169,7 +170,7 @@ def test_misses_are_the_ticks_whose_u_was_not_received_in_time(link, make, place
     assert (pair.timing["plant_woke"] >= due).all()
     there = received >= 0
     assert (received[there] >= pair.timing["plant_sent"][there]).all()
-    u = np.stack([pair.signals[f"u_{n}"] for n in names("u")], axis=1)
+    u = np.stack([pair.signals[f"u_{n}"] for n in carried("u", False)], axis=1)
     held = np.flatnonzero(~there[1:]) + 1
     for k in held[received[held - 1] >= 0]:  # a first miss: u of the tick before, or an older one
         assert u[k].tobytes() == u[k - 1].tobytes()
@@ -189,12 +190,14 @@ def test_a_plant_that_hears_nothing_blocks_after_hold_and_one_more(hold, make, p
     )
 
 
-def frames(group: str, *ticks: int, state: int = RUNNING, reason: int = 0) -> list[bytes]:
+def frames(
+    group: str, *ticks: int, state: int = RUNNING, reason: int = 0, inner: bool = False
+) -> list[bytes]:
     """Good frames of those ticks, in sequence, with different values."""
-    writer = FrameWriter(group)
-    width = len(names(group))
-    return [writer.pack(k, state, reason, ONES[group] + 0.001 * k * np.arange(width))
-            for k in ticks]  # fmt: skip
+    writer = FrameWriter(group, inner)
+    width = len(carried(group, inner))
+    ones = np.resize(ONES[group], width)
+    return [writer.pack(k, state, reason, ones + 0.001 * k * np.arange(width)) for k in ticks]
 
 
 ONES = {"y": np.array([1.0, 0.5, 1.0, 0.0, 1.0]), "u": np.array([0.3, 1.0, 1.0])}
@@ -234,7 +237,7 @@ def alone(
     """Run one side's loop over messages that are in the link before it starts."""
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
     bench = make_bench(scenario)
-    part = Part.create(folder, role, scenario.ticks)
+    part = Part.create(folder, role, scenario.ticks, bench.inner)
     compile_role(role, bench, part)
     ends = {s: open_link(link, s, endpoint) for s in ROLES}
     other: Role = "plant" if role == "controller" else "controller"
@@ -245,8 +248,8 @@ def alone(
         assert not heard or ends[role].wait(30)
         t0 = time.monotonic_ns()
         reader = run_loop(role, bench, ends[role], part, timeline, t0, stopped)
-        answers = FrameReader("u" if role == "controller" else "y")
-        values, said = np.zeros(len(names(answers.group))), []
+        answers = FrameReader("u" if role == "controller" else "y", bench.inner)
+        values, said = np.zeros(len(carried(answers.group, bench.inner))), []
         while ends[other].wait(0.05):
             message = ends[other].receive()
             assert message is not None
@@ -264,12 +267,17 @@ def answered(found: Alone) -> list[int]:
     return [tick for tick, state, _ in found.said if state == RUNNING]
 
 
-def test_extrapolation_is_a_straight_line_through_the_last_two_and_then_hold(place, make):
-    content = {**REALTIME, "late_policy": {"hold": 20, "extrapolate": 6}}
-    plant = alone("plant", make(**content), place, frames("u", 0, 1))
-    u = plant.part.signals[:, 5:8]
+@pytest.mark.parametrize("inner", ["none", "virtual-stator"])
+def test_extrapolation_is_a_straight_line_through_the_last_two_and_then_hold(inner, place, make):
+    content = {**REALTIME, "late_policy": {"hold": 20, "extrapolate": 6}, "inner": inner}
+    content["plant"] = {"protection": {"over_current": {"enabled": False}}}
+    stage = inner != "none"
+    plant = alone("plant", make(**content), place, frames("u", 0, 1, inner=stage))
+    columns = signals_of("plant", stage)
+    u = plant.part.signals[:, [columns.index(f"u_{n}") for n in carried("u", stage)]]
     assert plant.end == ("safe", "no fresh u for longer than late_policy.hold allows", 23)
-    first, last = ONES["u"], ONES["u"] + 0.001 * np.arange(3)
+    first = np.resize(ONES["u"], 3 + stage)
+    last = first + 0.001 * np.arange(3 + stage)
     assert (u[0] == first).all() and (u[1] == last).all()
     for n in range(1, 7):
         assert u[1 + n].tobytes() == (last + n * (last - first)).tobytes()

@@ -91,11 +91,15 @@ def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
         How many sets of functions numba had to compile, and how many there are.
     """
     scenario = Scenario(title="warm-up", duration=1.0)
+    limited = Scenario(title="warm-up", duration=1.0, inner="virtual-stator")
     found: list[Bench] = []
+    inner: list[Bench] = []
     sets: list[Set] = [
         ("the operating point", lambda: found.append(make_bench(scenario))),
         _both(found),
         *(_role(role, found) for role in ROLES),
+        ("the operating point of an inner stage", lambda: inner.append(make_bench(limited))),
+        *(_role(role, inner, " with an inner stage") for role in ROLES),
         *(_link(name, {}) for name in link_names()),
         ("a link's impairment", impaired.warm_up),
         _IDLE,
@@ -110,12 +114,12 @@ def _both(found: list[Bench]) -> Set:
     return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1, found[0].inner))
 
 
-def _role(role: Role, found: list[Bench]) -> Set:
+def _role(role: Role, found: list[Bench], which: str = "") -> Set:
     def compile_it() -> None:
         plant, controller = buffers(1, found[0].inner)
         compile_role(role, found[0], plant if role == "plant" else controller)
 
-    return f"the {role}", compile_it
+    return f"the {role}{which}", compile_it
 
 
 def _link(name: str, options: dict[str, Any], inner: bool = False) -> Set:
