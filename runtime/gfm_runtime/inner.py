@@ -91,8 +91,8 @@ class Inner:
     k_ff: float = 0.6
     I_thr: float = 1.0
     k_thr: float = 0.67
-    sigma: float = 1.0
-    f_i: float = 100.0
+    sigma: float = 2.0
+    f_i: float = 10.0
     m: float = SPACE_VECTOR
     freeze: bool = True
     P_max: float = math.inf

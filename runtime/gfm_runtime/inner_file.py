@@ -84,8 +84,8 @@ class ThresholdImpedance(_WithVoltageLoop):
     type: Literal["threshold-impedance"] = Field(description="kind of stage")
     I_thr: Number = Field(1.0, description="threshold, p.u.")
     k_thr: Number = Field(0.67, description="impedance per current beyond the threshold, p.u.")
-    sigma: Number = Field(1.0, description="X/R of that impedance")
-    f_i: Number = Field(100.0, description="low-pass on i, Hz")
+    sigma: Number = Field(2.0, description="X/R of that impedance")
+    f_i: Number = Field(10.0, description="low-pass on i, Hz")
 
 
 MODELS: dict[str, type[Table]] = {
