@@ -199,6 +199,11 @@ def test_signals_can_be_chosen(page: Browser) -> None:
     wait_for(lambda: page.js(count) == 6)
     wait_for(lambda: page.text("[data-strip=angle] .now") not in ("", "–"))
     assert page.text("[data-strip=dc] .now") == ""
+    page.click("#signal-list [data-strip=inner]")
+    page.click("#signal-list [data-strip=bridge]")
+    wait_for(lambda: page.js(count) == 8)
+    # this run has no inner stage
+    assert [page.text(f"[data-strip={name}] .now") for name in ("inner", "bridge")] == ["–", "–"]
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
