@@ -1,9 +1,10 @@
 """Settings for the whole suite, and its tiers.
 
 ``python -m pytest`` runs the fast tier: what needs no process of its own, in parallel. The other
-tiers are marked and run one test at a time, because they measure out processors and ports:
+tiers are marked; the last two run one test at a time, as they measure out processors and ports:
 
-* ``full``: every law where the fast tier takes one of each structure, and long computations,
+* ``full``: every law where the fast tier takes one of each structure, long computations, and
+  compilers from apt,
 * ``processes``: real processes, sockets, real time,
 * ``systems``: a browser, user-mode Linux, systemd, a C compiler, kills, soaks.
 
@@ -33,7 +34,7 @@ settings.load_profile("gfmhil")
 settings.register_profile("fuzz", deadline=60_000, max_examples=20_000)
 
 _MOST_WORKERS = 8  # more would compile the same functions once more each
-_SYSTEMS = ("apt", "soak", "uml")
+_TIER_OF = {**dict.fromkeys(("apt", "soak", "uml"), "systems"), "compilers": "full"}
 FAST, TIERS = "fast", ("full", "processes", "systems")
 
 
@@ -76,5 +77,5 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def tier(markers: Iterable[pytest.Mark]) -> str:
     """The last of ``TIERS`` that a test is marked with; fast if it is marked with none."""
-    names = {"systems" if mark.name in _SYSTEMS else mark.name for mark in markers}
+    names = {_TIER_OF.get(mark.name, mark.name) for mark in markers}
     return max((t for t in TIERS if t in names), key=TIERS.index, default=FAST)

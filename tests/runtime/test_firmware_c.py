@@ -17,7 +17,6 @@ from gfm_runtime.firmware import (
     CHECKED,
     REALS,
     STYLES,
-    TARGETS,
     check,
     export,
     golden,
@@ -26,25 +25,17 @@ from gfm_runtime.firmware import (
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
+from ..support.firmware import T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
-pytestmark = [pytest.mark.apt, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
 
-T_S = 1e-4
 PAGES = Path(__file__).parents[2] / "docs"
 FUSES = pytest.mark.skipif(
     " fma " not in Path("/proc/cpuinfo").read_text(), reason="the processor has no FMA"
 )
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic",
           "-Werror", "-ffp-contract=off"]  # fmt: skip
-
-
-def exported(folder: Path, real: str, style: Any, *names: str) -> Path:
-    """A folder with laws, all by default."""
-    laws = {name: LAWS[name] for name in names} or LAWS
-    for name, text in export(laws, T_S, real, style).items():
-        (folder / name).write_text(text, encoding="utf-8")
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -80,44 +71,10 @@ def test_every_law_has_the_kernels_bits(
 
 
 @pytest.mark.parametrize(
-    ("target", "real", "style"),
-    [
-        ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
-        ("m7", "float64", "unrolled"), ("rv64", "float64", "unrolled"),
-    ],
-)  # fmt: skip
-def test_every_law_has_the_kernels_bits_on_a_processor(
-    folders: Any, target: str, real: str, style: str
-) -> None:
-    found = check(folders[real, style], target)
-    assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
-    assert sum(c.differ for c in found) == 0
-    table = (PAGES / "tables" / "firmware_laws.md").read_text(encoding="utf-8")
-    compiler = TARGETS[target].prefix + TARGETS[target].compiler
-    if cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0] in table:
-        rows = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()]
-        at = next(k for k, head in enumerate(rows[0]) if f"{target} {real}, {style}" in head)
-        kept = {row[1]: row[at : at + 2] for row in rows[2:] if len(row) > at}
-        counts = {c.name: c.instructions or (0, 0) for c in found}
-        now = {c.name: ["{}…{}".format(*counts[c.name]), str(c.code)] for c in found}
-        assert kept == now, "python docs/make_firmware_tables.py makes the table anew"
-
-
-def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
-    folder = exported(tmp_path, "float32", "unrolled", "droop-1", "mimo-gfm")
-    first, again = (check(folder, "m4f", ticks=210) for _ in range(2))
-    assert first == again
-    droop, mimo = (c.instructions for c in first)
-    assert droop is not None and mimo is not None
-    assert 100 < droop[0] <= droop[1] < mimo[0] <= mimo[1] < 1000
-
-
-@pytest.mark.parametrize(
     ("target", "real", "flags"),
     [
         pytest.param("host", "float32", "-O3 -march=haswell", marks=FUSES),
         pytest.param("host", "float64", "-O3 -march=haswell", marks=FUSES),
-        ("m4f", "float32", "-O2"),
     ],
 )
 def test_fused_multiply_add_is_found(tmp_path: Path, target: str, real: str, flags: str) -> None:
@@ -134,12 +91,6 @@ def test_a_change_of_gains_has_the_kernels_bits(tmp_path: Path, style: Any) -> N
     for name, text in export(laws, T_S, "float32", style).items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     assert [c.differ for c in check(tmp_path, "host")] == [0, 0]
-
-
-def cc(folder: Path, *arguments: str, compiler: str = "gcc") -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False
-    )
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])

@@ -1,0 +1,64 @@
+"""Firmware on processors in QEMU: every bit of every law, and counts that are kept."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from gfm_hil.cli import main
+from gfm_runtime.firmware import CHECKED, TARGETS, check
+
+from ..support.firmware import cc, exported
+from ..support.laws import LAWS
+
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+
+PAGES = Path(__file__).parents[2] / "docs"
+RISC_V = pytest.mark.skipif(
+    not all(map(shutil.which, ("riscv64-unknown-elf-gcc", "qemu-system-riscv64"))),
+    reason="no RISC-V toolchain; it takes a gigabyte, so CI goes without",
+)
+
+
+@pytest.mark.parametrize(
+    ("target", "real", "style"),
+    [
+        ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
+        ("m7", "float64", "unrolled"),
+        pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
+    ],
+)  # fmt: skip
+def test_every_law_has_the_kernels_bits_on_a_processor(
+    tmp_path: Path, target: str, real: str, style: str
+) -> None:
+    found = check(exported(tmp_path, real, style), target)
+    assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
+    assert sum(c.differ for c in found) == 0
+    table = (PAGES / "tables" / "firmware_laws.md").read_text(encoding="utf-8")
+    compiler = TARGETS[target].prefix + TARGETS[target].compiler
+    if cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0] in table:
+        rows = [[cell.strip() for cell in line.split("|")] for line in table.splitlines()]
+        at = next(k for k, head in enumerate(rows[0]) if f"{target} {real}, {style}" in head)
+        kept = {row[1]: row[at : at + 2] for row in rows[2:] if len(row) > at}
+        counts = {c.name: c.instructions or (0, 0) for c in found}
+        now = {c.name: ["{}…{}".format(*counts[c.name]), str(c.code)] for c in found}
+        assert kept == now, "python docs/make_firmware_tables.py makes the table anew"
+
+
+def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
+    folder = exported(tmp_path, "float32", "unrolled", "droop-1", "mimo-gfm")
+    first, again = (check(folder, "m4f", ticks=210) for _ in range(2))
+    assert first == again
+    droop, mimo = (c.instructions for c in first)
+    assert droop is not None and mimo is not None
+    assert 100 < droop[0] <= droop[1] < mimo[0] <= mimo[1] < 1000
+
+
+def test_fused_multiply_add_is_found_on_a_processor(tmp_path: Path) -> None:
+    """The negative control: with it the bits differ, and the command says so by its exit code."""
+    folder = str(exported(tmp_path, "float32", "unrolled", "vsg-1", "hybrid-angle"))
+    command = ["firmware", "check", folder, "--target", "m4f"]
+    assert main(command) == 0
+    assert main([*command, "--flags=-O2 -ffp-contract=fast"]) == 3
