@@ -176,6 +176,7 @@ def test_the_locks_fit_the_project_and_every_line_has_hashes(
     attack_now(f"refused by pip: {len(lines)} packages of {name} carry their hashes")
 
 
+@pytest.mark.full
 def test_the_bill_of_materials_names_versions_and_licences(tmp_path: Path) -> None:
     pytest.importorskip("cyclonedx_py")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"

@@ -38,6 +38,9 @@ TRIPPING = {"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}}
 GRID = {"grid": {"scr": 3.0, "x_over_r": 10.0}}
 
 
+pytestmark = pytest.mark.full  # loops of another shape to compile
+
+
 @pytest.fixture
 def limited(tmp_path: Path) -> str:
     """A law file with an inner stage of its own."""

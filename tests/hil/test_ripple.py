@@ -97,6 +97,7 @@ def limit_cycle(**changed: Any) -> Any:
     )  # fmt: skip
 
 
+@pytest.mark.full
 def test_the_limit_cycle_of_the_rounded_output_fails_a_run_everywhere(tmp_path, capsys):
     content = limit_cycle().model_dump(mode="json", exclude_none=True)
     del content["expect_reason"], content["expect_after"]

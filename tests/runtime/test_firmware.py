@@ -48,6 +48,7 @@ def columns(rows: Any, real: str, *prefixes: str) -> list[Any]:
 # --- golden rows ---
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", LAWS)
 def test_golden_rows_are_what_the_controller_does(name: str) -> None:
     """Rows in float64 against ``control``, the tick of the bench: u, states, refusals, changes."""
@@ -79,6 +80,7 @@ def test_golden_rows_are_what_the_controller_does(name: str) -> None:
         np.testing.assert_array_equal(trends[k], state["trend"])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("real", REALS)
 def test_golden_rows_reach_all_paths(real: str) -> None:
     modules = make_modules(of("mimo-gfm", "vsg-1"), T_S, real)

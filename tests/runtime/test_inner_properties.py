@@ -124,6 +124,7 @@ def test_a_change_of_law_and_stage_leaves_the_bridges_voltage_where_it_was(
     assert abs(complex(u[2], u[3]) - before) < 400 * EPS[real]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", STAGES)
 @pytest.mark.parametrize("priority", PRIORITIES)
 def test_float32_stays_close_to_float64(kind: str, priority: str) -> None:

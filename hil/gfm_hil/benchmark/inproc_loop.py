@@ -70,10 +70,10 @@ def controller_alone(ctl, laws, states, est, y, u, ys):
 
 
 @compiled
-def recording_alone(par, st, ctl, est, y, u, plant_rows, controller_rows):
+def recording_alone(par, st, ctl, states, est, y, u, plant_rows, controller_rows):
     """Record the same tick into every row."""
     for k in range(len(plant_rows)):
-        record_controller(controller_rows[k], ctl, est)
+        record_controller(controller_rows[k], ctl, states, est)
         record_sample(plant_rows[k], y, par, st)
         record_command(plant_rows[k], u)
 
@@ -141,7 +141,9 @@ class Loop:
         """ns per tick of the recording alone."""
         b, c = self.reset(), self.bench.controller
         rows = (self.plant, self.controller)
-        return self._per_tick(lambda: recording_alone(b.par, b.st, c.ctl, c.est, b.y, b.u, *rows))
+        return self._per_tick(
+            lambda: recording_alone(b.par, b.st, c.ctl, c.states, c.est, b.y, b.u, *rows)
+        )
 
     def allocations_per_tick(self) -> float:
         """Allocations of numba's runtime per tick; those per call cancel."""
