@@ -30,7 +30,7 @@ from ..support.scope import addresses, mute
 pytestmark = pytest.mark.processes
 
 PAGES, CONNECTIONS, DESCRIPTORS = 200, 2000, 1024
-TURN_S = 5.0
+TURN_S = 3.0
 LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "roll", "span": 2.0}
 
 

@@ -59,7 +59,7 @@ def differing(folder: Path, target: str, flags: str) -> int:
 @pytest.mark.parametrize(
     ("target", "style", "flags"),
     [
-        *[("host", "unrolled", f"-O{level}") for level in range(4)],
+        *[("host", "unrolled", f"-O{level}") for level in (0, 2, 3)],
         ("host", "records", "-O2"),
         ("clang", "unrolled", "-O2"),
     ],
