@@ -113,11 +113,13 @@ def _part(name: str) -> Any:
     k, (dtype, _) = list(_SIZES).index(name), _SIZES[name]
     first, last = int(_ENDS[k - 1]) if k else 0, int(_ENDS[k])
 
-    @cached
     def part(handle):
         return handle[first:last].view(dtype)
 
-    return part
+    # numba tells functions apart by name and by a number that counts in each process. Two parts of
+    # one name, compiled by two processes and loaded from its cache by a third, could be confused.
+    part.__qualname__ = part.__name__ = f"part_{name}"
+    return cached(part)
 
 
 _state, _sockets, _sender, _receiver, _joiner, _subrate, _bus, _places, _out, _into = map(
