@@ -168,7 +168,7 @@ def plant_step(par: PlantRecord, st: PlantRecord) -> None:
 
 @compiled
 def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> None:
-    """Write the true values at this tick to out (11,), in the order of `TRUTH`."""
+    """Write the true values at this tick to out (15,), in the order of `TRUTH`."""
     r, s = par[0], st[0]
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
@@ -184,6 +184,7 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
         i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
         i_max = r.i_max if s.trip == 0 else 0.0
         out[10] = min(max(i_dc, -i_max), i_max)
+    out[11], out[12], out[13], out[14] = s.w[V, 0], s.w[V, 1], s.w[I_F, 0], s.w[I_F, 1]
 
 
 @compiled

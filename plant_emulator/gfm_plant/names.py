@@ -39,6 +39,8 @@ NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
 """Indices of the y that pass the sensors; omega_u is a command and known exactly."""
 
-TRUTH = (*Y_NAMES, "i", "delta", *D_NAMES, "trip", "i_dc")
+TRUTH = (*Y_NAMES, "i", "delta", *D_NAMES, "trip", "i_dc", "v_re", "v_im", "i_re", "i_im")
 """What `plant_truth` writes, in this order, in p.u.: i is |i_dq|, i_dc the current of the DC
-source, delta is in rad, and trip is a key of `TRIP_REASONS`."""
+source, delta is in rad, and trip is a key of `TRIP_REASONS`. The last four are the space vectors of
+the capacitor's voltage and the bridge's current in the common frame, which turns at omega_b; the
+grid's voltage lies on its real axis at tick 0."""

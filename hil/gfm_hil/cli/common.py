@@ -40,6 +40,7 @@ _OPTIONS = {
     "seed": "--seed",
     "law": "--law",
     "inner": "--inner",
+    "waveforms": "--waveforms",
 }
 
 
@@ -70,6 +71,15 @@ def _link_option(text: str) -> tuple[str, Any]:
         return key, tomllib.loads(f"x = {value}")["x"]
     except tomllib.TOMLDecodeError:
         return key, value
+
+
+def window(text: str) -> list[float]:
+    """FROM:TO in s, as [from, to]."""
+    try:
+        start, stop = map(float, text.split(":"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be FROM:TO, two numbers in s") from None
+    return [start, stop]
 
 
 def resolve(options: argparse.Namespace, **more: Any) -> Scenario:

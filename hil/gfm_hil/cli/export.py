@@ -15,6 +15,11 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--format", choices=list(FORMATS), help="by the ending of FILE if not given"
     )
+    command.add_argument(
+        "--three-phase", choices=["pu", "si"],
+        help="add v_abc of the filter capacitor and i_abc of the bridge and of the line, in p.u. "
+        "or in V and A",
+    )  # fmt: skip
     command.add_argument("-o", "--out", type=Path, metavar="FILE", help="the run's name by default")
 
 
@@ -30,6 +35,6 @@ def call(options: argparse.Namespace) -> int:
         file = Path(f"{options.folder.resolve().name}.{name}")
     if not file.name:
         raise UserError(f"--out {file}: must name a file")
-    for path in export_run(options.folder, name, file):
+    for path in export_run(options.folder, name, file, options.three_phase):
         print(path)
     return 0

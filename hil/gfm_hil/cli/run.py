@@ -14,6 +14,7 @@ from gfm_hil.cli.common import (
     print_summary,
     progress_bar,
     resolve,
+    window,
 )
 from gfm_hil.cli.companion import companion
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
@@ -32,6 +33,10 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.add_argument("--no-figures", action="store_true", help="neither figures nor report")
     command.add_argument(
+        "--waveforms", type=window, metavar="FROM:TO",
+        help="override waveforms: the window of the figure of the three phases, s",
+    )  # fmt: skip
+    command.add_argument(
         "--scope", nargs="?", type=int, const=-1, metavar="PORT",
         help="serve a scope of it to the browser; it stays when the run is over, until Ctrl-C",
     )  # fmt: skip
@@ -46,7 +51,7 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    scenario = resolve(options, law=options.law)
+    scenario = resolve(options, law=options.law, waveforms=options.waveforms)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
     with contextlib.ExitStack() as stack:
         scope = None

@@ -156,6 +156,12 @@ def _time(role: Role, name: str) -> Described:
     return Described(f"{role}_{name}", "", "ns", f"{clock}{_TIMES[name]}")
 
 
+#: letter, base and meaning; both parts of each are recorded, see `gfm_plant.TRUTH`
+_SPACE_VECTORS = (
+    ("v", "p.u. (V_n)", "voltage of C_f"), ("i", "p.u. (S_n/V_n)", "current of L_f"),
+)  # fmt: skip
+
+
 def _table() -> dict[str, Described]:
     rows = [
         Described("tick", "k", "", "number of the tick"),
@@ -172,6 +178,14 @@ def _table() -> dict[str, Described]:
             "angle of the converter's frame ahead of the grid's", _TRUE,
         ),
         Described("true_i_dc", "i_{dc}", "p.u. (S_n/V_dcref)", "current of the DC source", _TRUE),
+        *(
+            Described(
+                f"true_{n}_{part}", rf"\{sign} {n}", base,
+                f"space vector of the {what}, {axis} in the frame that turns at omega_n", _TRUE,
+            )
+            for n, base, what in _SPACE_VECTORS
+            for part, sign, axis in (("re", "Re", "real part"), ("im", "Im", "imaginary part"))
+        ),
         Described(
             "true_trip", "", "", "what has tripped", _TRUE, tuple(TRIP_REASONS.items())
         ),
@@ -202,12 +216,48 @@ def _table() -> dict[str, Described]:
 TABLE = _table()
 """Every column that a recording may have by its name, in the order of the files."""
 
+PHASES = ("a", "b", "c")
+WAVES = {"v": "V", "i": "A", "i_o": "A"}  #: what has three phases, and its unit in SI
+
+
+def wave(name: str, phase: str, si: bool) -> str:
+    """The name of a derived column: a phase of one of ``WAVES``, in p.u., or in V or A."""
+    return f"{name}{'' if name == 'i_o' else '_'}{phase}{f'_{WAVES[name]}' if si else ''}"
+
+
+def _derived() -> dict[str, Described]:
+    meanings = {
+        "v": ("p.u. (sqrt(2/3) V_n)", "voltage of C_f"),
+        "i": ("p.u. (sqrt(2/3) S_n/V_n)", "current of L_f"),
+        "i_o": ("p.u. (sqrt(2/3) S_n/V_n)", "current of the line, towards the grid"),
+    }
+    rows = [
+        Described(
+            wave(name, phase, si),
+            f"{name}{phase}" if name == "i_o" else f"{name}_{phase}",
+            WAVES[name] if si else base,
+            f"{quantity}, phase {phase}",
+            _TRUE,
+        )
+        for si in (False, True)
+        for name, (base, quantity) in meanings.items()
+        for phase in PHASES
+    ]
+    return {row.name: row for row in rows}
+
+
+DERIVED = _derived()
+"""The columns of `gfm_hil.results.waveforms`: they are not recorded but follow from what is.
+
+A phase's voltage is that against the star point of the three: with three wires there is no zero
+sequence."""
+
 HERTZ = "f_hz"
 """The converter's frequency in Hz, which is derived: true_omega_u times the nominal frequency."""
 
 
 def describe(name: str, laws: list[str]) -> Described:
-    """A column of signals.npz or timing.npz, by its name there.
+    """A column of signals.npz or timing.npz, by its name there, or one of ``DERIVED``.
 
     Args:
         name: of the column.
@@ -216,9 +266,9 @@ def describe(name: str, laws: list[str]) -> Described:
     Raises:
         UserError: there is no such column.
     """
-    if name not in TABLE:
+    row = TABLE.get(name) or DERIVED.get(name)
+    if row is None:
         raise UserError(f"column {name!r}: unknown; a recording has {[*TABLE]}")
-    row = TABLE[name]
     return replace(row, words=tuple(enumerate(laws))) if name == "law" else row
 
 

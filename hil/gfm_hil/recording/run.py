@@ -20,7 +20,7 @@ from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.profiles import look_beside
-from gfm_plant import load_converter
+from gfm_plant import Bases, load_converter
 from gfm_runtime.toml_file import read_toml
 
 if TYPE_CHECKING:
@@ -215,17 +215,22 @@ def controlled_by(summary: Mapping[str, Any]) -> str:
     return name or "a controller that gave no name"
 
 
-def nominal_frequency(scenario: Scenario) -> float:
-    """Nominal frequency of the scenario's converter, Hz.
+def bases(scenario: Scenario) -> Bases:
+    """The bases of the scenario's converter.
 
     Raises:
         UserError: the converter's file cannot be read.
     """
     name = scenario.plant.converter
     try:
-        return load_converter(name).bases.omega_b / (2 * math.pi)
+        return load_converter(name).bases
     except (OSError, ValueError) as problem:
         raise UserError(f"plant.converter = {name!r}: {problem}") from None
+
+
+def nominal_frequency(scenario: Scenario) -> float:
+    """Nominal frequency of the scenario's converter, Hz; raises as ``bases``."""
+    return bases(scenario).omega_b / (2 * math.pi)
 
 
 def read_scenario(folder: Path) -> Scenario:

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.columns import I_REF, PIECE, TABLE, Columns, Rows, pieces
-from gfm_hil.recording.run import controlled_by, nominal_frequency
+from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, Columns, Rows, pieces, wave
+from gfm_hil.recording.run import bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
+from gfm_hil.results.waveforms import NEEDS, three_phase, usual_window
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.scenario.model import Scenario
 
@@ -70,11 +71,15 @@ def dress(axes: Axes, title: str = "") -> None:
 
 
 def draw_panel(
-    axes: Axes, title: str, curves: Sequence[tuple[Rows, Rows, str, str]], factor: float = 1.0
+    axes: Axes,
+    title: str,
+    curves: Sequence[tuple[Rows, Rows, str, str]],
+    factor: float = 1.0,
+    styles: Sequence[Any] = _STYLES,
 ) -> None:
     """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
     for k, (t, x, colour, label) in enumerate(curves):
-        style = _STYLES[k % len(_STYLES)]
+        style = styles[k % len(styles)]
         axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, ls=style, label=label)
     dress(axes, title)
     axes.ticklabel_format(useOffset=False)
@@ -185,7 +190,7 @@ def draw_run(
     timing: Columns,
     summary: dict[str, Any],
 ) -> list[Path]:
-    """Draw one run into its folder: signals.png and, in real time, timing.png."""
+    """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png."""
     pictures = []
     if "true_p" in signals:
         figure = Figure(figsize=SIZE, layout="constrained")
@@ -193,12 +198,19 @@ def draw_run(
         draw_signals(figure, scenario, signals, summary)
         _save(figure, path)
         pictures.append(path)
+    if signals.keys() >= {*NEEDS}:
+        figure = Figure(figsize=SIZE_WAVES, layout="constrained")
+        if draw_waveforms(figure, scenario, signals, summary):
+            path = folder / "waveforms.png"
+            _save(figure, path)
+            pictures.append(path)
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
         pictures.append(draw_timing(folder, scenario, timing, summary))
     return pictures
 
 
 SIZE = (10.5, 7.4)  # inches, of the six panels of a run
+SIZE_WAVES = (10.5, 6.4)
 SIZE_LAWS = (8.6, 8.2)
 
 
@@ -228,11 +240,77 @@ def draw_signals(
         _draw_columns(a, title, names[0][0], scenario, curves)
         if len(curves) > 1:
             _legend(a, len(curves) + len(a.collections))
-    _mark(axes, summary["events"])
-    trips = [{"t": x["t"], "label": reason_name(x["reason"])} for x in summary.get("trips", [])]
-    _mark(axes, trips, red, above=20 + 10 * min(3, len(summary["events"])))
+    _mark_run(figure, axes, scenario, summary)
+    return axes
+
+
+def _mark_run(
+    figure: Figure,
+    axes: Sequence[Axes],
+    scenario: Scenario,
+    summary: dict[str, Any],
+    first: float = 0.0,
+    last: float = np.inf,
+) -> None:
+    """Mark events and trips from ``first`` to ``last``, s, and give the figure its title."""
+    events = [e for e in summary["events"] if first <= e["t"] <= last]
+    _mark(axes, events)
+    trips = [
+        {"t": x["t"], "label": reason_name(x["reason"])}
+        for x in summary.get("trips", [])
+        if first <= x["t"] <= last
+    ]
+    _mark(axes, trips, COLOURS[1], above=20 + 10 * min(3, len(events)))
     title = f"{scenario.title} — {controlled_by(summary)}"
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+
+
+def draw_waveforms(
+    figure: Figure,
+    scenario: Scenario,
+    signals: Columns,
+    summary: dict[str, Any],
+    window: tuple[float, float] | None = None,
+) -> list[Axes]:
+    """Fill a figure with v_abc, i_abc of the bridge and i_abc of the line.
+
+    Args:
+        window: from when to when, s; that of the scenario if None, or the usual one.
+
+    Returns:
+        The panels; none if nothing was recorded in the window.
+
+    Raises:
+        UserError: the recording lacks what ``three_phase`` needs.
+    """
+    base = bases(scenario)
+    waves = three_phase(signals, base)
+    start, stop = window or scenario.waveforms or usual_window(summary, nominal_frequency(scenario))
+    rows = slice(max(0, round(start / scenario.T_s)), max(0, round(stop / scenario.T_s) + 1))
+    t = signals["t"][rows]
+    if not len(t):
+        return []
+    axes = _panels(figure, 3, 1)
+    V, A = (f"1 p.u. = {np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
+    for a, name, title in zip(
+        axes,
+        ("v", "i", "i_o"),
+        (f"voltages of the filter capacitor v_abc [p.u.], {V} V",
+         f"currents of the bridge i_abc [p.u.], {A} A", "currents of the line i_o,abc [p.u.]"),
+        strict=True,
+    ):  # fmt: skip
+        curves = [
+            (t, waves[wave(name, phase, False)][rows], colour, phase)
+            for phase, colour in zip(PHASES, COLOURS, strict=False)
+        ]
+        draw_panel(a, title, curves, styles=("-",))
+        a.set_xlim(float(t[0]), max(stop, float(t[-1])))
+    if "limited" in signals:
+        _shade(axes[1], t, signals["limited"][rows])
+        if axes[1].collections:
+            _legend(axes[1], len(PHASES) + 1)
+    _legend(axes[0], len(PHASES))
+    _mark_run(figure, axes, scenario, summary, float(t[0]), float(t[-1]))
     return axes
 
 

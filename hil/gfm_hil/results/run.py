@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.npz import Table, write_npz
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import RecordedRun, bases
+from gfm_hil.results.waveforms import three_phase
 from gfm_hil.scenario.toml_out import write_scenario
 
 if TYPE_CHECKING:
@@ -58,6 +61,54 @@ class Run(RecordedRun):
             figures.draw_panel(a, name, [(t, x, figures.COLOURS[0], name)])
         axes[-1, 0].set_xlabel("t [s]")
         return list(axes[:, 0])
+
+    def three_phase(
+        self, start: float = 0.0, stop: float = math.inf, si: bool = False
+    ) -> dict[str, NDArray[Any]]:
+        """v_abc of the filter capacitor and i_abc of the bridge and of the line, at every tick.
+
+        Args:
+            start, stop: from when to before when, s.
+            si: in V and A instead of in p.u. of the nominal peak value of a phase.
+
+        Returns:
+            ``t`` in s, and v_a … v_c, i_a … i_c, i_oa … i_oc, in V and A under names such as v_a_V
+            and i_oa_A; shape (ticks,) each.
+
+        Raises:
+            UserError: the recording lacks what this needs.
+        """
+        waves = three_phase(self.columns, bases(self.scenario), si)
+        first, last = (
+            round(min(max(0.0, t / self.scenario.T_s), self.ticks)) for t in (start, stop)
+        )
+        rows = {"t": self.columns["t"], **waves}
+        return {name: np.asarray(column[first:last]) for name, column in rows.items()}
+
+    def plot_waveforms(self, start: float | None = None, stop: float | None = None) -> list[Axes]:
+        """Draw the three phases of the voltages and currents, as the report does.
+
+        Args:
+            start, stop: from when to when, s; the window of the report if not given.
+
+        Raises:
+            UserError: only one of them is given, nothing was recorded between them, or the
+                recording lacks what this needs.
+        """
+        from matplotlib import pyplot
+
+        from gfm_hil.results import figures
+
+        if (start is None) != (stop is None):
+            raise UserError(f"start = {start}, stop = {stop}: give both or neither")
+        window = None if start is None or stop is None else (start, stop)
+        figure = pyplot.figure(figsize=figures.SIZE_WAVES, layout="constrained")
+        axes = figures.draw_waveforms(figure, self.scenario, self.columns, self.summary, window)
+        if not axes:
+            pyplot.close(figure)
+            end = self.summary["duration_s"]
+            raise UserError(f"start = {start}, stop = {stop}: the recording ends at {end:g} s")
+        return axes
 
     def save(self, folder: str | Path) -> Path:
         """Write the run folder, with figures and report; returns it.

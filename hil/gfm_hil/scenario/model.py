@@ -172,6 +172,12 @@ class Scenario(_Model):
         description="real time: a thread of idle priority keeps each side's processor busy; auto: "
         "on a virtual machine, whose host may return an idle processor late",
     )
+    waveforms: tuple[float, float] | None = Field(
+        None,
+        strict=False,
+        description="[from, to], s: the window of the figure of the three phases; from 3 cycles "
+        "before the first event to 7 after it if none",
+    )
     ready_laws: list[str] = Field(
         default_factory=list,
         description="further laws to make ready for an operator, besides those of the events",
@@ -206,7 +212,7 @@ class Scenario(_Model):
     def digest(self) -> str:
         """Hash of all that both sides must agree on: scenario, signal table, and the content of
         the law and converter files, wherever each machine keeps them."""
-        about = {"link", "title", "description", "compare"}
+        about = {"link", "title", "description", "compare", "waveforms"}
         about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "inner", "events", "ready_laws"})
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
@@ -236,6 +242,11 @@ class Scenario(_Model):
         problems = check_expectation(self)
         if self.ticks < 1:
             problems.append(f"duration = {self.duration:g} s: not one tick of T_s = {self.T_s:g} s")
+        if self.waveforms and not 0 <= self.waveforms[0] < min(self.waveforms[1], self.duration):
+            problems.append(
+                f"waveforms = {list(self.waveforms)}: must be [from, to] with 0 <= from < to, and "
+                f"from before the end of the run at {self.duration:g} s"
+            )
         for k, event in enumerate(self.events):
             if event.at(self.T_s) >= self.ticks:
                 problems.append(

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing, write_text
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import RecordedRun, bases
+from gfm_hil.results.waveforms import three_phase
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,14 @@ class Format:
         writer: function that writes a run to a file, as module:name in this package.
         needs: package that this takes.
         beside: ending of a second file that the first is read by, and the function of its text.
+        columns: it holds the columns of the recording.
     """
 
     text: str
     writer: str
     needs: str = ""
     beside: tuple[str, str] | None = None
+    columns: bool = True
 
 
 FORMATS = {
@@ -38,7 +41,7 @@ FORMATS = {
     "parquet": Format("Apache Parquet", "writers:write_parquet", "pyarrow"),
     "blf": Format(
         "CAN frames and their DBC, for Vector's tools", "blf:write_blf",
-        beside=(".dbc", "blf:dbc_text"),
+        beside=(".dbc", "blf:dbc_text"), columns=False,
     ),
 }  # fmt: skip
 
@@ -56,17 +59,30 @@ def check_format(name: str) -> None:
         raise UserError(f"--format {name} needs {needs}: pip install 'gfmhil[export]'")
 
 
-def export_run(folder: Path, name: str, file: Path) -> list[Path]:
+def export_run(
+    folder: Path, name: str, file: Path, phases: Literal["pu", "si"] | None = None
+) -> list[Path]:
     """Write a finished run to ``file`` in the format ``name``.
+
+    Args:
+        phases: with the three phases of voltages and currents as further columns, in p.u. or in V
+            and A; see ``gfm_hil.results.waveforms``.
 
     Returns:
         What was written: the file and, of CAN frames, their DBC.
 
     Raises:
-        UserError: no run, no such format, or the file cannot be written.
+        UserError: no run, no such format, the recording lacks what the three phases need, or the
+            file cannot be written.
     """
     check_format(name)
     run, form = RecordedRun.load(folder), FORMATS[name]
+    if phases is not None:
+        if not form.columns:
+            fitting = ", ".join(name for name, form in FORMATS.items() if form.columns)
+            raise UserError(f"--three-phase {phases}: goes with {fitting}, not with {name}")
+        waves = three_phase(run.columns, bases(run.scenario), si=phases == "si")
+        run = replace(run, columns={**run.columns, **waves})
     written = [file]
     try:
         with replacing(file) as part:
