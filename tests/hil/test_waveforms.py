@@ -18,11 +18,13 @@ from scipy.io import loadmat
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import DERIVED, PHASES, WAVES, describe
+from gfm_hil.recording.columns import DERIVED, PHASES, WAVES, describe, wave
 from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import draw_waveforms
 from gfm_hil.results.run import Run
 from gfm_hil.results.waveforms import three_phase
+from gfm_hil.scope.channels import make_channels
+from gfm_hil.scope.trigger import Trigger, edges
 from gfm_plant import (
     TRUTH,
     Bases,
@@ -244,6 +246,20 @@ def test_exports_have_them_on_request(run: Callable[..., Run], tmp_path: Any) ->
         export_run(one.folder, "blf", tmp_path / "run.blf", "si")
     export_run(one.folder, "csv", tmp_path / "run.csv")
     assert "v_a" not in (tmp_path / "run.csv").read_text(encoding="utf-8").partition("\n")[0]
+
+
+def test_the_scope_draws_them_and_its_trigger_finds_a_zero_crossing(
+    run: Callable[..., Run],
+) -> None:
+    one = run(plant={"grid": WEAK}, events=[{**SAG, "t": 0.02}])
+    channels = {c.name: c for c in make_channels(T_S, 50.0) if c.group == "wave"}
+    waves = one.three_phase(0.03, 0.05)
+    for name, channel in channels.items():
+        live = {n: x for n, x in one.columns.items() if n not in ("t", "tick")}  # as while it runs
+        assert np.array_equal(channel.read(live, 300, 500), waves[name].astype(np.float32))
+    assert [*channels] == [wave(name, phase, si=False) for name in "vi" for phase in PHASES]
+    up = edges(channels["v_a"].read(one.columns, 0, 1000), Trigger(channel="v_a", level=0.0))
+    assert len(up) == 5 and np.abs(np.diff(up) - 200).max() < 15  # 50 Hz, an angle that swings
 
 
 def test_the_figure_shows_the_cycles_around_the_first_event(run: Callable[..., Run]) -> None:

@@ -26,18 +26,25 @@ from gfm_plant import Bases
 
 NEEDS = ("t", "true_v_re", "true_v_im", "true_i_re", "true_i_im", "true_p", "true_q")
 BEFORE, AFTER = 3, 7  # cycles of the usual window, before and after the first event
-_LAG = dict(zip(PHASES, (0.0, 2 * math.pi / 3, -2 * math.pi / 3), strict=True))
+_LAG = dict(zip(PHASES, (0.0, 2 * math.pi / 3, -2 * math.pi / 3), strict=True))  # rad
 
 
 @dataclass(frozen=True)
-class _Phase:
-    """A phase of a space vector as a column, of which only the rows asked for are computed."""
+class Phase:
+    """A phase of a space vector as a column, of which only the rows asked for are computed.
+
+    Attributes:
+        columns: with those of ``NEEDS``.
+        name, phase: of ``WAVES`` and ``PHASES``.
+        f_n: nominal frequency, Hz.
+        factor: from p.u. to what is wanted.
+    """
 
     columns: Columns
-    name: str  # of ``WAVES``
-    lag: float  # rad, behind phase a
-    f_n: float  # Hz
-    factor: float
+    name: str
+    phase: str
+    f_n: float
+    factor: float = 1.0
     dtype = np.dtype(float)
 
     def __len__(self) -> int:
@@ -47,7 +54,7 @@ class _Phase:
         def read(name: str) -> NDArray[np.float64]:
             return np.asarray(self.columns[name][rows])
 
-        angle = 2 * math.pi * (self.f_n * read("t") % 1.0) - self.lag
+        angle = 2 * math.pi * (self.f_n * read("t") % 1.0) - _LAG[self.phase]
         letter = "i" if self.name == "i" else "v"
         x = read(f"true_{letter}_re") + 1j * read(f"true_{letter}_im")
         if self.name == "i_o":
@@ -77,7 +84,7 @@ def three_phase(columns: Columns, bases: Bases, si: bool = False) -> dict[str, R
     scale = {"V": peak * bases.V_n, "A": peak * bases.S_n / bases.V_n}
     f_n = bases.omega_b / (2 * math.pi)
     return {
-        wave(name, phase, si): _Phase(columns, name, _LAG[phase], f_n, scale[unit] if si else 1.0)
+        wave(name, phase, si): Phase(columns, name, phase, f_n, scale[unit] if si else 1.0)
         for name, unit in WAVES.items()
         for phase in PHASES
     }

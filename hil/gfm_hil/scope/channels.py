@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import CONTROLLER_INNER, I_REF, TABLE, Columns
+from gfm_hil.recording.columns import (
+    CONTROLLER_INNER,
+    DERIVED,
+    I_REF,
+    PHASES,
+    TABLE,
+    Columns,
+    wave,
+)
 from gfm_hil.recording.timing import LATE, MISS_NEEDS, ROUND_TRIP, SLACK, Duration, missed
+from gfm_hil.results.waveforms import NEEDS, Phase
 from gfm_runtime.signals import names
 
 _LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5, "": 1.0}  # of a channel's range, by its unit
@@ -22,7 +31,7 @@ class Channel:
 
     Attributes:
         name: in messages between page and server.
-        group: y, u, ref, d, plant, inner (of a run with an inner stage) or loop.
+        group: y, u, ref, d, plant, wave, inner (of a run with an inner stage) or loop.
         symbol, unit, description: for display.
         least: the smallest range of values that fills the height of a plot, in ``unit``.
         needs: columns of the recording from which it is computed.
@@ -65,6 +74,7 @@ def make_channels(T_s: float, f_b: float) -> tuple[Channel, ...]:
           for n in names("ref")),
         *(_column(f"d_{n}", "d", f"true_{n}", f_b) for n in names("d")),
         *(_column(n, "plant", f"true_{n}", f_b) for n in ("i", "delta")),
+        *(_phase(n, phase, T_s, f_b) for n in ("v", "i") for phase in PHASES),
         *(_column(n, "inner", f"y_{n}", f_b) for n in names("y_inner")),
         *(_column(f"u_{n}", "inner", f"u_{n}", f_b) for n in names("u_inner")),
         *(_column(n, "inner", n, f_b) for n in CONTROLLER_INNER),
@@ -85,6 +95,19 @@ def _column(name: str, group: str, column: str, f_b: float) -> Channel:
         return np.asarray(columns[column][first:last] * factor)
 
     return Channel(name, group, symbol, unit, row.quantity, _LEAST[unit], (column,), of)
+
+
+def _phase(name: str, phase: str, T_s: float, f_b: float) -> Channel:
+    """A phase of a voltage or current; the recording of a run that goes on has no column t."""
+    row, needs = DERIVED[wave(name, phase, si=False)], NEEDS[1:]
+
+    def of(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
+        part = {n: columns[n][first:last] for n in needs} | {"t": np.arange(first, last) * T_s}
+        return Phase(part, name, phase, f_b)[:]
+
+    return Channel(
+        row.name, "wave", row.symbol, "p.u.", row.quantity, _LEAST["p.u."], needs, of
+    )  # fmt: skip
 
 
 def _i_ref(columns: Columns, first: int, last: int) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ class Look(BaseModel):
 
     kind: Literal["look"]
     id: int = Field(ge=0, lt=2**53)  # a frame carries it as float64
-    channels: list[ChannelName] = Field(max_length=24)
+    channels: list[ChannelName] = Field(max_length=40)
     watched: list[ChannelName] = Field(default=[], max_length=24)
     bins: int = Field(ge=16, le=4096)
     mode: Literal["roll", "held", "trigger"]
