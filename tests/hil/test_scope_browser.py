@@ -202,6 +202,11 @@ def test_signals_can_be_chosen(page: Browser) -> None:
     page.click("#signal-list [data-strip=inner]")
     page.click("#signal-list [data-strip=bridge]")
     wait_for(lambda: page.js(count) == 8)
+    page.click("#signal-list [data-strip=v-abc]")
+    page.click("#signal-list [data-strip=i-abc]")
+    wait_for(lambda: page.js(count) == 10)
+    for name in ("v-abc", "i-abc"):
+        wait_for(lambda name=name: page.text(f"[data-strip={name}] .now") not in ("", "–"))
     # this run has no inner stage
     assert [page.text(f"[data-strip={name}] .now") for name in ("inner", "bridge")] == ["–", "–"]
 
