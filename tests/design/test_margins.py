@@ -195,7 +195,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     """Growth of p's swing on the nonlinear bench: its last third over its middle third."""
     content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": plant}
     bench = make_bench(check_scenario(content, "test"))
-    phase_jump(bench.st, -math.degrees(1e-7))
+    phase_jump(bench.plant, -math.degrees(1e-7))
     parts = [Part.create(tmp, role, ticks) for role in ("plant", "controller")]
     run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
     p = np.diff(parts[0].signals[:, PLANT_COLUMNS.index("true_p")])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import LawStateSpace
@@ -114,7 +114,7 @@ class Mode:
 
 
 def linearise_plant(
-    par: PlantRecord, op: OperatingPoint, omega_g: float = 1.0, V_g: float = 1.0
+    par: Record, op: OperatingPoint, omega_g: float = 1.0, V_g: float = 1.0
 ) -> LinearPlant:
     """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g."""
     r = par[0]

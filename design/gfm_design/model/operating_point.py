@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gfm_plant import NoEquilibrium, plant_equilibrium
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import Record
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.tustin import DiscreteLaw
@@ -56,7 +56,7 @@ class OperatingPoint:
 
 
 def operating_point(
-    par: PlantRecord,
+    par: Record,
     law: DiscreteLaw,
     ref: Vector,
     omega_g: float = 1.0,
@@ -144,7 +144,7 @@ def _in_frame_of_law(law: DiscreteLaw, x: Vector, u: Vector) -> tuple[Vector, Ve
 
 
 def _unpack(
-    z: Vector, par: PlantRecord, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
+    z: Vector, par: Record, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
 ) -> tuple[Vector, Vector, Vector, Vector]:
     x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
     y = g(x, u)

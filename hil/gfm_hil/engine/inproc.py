@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.engine.loop_records import ControllerRecords, PlantRecords, Why
+from gfm_hil.engine.loop_records import ControllerRecords, Why
 from gfm_hil.engine.setup import Bench
-from gfm_hil.engine.tick import advance, answer, obey, sample
+from gfm_hil.engine.tick import answer, obey, sample, take
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import (
     CONTROLLER_TIMES,
@@ -32,22 +32,24 @@ CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
 @compiled
 def _run_ticks(plant, controller, y, u, plant_rows, controller_rows, start, stop, waits):
     """The compiled part of ``run_ticks``."""
-    par, st = plant
+    st = plant.st
     ctl, laws, states, est = controller
-    changes, delayed = ctl[0].changes, plant_is_delayed(par)
+    changes, delayed = ctl[0].changes, plant_is_delayed(plant)
     for k in range(start, stop):
         before = ctl[0].state
-        tripped = sample(par, st, y, plant_rows[k])
+        tripped = sample(plant, 0, y, plant_rows[k])
         answer(ctl, laws, states, est, y, u, tripped != 0)
         record_controller(controller_rows[k], ctl, states, est)
         record_command(plant_rows[k], u)
         if delayed:  # as over a link, where u[k] may come meanwhile
-            plant_step(par, st)
+            plant_step(plant)
         state = ctl[0].state
-        if obey(par, st, waits, state) != Why.GO_ON:
+        if obey(plant, 0, waits, state) != Why.GO_ON:
             return k + 1
-        if advance(par, st, u, delayed, tripped, state, True) != Why.GO_ON:
+        if take(plant, 0, u, tripped, state, True) != Why.GO_ON:
             return k + 1
+        if not delayed:
+            plant_step(plant)
         if ctl[0].changes != changes or state != before or st[0].trip != tripped:
             return k + 1
     return stop
@@ -71,7 +73,7 @@ def run_ticks(
     """
     c = bench.controller
     return int(_run_ticks(
-        PlantRecords(bench.par, bench.st),
+        bench.plant.records,
         ControllerRecords(c.ctl, c.laws, c.states, c.est),
         bench.y, bench.u, plant_rows, controller_rows, start, stop,
         bench.scenario.after_trip == "wait",
@@ -92,7 +94,7 @@ def run_inproc(
         timeline.carry_out(k)
         stop = min(k + CHUNK, timeline.next_tick(), ticks)
         k = run_ticks(bench, plant_part.signals, controller_part.signals, k, stop)
-        if int(bench.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
+        if int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
             bench.restore_plant(k)
         timeline.look(k - 1)
         if not go_on(k):

@@ -7,7 +7,6 @@ frames have to cross the link.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.retune import retuned
 from gfm_hil.scenario.events import Gains, LawChange, Reset
 from gfm_hil.scenario.model import Scenario
-from gfm_plant import NoEquilibrium, make_plant, plant_init
+from gfm_plant import Network, NoEquilibrium, make_plant
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import NY, NY_INNER, carried
@@ -29,15 +28,14 @@ class Bench:
     """Everything that one run changes.
 
     Attributes:
-        par, st: the plant's records.
+        plant: the plant.
         controller: the controller, its first law at rest and RUNNING.
         y: measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
         u: inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
     """
 
     scenario: Scenario
-    par: NDArray[Any]
-    st: NDArray[Any]
+    plant: Network
     controller: Controller
     start: OperatingPoint
     y: NDArray[np.float64]
@@ -51,14 +49,14 @@ class Bench:
     def keep(self) -> None:
         """Remember this instant as the start, to which a reset goes back."""
         c = self.controller
-        self._plant = self.par.copy(), self.st.copy()
+        self._plant = self.plant.copy()
         self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
         self._asked = c.asked
 
     def restore_plant(self, tick: int) -> None:
         """Put the plant and its grid back to their start at a tick, and clear the trip."""
-        self.par[:], self.st[:] = self._plant
-        self.st["tick"], self.u[:] = tick, self.start.commands[: len(self.u)]
+        self.plant.restore(self._plant)
+        self.plant.st["tick"], self.u[:] = tick, self.start.commands[: len(self.u)]
 
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
@@ -82,12 +80,12 @@ def make_bench(scenario: Scenario) -> Bench:
     Raises:
         UserError: the law has no steady state on this grid.
     """
-    plant = scenario.plant
+    options = scenario.plant
     if scenario.seed:
-        plant = plant.model_copy(
-            update={"sensors": plant.sensors.model_copy(update={"seed": scenario.seed})}
+        options = options.model_copy(
+            update={"sensors": options.sensors.model_copy(update={"seed": scenario.seed})}
         )
-    par, st = make_plant(plant, scenario.T_s)
+    plant = make_plant(options, scenario.T_s)
     references = scenario.references.vector()
     # under the name that events use: the name inside a law file may differ
     sets = [replace(load_law(name, scenario.inner), name=name) for name in scenario.laws()]
@@ -96,11 +94,11 @@ def make_bench(scenario: Scenario) -> Bench:
         scenario.T_s,
         references,
         hold=scenario.late_policy.hold,
-        omega_b=float(par[0]["omega_b"]),
+        omega_b=float(plant.par[0]["omega_b"]),
     )
     try:
         start = operating_point(
-            par,
+            plant.par,
             controller.active_law,
             np.asarray(references),
             scenario.plant.grid.omega_g,
@@ -108,7 +106,7 @@ def make_bench(scenario: Scenario) -> Bench:
         )
     except NoEquilibrium as problem:
         raise UserError(f"references, plant.grid: {problem}") from None
-    plant_init(par, st, start.x, start.commands)
+    plant.start(start.x, start.commands)
     y = np.zeros(len(carried("y", controller.inner)))
     if controller.inner:
         y[:NY], y[NY:] = start.y, start.x[: NY_INNER - NY]
@@ -116,7 +114,7 @@ def make_bench(scenario: Scenario) -> Bench:
     else:
         controller.start(start.x_law, start.u)
     u = start.commands[: len(carried("u", controller.inner))].copy()
-    bench = Bench(scenario, par, st, controller, start, np.zeros(len(y)), u)
+    bench = Bench(scenario, plant, controller, start, np.zeros(len(y)), u)
     bench.keep()
     _ready_gains(scenario)
     return bench

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from gfm_plant import Network
 from gfm_runtime.signals import SIGNALS
 
 _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
@@ -291,35 +292,35 @@ Event = Annotated[
 CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 
-def nominal_hz(par: Any) -> float:
-    """Nominal frequency of a plant, Hz, from its record."""
-    return float(par[0]["omega_b"]) / (2 * math.pi)
+def nominal_hz(plant: Network) -> float:
+    """Nominal frequency of a plant, Hz."""
+    return plant.wiring.omega_b / (2 * math.pi)
 
 
-def apply_grid_event(event: Any, par: Any, st: Any) -> None:
-    """Apply one of the plant's events to its records, between two ticks."""
+def apply_grid_event(event: Any, plant: Network) -> None:
+    """Apply one of the plant's events, between two ticks."""
     from gfm_plant import grid
 
-    f_b = nominal_hz(par)
+    f_b = nominal_hz(plant)
     match event:
         case GridFrequency():
             rate = event.rate / f_b if event.rate else None
-            grid.grid_frequency(par, st, event.f_hz / f_b, rate)
+            grid.grid_frequency(plant, event.f_hz / f_b, rate)
         case GridVoltage():
-            grid.grid_voltage(st, event.V_g, event.rate, event.duration)
+            grid.grid_voltage(plant, event.V_g, event.rate, event.duration)
         case GridProfile():
             raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
         case PhaseJump():
-            grid.phase_jump(st, event.degrees)
+            grid.phase_jump(plant, event.degrees)
         case GridImpedance():
-            grid.grid_impedance(par, st, event.L_g, event.R_g)
+            grid.grid_impedance(plant, event.L_g, event.R_g)
         case GridLoad():
-            grid.grid_load(par, st, event.change)
+            grid.grid_load(plant, event.change)
         case GridUnbalance():
-            grid.grid_unbalance(par, st, event.factors(), event.duration)
+            grid.grid_unbalance(plant, event.factors(), event.duration)
         case Fault():
-            grid.fault(par, st, event.position, event.R, event.duration)
+            grid.fault(plant, event.position, event.R, event.duration)
         case FaultClear():
-            grid.clear_fault(par, st)
+            grid.clear_fault(plant)
         case Breaker():
-            grid.breaker(par, st, event.closed)
+            grid.breaker(plant, event.closed)

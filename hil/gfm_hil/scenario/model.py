@@ -443,7 +443,7 @@ def _try_plant(scenario: Scenario) -> None:
         except ValueError as problem:
             raise UserError(f"{converter}: {problem}") from None
     try:
-        par, st = make_plant(scenario.plant, scenario.T_s)
+        plant = make_plant(scenario.plant, scenario.T_s)
     except ValidationError as problem:
         wrong = lines(problem, ConverterParameters)
         raise UserError("; ".join(f"{converter}: {line}" for line in wrong)) from None
@@ -453,9 +453,9 @@ def _try_plant(scenario: Scenario) -> None:
         if isinstance(event, Fault | GridFrequency | GridImpedance | GridLoad | GridProfile):
             try:
                 if isinstance(event, GridProfile):
-                    profile = read_profile(event.file, nominal_hz(par))
-                    next(profile.points(scenario.T_s))[1].apply(par, st)
+                    profile = read_profile(event.file, nominal_hz(plant))
+                    next(profile.points(scenario.T_s))[1].apply(plant)
                 else:
-                    apply_grid_event(event, par, st)
+                    apply_grid_event(event, plant)
             except (UserError, ValueError) as problem:
                 raise UserError(f"events.{k}: {problem}") from None
