@@ -21,7 +21,7 @@ from .grid import (
 )
 from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .network import Network
-from .options import Plant
+from .options import NetworkParts, Plant
 from .parameters import ConverterParameters, load_converter
 from .protection import trip_reason
 from .records import PlantRecords
@@ -36,6 +36,7 @@ __all__ = [
     "Bases",
     "ConverterParameters",
     "Network",
+    "NetworkParts",
     "NoEquilibrium",
     "Plant",
     "PlantRecords",

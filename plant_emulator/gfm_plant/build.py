@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -12,16 +13,25 @@ from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
-from gfm_plant.options import COMMANDS, MEASURED, FiniteGrid, Grid, Overload, Plant, Protection
+from gfm_plant.options import (
+    COMMANDS,
+    MEASURED,
+    FiniteGrid,
+    Grid,
+    NetworkParts,
+    Overload,
+    Plant,
+    Protection,
+)
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.records import (
     N_RING,
-    SIZES,
     PlantRecords,
     Record,
     converter_par_dtype,
     converter_state_dtype,
     network_dtypes,
+    size_for,
 )
 from gfm_plant.wiring import Unit, Wiring
 
@@ -49,38 +59,63 @@ def make_plant(options: Plant, T_s: float) -> Network:
         bases = load_converter(options.converter).bases
         L, R = bases.to_pu(options.grid.load_L, "L"), bases.to_pu(options.grid.load_R, "R")
         load = (Branch(LOAD, FAR, GROUND, L, R),)
-    return make_network({CONVERTER: (options, FAR)}, T_s, options.grid, FAR, load)
+    return _make({CONVERTER: (options, FAR)}, T_s, options.grid, FAR, load)
 
 
 def make_network(
-    converters: Mapping[str, tuple[Plant, str]],
-    T_s: float,
-    grid: Grid,
-    grid_node: str | None,
-    branches: Sequence[Branch] = (),
-    shunts: Sequence[Shunt] = (),
-    capacitors: Sequence[Capacitor] = (),
+    converters: Mapping[str, tuple[Plant, str]], T_s: float, grid: Grid, parts: NetworkParts
 ) -> Network:
     """Return a plant of several converters, each with its line to a node of a network.
 
     Args:
         converters: By name, the options of each, of which `grid` is not used, and its node.
         T_s: Sampling period in s.
-        grid: The grid simulator, p.u.
-        grid_node: Its node; None for an island.
-        branches, shunts, capacitors: Lines, loads and capacitors, p.u. of the first converter.
+        grid: The grid simulator, p.u., if `parts` has a node for it.
+        parts: What connects them.
 
     Raises:
-        ValueError: If there are too many parts, converters of different voltages or frequencies,
-            a part that hangs in the air, or a rate that is too fast for T_s.
+        ValueError: If there are too many parts, two of one name, converters of different voltages
+            or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
+    names = [*converters, *parts.lines, *parts.loads, *parts.capacitors]
+    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
+        raise ValueError(f"network: {twice[0]} is the name of two parts")
+    branches = [Branch(name, x.start, x.end, x.L, x.R) for name, x in parts.lines.items()]
+    shunts: dict[str, Shunt] = {}
+    for name, load in parts.loads.items():
+        size = load.P**2 + load.Q**2
+        if load.Q > 0:
+            branches.append(Branch(name, load.node, GROUND, load.Q / size, load.P / size))
+        elif load.node in shunts:
+            raise ValueError(
+                f"network: {shunts[load.node].name} and {name}: two resistors at node {load.node};"
+                " make them one load"
+            )
+        else:
+            shunts[load.node] = Shunt(name, load.node, 1 / load.P)
+    banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
+    breakers = [*parts.lines.items(), *parts.loads.items()]
+    opened = frozenset(name for name, part in breakers if not part.closed)
+    return _make(
+        converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks, opened
+    )
+
+
+def _make(
+    converters: Mapping[str, tuple[Plant, str]],
+    T_s: float,
+    grid: Grid,
+    grid_node: str | None,
+    branches: Sequence[Branch],
+    shunts: Sequence[Shunt] = (),
+    capacitors: Sequence[Capacitor] = (),
+    opened: frozenset[str] = frozenset(),
+) -> Network:
+    """Return a plant; elements in p.u. of the first converter."""
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
-    size = next((n for n in SIZES if n >= len(converters)), None)
-    if size is None:
-        raise ValueError(f"{len(converters)} converters: at most {max(SIZES)}")
-    net_dtype, now_dtype = network_dtypes(size)
     N = len(converters)
+    net_dtype, now_dtype = network_dtypes(size_for(N))
     records = PlantRecords(
         np.zeros(N, converter_par_dtype),
         np.zeros(N, converter_state_dtype),
@@ -109,9 +144,14 @@ def make_network(
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
     now["V_g"] = now["V_g_to"] = grid.V_g
     wiring = Wiring(
-        first.bases.omega_b, tuple(units), tuple(branches), tuple(shunts), tuple(capacitors),
+        first.bases.omega_b,
+        tuple(units),
+        tuple(branches),
+        tuple(shunts),
+        tuple(capacitors),
         grid_node,
-    )  # fmt: skip
+        opened=opened,
+    )
     network = Network(records, wiring)
     network.connect(wiring)
     return network

@@ -76,26 +76,51 @@ def grid_load(plant: Network, change: float) -> None:
     plant.now["P_load"] += change
 
 
-def fault(plant: Network, position: float, R: float, duration: float | None = None) -> None:
+def fault(
+    plant: Network,
+    position: float | None,
+    R: float,
+    duration: float | None = None,
+    line: str | None = None,
+    node: str | None = None,
+) -> None:
     """Short the three phases to ground through `R`.
 
     Args:
-        position: Place on the line: 0 at the filter capacitor, 1 at the grid.
-        R: Resistance of the fault, p.u.; > 0 at the filter capacitor.
+        plant: The plant.
+        position: Place on the line: 0 at its start, the filter capacitor, 1 at its end; None: at a
+            node.
+        R: Resistance of the fault, p.u. of the first converter; > 0 at a capacitor.
         duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
+        line: Name of the line, or of the converter whose line it is; None: the first converter.
+        node: The node.
 
     Raises:
-        ValueError: If a value is out of range. The plant is then unchanged.
+        ValueError: If there is no such place, or a value is out of range. The plant is then
+            unchanged.
     """
-    _require("position", position, 0 <= position < 1, "in [0, 1)")
-    least = 0.0 if position > 0 else LEAST_FAULT_R
-    _require("R", R, least <= R, f">= {least:g} p.u. at position {position:g}")
+    wiring = plant.wiring
+    if position is not None:
+        _require("position", position, 0 <= position < 1, "in [0, 1)")
+        lines = wiring.named_lines()
+        line = wiring.units[0].name if line is None else line
+        if line not in lines:
+            raise ValueError(f"line = {line!r}: must be one of {sorted(lines)}")
+        node = lines[line].start
+        inside = lines[line].name if position > 0 else None
+    elif node not in wiring.nodes:
+        raise ValueError(f"node = {node!r}: must be one of {sorted(wiring.nodes)}")
+    else:
+        position, inside = 0.0, None
+    if inside is None and node == wiring.grid and wiring.closed:
+        raise ValueError(f"node = {node!r}: is an ideal voltage; put the fault on a line to it")
+    charged = {unit.terminal for unit in wiring.units} | {c.node for c in wiring.capacitors}
+    least = LEAST_FAULT_R if inside is None and node in charged else 0.0
+    where = f"position {position:g}" if line is not None else f"node {node}"
+    _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    unit = plant.wiring.units[0]
-    R *= float(plant.par[0]["current"])
-    place = FaultPlace(unit.terminal, unit.line if position > 0 else None, position, R)
-    plant.rewire(replace(plant.wiring, fault=place))
+    plant.rewire(replace(wiring, fault=FaultPlace(node, inside, position, R)))
     plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
     reconnect(plant.records)
 
@@ -191,12 +216,36 @@ def breaker(plant: Network, closed: bool) -> None:
     """
     if closed == bool(plant.now[0]["closed"]):
         return
-    if not closed and not plant.wiring.branches:
+    if plant.wiring.grid is None:
+        raise ValueError("network.grid: not set; an island has no grid breaker")
+    if not closed and not plant.wiring.has_load:
         raise ValueError(
             "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
         )
     plant.rewire(replace(plant.wiring, closed=closed))
     plant.now["closed"] = closed
+
+
+def line_breaker(plant: Network, name: str, closed: bool) -> None:
+    """Open or close the breaker of a line or a load.
+
+    What opens interrupts its current; the flux that it shared with others stays in them.
+
+    Args:
+        plant: The plant.
+        name: Of the line or load, or of the converter whose line it is.
+        closed: False opens it.
+
+    Raises:
+        ValueError: If there is no such breaker.
+    """
+    wiring = plant.wiring
+    breakers = {shown: line.name for shown, line in wiring.named_lines().items()}
+    breakers |= {part: part for part in wiring.parts}
+    if name not in breakers:
+        raise ValueError(f"name = {name!r}: must be one of {sorted(breakers)}")
+    one = frozenset({breakers[name]})
+    plant.rewire(replace(wiring, opened=wiring.opened - one if closed else wiring.opened | one))
 
 
 def take_out(plant: Network) -> None:

@@ -29,6 +29,18 @@ SIZES = {1: 5, 4: 32, 12: 96}
 circuit, that fit in."""
 
 
+def size_for(converters: int) -> int:
+    """Return the key of `SIZES` for so many converters.
+
+    Raises:
+        ValueError: If there are too many.
+    """
+    found = next((size for size in SIZES if size >= converters), None)
+    if found is None:
+        raise ValueError(f"{converters} converters: at most {max(SIZES)}")
+    return found
+
+
 class PlantRecords(NamedTuple):
     """A plant: converters and the network between them, see ``gfm_plant.make_plant``.
 

@@ -105,6 +105,14 @@ class Wiring:
         return (*own, *(branch.name for branch in self.branches), *beyond)
 
     @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes between the parts, each once."""
+        ends = [unit.node for unit in self.units]
+        ends += [node for branch in self.branches for node in (branch.start, branch.end)]
+        ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
+        return tuple(dict.fromkeys(node for node in ends if node != GROUND))
+
+    @property
     def split(self) -> str | None:
         """The branch that has a place for a fault inside."""
         return None if self.fault is None else self.fault.branch
@@ -113,6 +121,21 @@ class Wiring:
     def units_lines(self) -> tuple[Branch, ...]:
         """The lines from the converters to their nodes."""
         return tuple(Branch(u.line, u.terminal, u.node, u.L_g, u.R_g) for u in self.units)
+
+    def named_lines(self) -> dict[str, Branch]:
+        """Lines by the name that people use: a converter's line has that of the converter."""
+        own = {unit.name: line for unit, line in zip(self.units, self.units_lines, strict=True)}
+        return own | {b.name: b for b in self.branches if b.end != GROUND}
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the lines and loads between nodes and ground, without the converters' lines."""
+        return [branch.name for branch in self.branches] + [shunt.name for shunt in self.shunts]
+
+    @property
+    def has_load(self) -> bool:
+        """Whether anything is left to feed without the grid."""
+        return bool(self.shunts) or any(branch.end == GROUND for branch in self.branches)
 
     def to_grid(self) -> dict[str, float]:
         """What each state brings to the grid, as a factor of its current."""
@@ -134,7 +157,8 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
-        filters, shunts, sources = [], list(self.shunts), []
+        filters, sources = [], []
+        shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         if faulted and self.fault is not None:
             node = "beyond" if self.split else self.fault.node
             shunts = _with_shunt(shunts, Shunt("fault", node, self.fault.R))
@@ -148,8 +172,8 @@ class Wiring:
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
             sources.append(Source(GRID_SOURCE, self.grid))
-        if self.opened:
-            held = {c.node for c in capacitors} | {s.node for s in shunts} | {GROUND}
+        if self.opened or not self.closed:
+            held = {GROUND} | {c.node for c in capacitors} | {s.node for s in shunts}
             branches = _without_ends(branches, held | {source.node for source in sources})
             met = {node for branch in branches for node in (branch.start, branch.end)}
             shunts = [s for s in shunts if s.node in met]

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode, hold, linearise_plant
 from gfm_design.model.operating_point import operating_point
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
@@ -95,7 +95,14 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         x = loop.A @ x
     phase_jump(bench.plant, -math.degrees(angle))
     parts = [Part.create(place, role, ticks) for role in ("plant", "controller")]
-    done = run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
+    done = run_ticks(
+        bench.plant.records,
+        stack([bench]),
+        parts[0].signals[None],
+        parts[1].signals[None],
+        0,
+        ticks,
+    )
     assert done == ticks
     p = parts[0].signals[:, PLANT_COLUMNS.index("y_p")]
     return p - bench.start.y[1], predicted

@@ -19,7 +19,7 @@ from numba.core.runtime.nrt import rtsys
 
 from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, seconds, take_turns
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
@@ -109,11 +109,13 @@ class Loop:
             UserError: the run ended early, so that there is nothing to time.
         """
         b, n = self.reset(), ticks or self.ticks
-        done = 0
+        done, controllers = 0, stack([b])
 
         def run() -> None:
             nonlocal done
-            done = run_ticks(b, self.plant, self.controller, 0, n)
+            done = run_ticks(
+                b.plant.records, controllers, self.plant[None], self.controller[None], 0, n
+            )
 
         time = seconds(run) / n * 1e9
         if done != n:

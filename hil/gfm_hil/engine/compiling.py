@@ -14,11 +14,12 @@ from numba.core import event
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.inproc import buffers, compile_loop
 from gfm_hil.engine.process import compile_role
-from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
 from gfm_hil.scenario.model import INPROC, Scenario
+from gfm_plant.records import size_for
 
 #: a name for people, and what compiles the functions, or loads them from the cache
 Set = tuple[str, Callable[[], object]]
@@ -84,6 +85,27 @@ def compiled_bench(
     return found[0]
 
 
+def compiled_benches(scenario: Scenario, notice: Callable[[str], None]) -> list[Bench]:
+    """The benches of a network's converters, with everything compiled that a tick calls.
+
+    Args:
+        scenario, notice: as for ``compiled_bench``.
+
+    Raises:
+        UserError: as ``make_benches``.
+    """
+    found: list[Bench] = []
+    loop = f"the loop of up to {size_for(len(scenario.converters))} converters"
+    compile_sets(
+        [
+            ("the operating point", lambda: found.extend(make_benches(scenario))),
+            (loop, lambda: compile_loop(found)),
+        ],
+        notice,
+    )
+    return found
+
+
 def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
     """Compile what any run may call, over every link there is.
 
@@ -111,7 +133,7 @@ _IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)
 
 
 def _both(found: list[Bench]) -> Set:
-    return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1, found[0].inner))
+    return "the loop of both sides", lambda: compile_loop(found[:1])
 
 
 def _role(role: Role, found: list[Bench], which: str = "") -> Set:

@@ -121,7 +121,8 @@ class Timeline:
         while self._todo and self._todo[0][0] <= tick:
             event = self._todo.popleft()[1]
             if isinstance(event, Point):
-                event.apply(self._bench.plant)
+                if self._bench.place == 0:
+                    event.apply(self._bench.plant)
                 continue
             try:
                 self._carry_out(event, tick)
@@ -151,6 +152,8 @@ class Timeline:
                 self._bench.reset_controller()
             case GridProfile() if "operator" not in more:
                 pass  # its points follow
+            case _ if self._bench.place > 0:
+                pass  # what happens to a network, the timeline of its first converter carries out
             case _:
                 apply_grid_event(event, self._bench.plant)
         self.write(tick, event.type, label=event.label(), **more)
@@ -178,13 +181,13 @@ class Timeline:
 
     def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
         """The fault that keeps our side from running, if any; the cause before its consequences."""
-        trip = int(st["trip"][0]) if "plant" in self._roles else 0
+        trip = int(st["trip"][self._bench.place]) if "plant" in self._roles else 0
         if trip not in (0, CONTROLLER):
-            return "tripped", trip_reason(self._bench.plant.records)
+            return "tripped", trip_reason(self._bench.plant.records, self._bench.place)
         if "controller" in self._roles and int(ctl["state"][0]) == SAFE:
             heard = int(ctl["reason"][0]) == PLANT_TRIP
             return "tripped" if heard else "safe", safe_reason(ctl)
-        return ("safe", trip_reason(self._bench.plant.records)) if trip else None
+        return ("safe", trip_reason(self._bench.plant.records, self._bench.place)) if trip else None
 
     def finish(self, tick: int) -> None:
         """The scenario is over: the run is complete unless it still waits for a reset."""

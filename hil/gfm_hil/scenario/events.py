@@ -51,6 +51,9 @@ def reference_field(name: str, default: float | None) -> Any:
     return Field(default, description=f"{s.description}, {s.low:g} to {s.high:g} {s.unit}")
 
 
+_WHOSE = "in a network: which converter it is for; all of them if none"
+
+
 class Reference(_Event):
     """New references; ``ramp_s`` spreads the change over a time instead of one tick."""
 
@@ -60,6 +63,7 @@ class Reference(_Event):
     omega_g: float | None = reference_field("omega_g", None)
     Q_ref: float | None = reference_field("Q_ref", None)
     V_ref: float | None = reference_field("V_ref", None)
+    converter: str | None = Field(None, description=_WHOSE)
     ramp_s: float = Field(0.0, ge=0, description="spreads the change evenly over so many seconds")
 
     @model_validator(mode="after")
@@ -90,6 +94,7 @@ class LawChange(_Event):
 
     type: Literal["law"] = Field(description="kind of event")
     law: str = Field(description="catalogue name or law file")
+    converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
         return f"law {self.law}"
@@ -103,6 +108,7 @@ class Gains(_Event):
     values: dict[str, float] = Field(
         min_length=1, description="a table of names and numbers, e.g. { D_p = 0.02 }"
     )
+    converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
         return ", ".join(f"{name} = {value:g}" for name, value in self.values.items())
@@ -234,21 +240,40 @@ class GridUnbalance(_Event):
 
 
 class Fault(_Event):
-    """A three-phase fault to ground on the line, through ``R`` [p.u.]."""
+    """A three-phase fault to ground on a line, or at a node of a network, through ``R`` [p.u.]."""
 
     type: Literal["fault"] = Field(description="kind of event")
-    position: float = Field(
-        ge=0, lt=1, description="place on the line: 0 at the filter capacitor, 1 at the grid"
+    position: float | None = Field(
+        None,
+        ge=0,
+        lt=1,
+        description="place on the line: 0 at its start, which for a converter's line is the filter "
+        "capacitor, 1 at its end",
     )
-    R: float = Field(
-        ge=0, le=1e6, description="resistance, p.u.; at least 1e-4 at the filter capacitor"
+    line: str | None = Field(
+        None, description="in a network: name of the line, or of the converter whose line it is"
     )
+    node: str | None = Field(None, description="in a network: the node, in place of a position")
+    R: float = Field(ge=0, le=1e6, description="resistance, p.u.; at least 1e-4 at a capacitor")
     duration: float | None = Field(
         None, gt=0, description="s until it is cleared; none: fault-clear clears it"
     )
 
+    @model_validator(mode="after")
+    def _has_one_place(self) -> Fault:
+        if (self.position is None) == (self.node is None):
+            raise ValueError(f"position = {self.position}, node = {self.node}: give one of them")
+        if self.line is not None and self.position is None:
+            raise ValueError(f"line = {self.line!r}: goes with a position")
+        return self
+
     def label(self) -> str:
-        where = f"{self.position:g} of the line" if self.position else "the filter"
+        line = "the line" if self.line is None else f"line {self.line}"
+        where = f"{self.position:g} of {line}" if self.position else "the filter"
+        if self.position == 0 and self.line is not None:
+            where = f"the start of {line}"
+        if self.node is not None:
+            where = f"node {self.node}"
         return f"fault at {where}" + (f" for {self.duration:g} s" if self.duration else "")
 
 
@@ -271,6 +296,19 @@ class Breaker(_Event):
         return "grid breaker " + ("closes" if self.closed else "opens")
 
 
+class LineBreaker(_Event):
+    """The breaker of a line or load of a network opens or closes."""
+
+    type: Literal["breaker"] = Field(description="kind of event")
+    name: str = Field(
+        min_length=1, description="of the line or load, or of the converter whose line it is"
+    )
+    closed: bool = Field(description="false opens it")
+
+    def label(self) -> str:
+        return f"{self.name} " + ("on" if self.closed else "off")
+
+
 Event = Annotated[
     Reference
     | LawChange
@@ -285,7 +323,8 @@ Event = Annotated[
     | GridUnbalance
     | Fault
     | FaultClear
-    | Breaker,
+    | Breaker
+    | LineBreaker,
     Field(discriminator="type"),
 ]
 
@@ -319,8 +358,12 @@ def apply_grid_event(event: Any, plant: Network) -> None:
         case GridUnbalance():
             grid.grid_unbalance(plant, event.factors(), event.duration)
         case Fault():
-            grid.fault(plant, event.position, event.R, event.duration)
+            grid.fault(
+                plant, event.position, event.R, event.duration, line=event.line, node=event.node
+            )
         case FaultClear():
             grid.clear_fault(plant)
         case Breaker():
             grid.breaker(plant, event.closed)
+        case LineBreaker():
+            grid.line_breaker(plant, event.name, event.closed)
