@@ -25,6 +25,7 @@ from gfm_plant.options import (
 )
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.records import (
+    N_OWN,
     N_RING,
     PlantRecords,
     Record,
@@ -96,9 +97,7 @@ def make_network(
     banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
     breakers = [*parts.lines.items(), *parts.loads.items()]
     opened = frozenset(name for name, part in breakers if not part.closed)
-    return _make(
-        converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks, opened
-    )
+    return _make(converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks, opened)
 
 
 def _make(
@@ -115,7 +114,8 @@ def _make(
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     N = len(converters)
-    net_dtype, now_dtype = network_dtypes(size_for(N))
+    states = N_OWN * N + len(branches) + len(capacitors) + 1  # one for a fault within a branch
+    net_dtype, now_dtype = network_dtypes(size_for(N, states))
     records = PlantRecords(
         np.zeros(N, converter_par_dtype),
         np.zeros(N, converter_state_dtype),
@@ -152,9 +152,36 @@ def _make(
         grid_node,
         opened=opened,
     )
+    _check_paths(wiring)
     network = Network(records, wiring)
     network.connect(wiring)
     return network
+
+
+def _check_paths(wiring: Wiring) -> None:
+    """Raise ValueError if a part has no path to a converter."""
+    reached = {unit.node for unit in wiring.units}
+    while True:
+        more = {
+            node
+            for branch in wiring.branches
+            if branch.end != GROUND and {branch.start, branch.end} & reached
+            for node in (branch.start, branch.end)
+        }
+        if more <= reached:
+            break
+        reached |= more
+    ends = [(unit.name, unit.node) for unit in wiring.units]
+    ends += [(b.name, node) for b in wiring.branches for node in (b.start, b.end)]
+    ends += [(shunt.name, shunt.node) for shunt in wiring.shunts]
+    ends += [(capacitor.name, capacitor.node) for capacitor in wiring.capacitors]
+    ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
+    for name, node in ends:
+        if node not in reached | {GROUND}:
+            raise ValueError(
+                f"network: {name} is at node {node!r}, which has no path to a converter; nodes with"
+                f" one are {sorted(reached)}"
+            )
 
 
 def _pack_converter_circuit(

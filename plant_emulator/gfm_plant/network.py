@@ -108,8 +108,8 @@ class Network:
         """Set the modes of all circuits that a wiring gives.
 
         Raises:
-            ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), there are too many,
-                or one is too fast for the DC link. The plant is then unchanged.
+            ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast
+                for the DC link. The plant is then unchanged.
         """
         changed = self.records.copy()
         _connect(changed, wiring)
@@ -120,11 +120,6 @@ class Network:
 def _connect(records: PlantRecords, wiring: Wiring) -> None:
     net, N = records.net, len(wiring.units)
     order = wiring.order
-    if len(order) > net["modes"].shape[2]:
-        raise ValueError(
-            f"{len(order)} lines, loads and filters: with {N} converters at most"
-            f" {net['modes'].shape[2]}"
-        )
     net["n_states"] = len(order)
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():

@@ -24,21 +24,24 @@ N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_RE
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
 N_RING = 256  # places of a ring that holds one cycle
 
-SIZES = {1: 5, 4: 32, 12: 96}
+SIZES = {1: 5, 2: 16, 4: 32, 12: 96}
 """Records come in sizes, because each is compiled once a machine: converters, and states of the
 circuit, that fit in."""
 
 
-def size_for(converters: int) -> int:
-    """Return the key of `SIZES` for so many converters.
+def size_for(converters: int, states: int) -> int:
+    """Return the key of `SIZES` for so many converters, and states of the circuit.
 
     Raises:
         ValueError: If there are too many.
     """
-    found = next((size for size in SIZES if size >= converters), None)
-    if found is None:
-        raise ValueError(f"{converters} converters: at most {max(SIZES)}")
-    return found
+    for size, most in SIZES.items():
+        if size >= converters and most >= states:
+            return size
+    raise ValueError(
+        f"network: {converters} converters and {states} currents and voltages; at most"
+        f" {max(SIZES)} and {max(SIZES.values())}"
+    )
 
 
 class PlantRecords(NamedTuple):

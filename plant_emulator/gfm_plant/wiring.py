@@ -98,11 +98,12 @@ class Wiring:
 
     @property
     def order(self) -> tuple[str, ...]:
-        """Names of the states as w has them: three a converter, the branches, and what a fault
-        within one adds: the current beyond it."""
+        """Names of the states as w has them: three a converter, the branches, the banks' voltages,
+        and what a fault within a branch adds: the current beyond it."""
         own = tuple(name for unit in self.units for name in unit.states)
         beyond = () if self.split is None else ("beyond",)
-        return (*own, *(branch.name for branch in self.branches), *beyond)
+        others = [part.name for part in self.branches] + [bank.name for bank in self.capacitors]
+        return (*own, *others, *beyond)
 
     @property
     def nodes(self) -> tuple[str, ...]:

@@ -19,7 +19,6 @@ from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
 from gfm_hil.scenario.model import INPROC, Scenario
-from gfm_plant.records import size_for
 
 #: a name for people, and what compiles the functions, or loads them from the cache
 Set = tuple[str, Callable[[], object]]
@@ -95,11 +94,10 @@ def compiled_benches(scenario: Scenario, notice: Callable[[str], None]) -> list[
         UserError: as ``make_benches``.
     """
     found: list[Bench] = []
-    loop = f"the loop of up to {size_for(len(scenario.converters))} converters"
     compile_sets(
         [
             ("the operating point", lambda: found.extend(make_benches(scenario))),
-            (loop, lambda: compile_loop(found)),
+            ("the loop of several converters", lambda: compile_loop(found)),
         ],
         notice,
     )

@@ -154,7 +154,7 @@ class Member(_Model):
 
     @model_validator(mode="after")
     def _has_no_grid(self) -> Member:
-        if self.plant is not None and "grid" in self.plant.model_fields_set:
+        if self.plant is not None and self.plant.grid != Plant().grid:
             raise ValueError("plant.grid: is the scenario's own; its node is network.grid")
         return self
 
@@ -253,10 +253,8 @@ class Scenario(_Model):
 
         def whole(member: Member) -> Member:
             own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
-            if isinstance(own.get("plant"), Plant):
-                own["plant"] = Plant.model_validate(
-                    own["plant"].model_dump(exclude={"grid"}, exclude_unset=True)
-                )
+            if "plant" in own:
+                own["plant"] = self.plant.model_copy(update={"grid": Plant().grid})
             return member.model_copy(update=own)
 
         members = {key: whole(member) for key, member in self.network.converters.items()}
