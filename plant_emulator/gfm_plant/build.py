@@ -95,9 +95,18 @@ def make_network(
         else:
             shunts[load.node] = Shunt(name, load.node, 1 / load.P)
     banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
-    breakers = [*parts.lines.items(), *parts.loads.items()]
-    opened = frozenset(name for name, part in breakers if not part.closed)
-    return _make(converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks, opened)
+    opened = {name for name, line in parts.lines.items() if not line.closed}
+    opened |= {name for name, load in parts.loads.items() if not load.closed}
+    return _make(
+        converters,
+        T_s,
+        grid,
+        parts.grid,
+        branches,
+        tuple(shunts.values()),
+        banks,
+        frozenset(opened),
+    )
 
 
 def _make(
