@@ -155,7 +155,7 @@ class ClosedLoop:
     def _made(cls, plant: Plant, law: DiscreteLaw, ideal: bool, ref: Matrix, par: Record) -> Self:
         grid, delay = plant.grid, plant.delay
         op = operating_point(par, law, ref, grid.omega_g, grid.V_g)
-        linear = linearise_plant(par, op, grid.omega_g, grid.V_g)
+        linear = linearise_plant(par, op, grid.omega_g, grid.V_g, grid.finite)
         controlled = plant.dc_source.mode == "controlled"
         state_space = realise(law.law) if ideal else law
         reaction = linearise_law(law.law, state_space, op, ref, controlled)
