@@ -171,3 +171,15 @@ def test_what_takes_one_converter_says_so() -> None:
         gfmhil.run(content())
     with pytest.raises(UserError, match="network: the scenario has none"):
         gfmhil.run_network("pref_step")
+
+
+def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:
+    run = gfmhil.run_network("loss_of_the_last_machine")
+    assert run.status == "completed"
+    for one in run.values():
+        (opened,) = one.summary["events"]
+        assert opened["i_peak_cycle"] < 1.0 and opened["f_nadir_hz"] > 49.8
+    a, b = run["A"].signals, run["B"].signals
+    V = 0.5 * (a["true_V"][-1] + b["true_V"][-1])  # both feed the bus through the same short line
+    assert a["p"][-1] + b["p"][-1] == pytest.approx(1.2 * V**2, rel=0.03)
+    assert a["omega_u"][-1] == pytest.approx(b["omega_u"][-1], abs=1e-7)
