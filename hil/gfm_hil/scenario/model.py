@@ -321,8 +321,8 @@ class Scenario(_Model):
                 problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
             if isinstance(event, GridImpedance) and self.network is not None:
                 problems.append(
-                    f"events.{k}: grid-impedance is for the line of one converter; a network's lines"
-                    " have breakers"
+                    f"events.{k}: grid-impedance is for the line of one converter alone; a"
+                    " network's lines have breakers"
                 )
             asked = getattr(event, "converter", None)
             if asked is not None and asked not in self.converters:
