@@ -10,7 +10,7 @@ import pytest
 from gfm_hil.cli import main
 from gfm_runtime.firmware import CHECKED, TARGETS, check
 
-from ..support.firmware import cc, exported
+from ..support.firmware import STAGED, cc, exported
 from ..support.laws import LAWS
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
@@ -45,6 +45,22 @@ def test_every_law_has_the_kernels_bits_on_a_processor(
         counts = {c.name: c.instructions or (0, 0) for c in found}
         now = {c.name: ["{}…{}".format(*counts[c.name]), str(c.code)] for c in found}
         assert kept == now, "python docs/make_firmware_tables.py makes the table anew"
+
+
+@pytest.mark.parametrize(
+    ("target", "real", "style"),
+    [
+        ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
+        ("m7", "float64", "unrolled"),
+        pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
+    ],
+)  # fmt: skip
+def test_every_stage_has_the_kernels_bits_on_a_processor(
+    tmp_path: Path, target: str, real: str, style: str
+) -> None:
+    found = check(exported(tmp_path, real, style, of=STAGED), target)
+    assert [c.name for c in found] == list(STAGED) and {c.rows for c in found} == {CHECKED}
+    assert sum(c.differ for c in found) == 0
 
 
 def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -67,11 +68,20 @@ def _add_laws(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--real", choices=REALS, default=REALS[0], help="precision (float32)")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
+    command.add_argument(
+        "--inner", metavar="NAME",
+        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
+    )  # fmt: skip
+    command.add_argument(
+        "--f_n", type=float, default=50.0, metavar="HZ",
+        help="nominal frequency of the converter, for an inner stage (50)",
+    )  # fmt: skip
 
 
 def call_export(options: argparse.Namespace) -> int:
     """Write the folder; returns the exit code."""
-    files = export(_laws(options.laws), options.T_s, options.real, options.style)
+    laws, omega_b = _laws(options.laws, options.inner), _omega_b(options.f_n)
+    files = export(laws, options.T_s, options.real, options.style, omega_b)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         write_text(options.out / name, text)
@@ -81,7 +91,8 @@ def call_export(options: argparse.Namespace) -> int:
 
 def call_golden(options: argparse.Namespace) -> int:
     """Write or print the vectors; returns the exit code."""
-    modules = make_modules(_laws(options.laws), options.T_s, options.real)
+    laws, omega_b = _laws(options.laws, options.inner), _omega_b(options.f_n)
+    modules = make_modules(laws, options.T_s, options.real, omega_b)
     text = golden(modules, _ticks(options.ticks)).csv()
     if options.out is None:
         print(text, end="")
@@ -100,17 +111,23 @@ def call_check(options: argparse.Namespace) -> int:
     return EXIT_OTHERWISE if any(result.differ for result in results) else 0
 
 
-def _laws(names: Sequence[str]) -> dict[str, Law]:
-    """Laws by name; the stages of a scheduled law one by one."""
+def _laws(names: Sequence[str], inner: str | None) -> dict[str, Law]:
+    """Laws by name, with an inner stage in place of their own; a scheduled law in its stages."""
     laws: dict[str, Law] = {}
     for name in law_names() if list(names) == [ALL] else names:
-        found = load_law(name)
+        found = load_law(name, inner)
         for k, law in enumerate(found.laws):
             label = found.name if len(found.laws) == 1 else f"{found.name}[{k}]"
             if label in laws:
                 raise UserError(f"law {label!r}: is named twice")
             laws[label] = law
     return laws
+
+
+def _omega_b(f_n: float) -> float:
+    if not (math.isfinite(f_n) and f_n > 0.0):
+        raise UserError(f"--f_n {f_n:g}: must be > 0 Hz")
+    return 2 * math.pi * f_n
 
 
 def _ticks(ticks: int) -> int:
