@@ -1,7 +1,7 @@
 from .check import OPTIMISED, TARGETS, Checked, check
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
-from .module import REALS, STYLES, Module, Style, make_modules
+from .module import REALS, STYLES, Module, Style, make_modules, sources
 
 __all__ = [
     "CHECKED",
@@ -18,4 +18,5 @@ __all__ = [
     "export",
     "golden",
     "make_modules",
+    "sources",
 ]
