@@ -24,7 +24,7 @@ from gfm_runtime.firmware.golden import INIT, RESET, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields
 from gfm_runtime.firmware.report import read_report
 from gfm_runtime.firmware.stage import VARIABLES
-from gfm_runtime.inner import settle
+from gfm_runtime.inner import Inner, settle
 from gfm_runtime.signals import NU, NY, carried, group
 from gfm_runtime.states import OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
@@ -321,6 +321,28 @@ def test_the_report_counts_the_operations_as_by_hand() -> None:
         "comparisons": 3 * 2 + 6 + 10 + 6 + 1,  # limits, what fades, inputs (6 not symmetric), u
     }
     assert found["bytes"]["state"] == 4 * (1 + 3 + 3 + 3)
+
+
+def test_the_report_counts_the_operations_of_a_stage_as_by_hand() -> None:
+    """What a virtual stator adds; in brackets its equations in ``gfm_runtime.inner``."""
+    counts = []
+    for stage in (None, Inner("virtual-stator")):
+        law = replace(LAWS["droop-1"], inner=stage)
+        text = export({"x": law}, T_S, "float32", "unrolled")["report.json"]
+        counts.append(json.loads(text)["laws"][0])
+    plain, staged = counts
+    more = {name: staged["operations"][name] - n for name, n in plain["operations"].items()}
+    assert more == {
+        # low-passes, i* (b, r_d, r_q, size, i*), limit, current loop, modulation, away
+        "multiplications": 4 + (1 + 3 + 3 + 2 + 4) + (3 + 2) + 5 + (4 + 2) + 2,
+        # E, low-passes, i* (keep and lose, r_d, r_q, size, i*), limit, current loop, modulation,
+        # whether u is finite
+        "additions": 1 + 8 + (2 + 3 + 3 + 1 + 2) + 1 + 8 + 1 + 2,
+        "divisions": 2 + 1 + 1,
+        "square_roots": 1 + 1,
+        "comparisons": 1 + 1 + 2 + 6,  # limit, modulation, what fades, inputs
+    }
+    assert staged["bytes"]["state"] - plain["bytes"]["state"] == 4 * 19
 
 
 # --- refusals ---

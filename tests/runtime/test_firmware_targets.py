@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from gfm_hil.cli import main
+from gfm_runtime import load_law
 from gfm_runtime.firmware import CHECKED, TARGETS, check
+from gfm_runtime.inner_file import inner_names
 
 from ..support.firmware import STAGED, cc, exported
 from ..support.laws import LAWS
@@ -61,6 +63,29 @@ def test_every_stage_has_the_kernels_bits_on_a_processor(
     found = check(exported(tmp_path, real, style, of=STAGED), target)
     assert [c.name for c in found] == list(STAGED) and {c.rows for c in found} == {CHECKED}
     assert sum(c.differ for c in found) == 0
+
+
+def test_the_table_of_stages_is_what_is_measured(tmp_path: Path) -> None:
+    compiler = TARGETS["m4f"].prefix + TARGETS["m4f"].compiler
+    version = cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0]
+    if version not in (PAGES / "tables" / "firmware_laws.md").read_text(encoding="utf-8"):
+        pytest.skip(f"the tables are not of {version}")
+    table = (PAGES / "tables" / "firmware_stages.md").read_text(encoding="utf-8")
+    for stage in inner_names():
+        exported(tmp_path, "float32", "unrolled", of={"vsg-2": load_law("vsg-2", stage).laws[0]})
+        (one,) = check(tmp_path, "m4f")
+        assert one.instructions is not None
+        counted = "{}…{}".format(*one.instructions)
+        row = (
+            stage,
+            "m4f float32, unrolled",
+            counted,
+            one.code,
+            one.constants,
+            one.state,
+            one.stack,
+        )
+        assert f"| {' | '.join(map(str, row))} |" in table, "make_firmware_tables.py makes it anew"
 
 
 def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def operations(m: Module, style: Style) -> dict[str, int]:
     said = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
     half_angle = bool(m.record["error_map"] == HYBRID_ANGLE)
     return {
-        "multiplications": products + said.count(" * "),
+        "multiplications": products + len(re.findall(r" \*=? ", said)),
         "additions": sums + len(re.findall(r" \+=? | -=? ", said)) + 2 * (NU + m.stages) - 1,
         "divisions": len(re.findall(r" /=? ", said)),
         "square_roots": 2 * half_angle + stage.count(" sqrt("),
