@@ -22,7 +22,9 @@ from gfm_runtime.firmware import (
     STYLES,
     TARGETS,
     Checked,
+    build_dll,
     check,
+    dll_sources,
     export,
     golden,
     make_modules,
@@ -41,6 +43,13 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     out.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
     out.set_defaults(call=call_export)
+    dll = kinds.add_parser(
+        "dll", help="build a law as a real-code model of the IEEE/CIGRE interface, for EMT programs"
+    )
+    dll.add_argument("law", metavar="LAW", help="a name, or a .toml file")
+    _add_how(dll)
+    dll.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
+    dll.set_defaults(call=call_dll)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
     _add_laws(vectors)
     vectors.add_argument(
@@ -66,6 +75,10 @@ def _add_laws(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
+    _add_how(command)
+
+
+def _add_how(command: argparse.ArgumentParser) -> None:
     command.add_argument("--real", choices=REALS, default=REALS[0], help="precision (float32)")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
     command.add_argument(
@@ -86,6 +99,20 @@ def call_export(options: argparse.Namespace) -> int:
     for name, text in files.items():
         write_text(options.out / name, text)
     print(f"{options.out}: {', '.join(files)}")
+    return 0
+
+
+def call_dll(options: argparse.Namespace) -> int:
+    """Write the folder and build the library; returns the exit code."""
+    laws = _laws([options.law], options.inner)
+    if len(laws) != 1:
+        raise UserError(f"law {options.law!r}: has {len(laws)} stages; a model holds one law")
+    ((name, law),) = laws.items()
+    files = dll_sources(name, law, options.T_s, options.real, _omega_b(options.f_n))
+    options.out.mkdir(parents=True, exist_ok=True)
+    for file, text in files.items():
+        write_text(options.out / file, text)
+    print(build_dll(options.out, name, files))
     return 0
 
 

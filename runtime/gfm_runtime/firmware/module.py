@@ -241,14 +241,14 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
 
 
 def _header(m: Module, T_s: float) -> str:
-    keys = _keys(m.prefix, m.real, m.n, m.stages) | {"TYPES": "", "LAW": "", "law": ""}
+    keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
     text = filled(chosen(template("interface.h"), m.choices), keys)
     return _about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
 
 
 def _unrolled(m: Module) -> str:
     loop = literal(m.record["loop"], m.real)
-    keys = _keys(m.prefix, m.real, m.n, m.stages) | {"LAW": "", "law": "", "LOOP": loop}
+    keys = keys_of(m) | {"LAW": "", "law": "", "LOOP": loop}
     stage = ""
     if m.stages:
         keys |= numbers_of(m.record)
@@ -334,6 +334,11 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         "sqrt": root,
         "NEGLIGIBLE": literal(NEGLIGIBLE, real),
     }
+
+
+def keys_of(m: Module) -> dict[str, str]:
+    """What the templates of an unrolled law ask for."""
+    return _keys(m.prefix, m.real, m.n, m.stages)
 
 
 def _enumerators(guard: str) -> str:
