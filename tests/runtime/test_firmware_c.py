@@ -85,8 +85,8 @@ def test_every_law_has_the_kernels_bits(
 @pytest.mark.parametrize(
     ("target", "real", "style", "flags"),
     [
-        ("host", "float32", "unrolled", "-O2"), ("host", "float64", "unrolled", "-O3"),
-        ("host", "float64", "records", "-O2"), ("clang", "float32", "unrolled", "-O2"),
+        ("host", "float32", "unrolled", "-O2"), ("host", "float64", "records", "-O3"),
+        ("clang", "float64", "unrolled", "-O2"),
     ],
 )  # fmt: skip
 def test_every_stage_has_the_kernels_bits(

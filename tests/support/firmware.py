@@ -21,13 +21,14 @@ SOME = ("vsg-1", "psc-dc", "dvoc", "hybrid-angle", "matching-2", "vsg-12")
 
 
 def _staged() -> dict[str, Law]:
-    """Laws with inner stages: each shipped one behind laws of each structure, and every kind with
-    every priority, PLL and power limiter, with and without freeze and integral; and one without."""
+    """Laws with inner stages: the shipped ones behind vsg-2 and laws of each structure, and every
+    kind with every priority, PLL and power limiter, with and without freeze and integral; and one
+    without."""
+    shipped = [stage for stage in inner_names() if stage != NO_INNER]
     laws = {
         f"{law} {stage}": load_law(law, stage).laws[0]
-        for stage in inner_names()
-        if stage != NO_INNER
-        for law in ("vsg-2", *SOME)
+        for k, stage in enumerate(shipped)
+        for law in ("vsg-2", *SOME[k :: len(shipped)])
     }
     for kind in KINDS:
         for k, priority in enumerate(PRIORITIES if kind != NO_INNER else ()):
