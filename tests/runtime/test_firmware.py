@@ -281,6 +281,10 @@ def test_the_header_of_a_stage_is_the_signal_table() -> None:
     for letter, vector in (("Y", "y"), ("U", "u")):
         found = re.findall(rf"^    GFM_NO_STAGE_{letter}_(\w+),", text, re.MULTILINE)
         assert found == [name.upper() for name in carried(vector, True)]  # type: ignore[arg-type]
+    law = load_law("vsg-2", "cascaded").laws
+    text = export({"x": law[0]}, T_S, "float32", "records", 120 * math.pi)["gfm_x.h"]
+    assert "Inner stage at f_n = 60 Hz: cascaded, m = 1.3025508, freeze = True" in text
+    assert "k_v = 1.0" in text and "I_thr" not in text, "only what acts"
 
 
 def test_the_stage_is_that_of_the_converters_frequency() -> None:

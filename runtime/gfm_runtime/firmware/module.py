@@ -32,6 +32,7 @@ from gfm_runtime.firmware.stage import (
     AT_RUN_TIME,
     CONSTANTS,
     SHARED,
+    STAGE_PARTS,
     WITHOUT,
     check_stage,
     choices_of,
@@ -42,6 +43,7 @@ from gfm_runtime.firmware.stage import (
 )
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.inner import INNER_CONSTANTS, NEGLIGIBLE
+from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
 from gfm_runtime.signals import NU, NY, TABLE_VERSION, Signal, carried_rows, group, table_hash
@@ -184,33 +186,23 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
     real, stages = modules[0].real, modules[0].stages
     choices = AT_RUN_TIME if stages else WITHOUT
     common = _keys("gfm", real, states, stages)
-    types = chosen(template("records.h"), choices)
-    common["TYPES"] = filled(
-        types,
-        {
-            **{key: common[key] for key in ("N_ROWS", "N_COLUMNS")},
-            "KINDS": kinds_text(),
-            "CONSTANTS": "\n        ".join(textwrap.wrap(", ".join(CONSTANTS), 80)),
-        },
-    )
     common |= {"LAW": "const gfm_law_t *law, ", "law": "law, ", "LOOP": "law->loop"}
+    constants = "\n        ".join(textwrap.wrap(", ".join(CONSTANTS), 80))
+    types = common | {"KINDS": kinds_text(), "CONSTANTS": constants}
+    common["TYPES"] = filled(chosen(template("records.h"), choices), types).rstrip("\n")
+    columns = common["N_COLUMNS"]
     common["TICK"] = "".join(
         f"    real {name}[{size}]; /* {text} */\n"
         for name, size, text in (
             ("ref", "GFM_NREF", "references as given"),
             ("r", "GFM_NREF", "references after the error map"),
-            (
-                "y",
-                common["N_COLUMNS"],
-                "measurements after the error map; omega_u is the law's own",
-            ),
+            ("y", columns, "measurements after the error map; omega_u is the law's own"),
         )
     )
     maps = [name for name, code in ERROR_MAPS.items() if code]
     body = _maps(maps, real) + filled(chosen(template("records.c"), choices), _codes() | common)
     if stages:
-        body += stage_text("stage.c", choices, common)
-        body += stage_text("stage_settle.c", choices, common)
+        body += "".join(stage_text(part, choices, common) for part in STAGE_PARTS)
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
         + filled(chosen(template("interface.h"), choices), common),
@@ -252,8 +244,7 @@ def _unrolled(m: Module) -> str:
     stage = ""
     if m.stages:
         keys |= numbers_of(m.record)
-        parts = ("stage.c", "stage_settle.c")
-        stage = "".join(stage_text(part, m.choices, keys) for part in parts)
+        stage = "".join(stage_text(part, m.choices, keys) for part in STAGE_PARTS)
     used = [name for name, code in ERROR_MAPS.items() if code and code == m.record["error_map"]]
     keys["TICK"] = Unrolled(m.record, m.stages).tick()
     return (
@@ -280,6 +271,10 @@ def _about(m: Module, T_s: float) -> str:
             f"anti-windup T_t = {m.law.limits.T_t:g} s, bumpless change T_off = "
             f"{m.law.limits.T_off:g} s"
         ]
+        if m.law.inner is not None:
+            f_n = float(m.record["half_turn"]) / (math.pi * T_s)
+            numbers = ", ".join(f"{name} = {value}" for name, value in acting(m.law.inner).items())
+            lines += [f"Inner stage at f_n = {f_n:g} Hz: {m.law.inner.kind}, {numbers}"]
     lines += [
         f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.real}.",
         "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",

@@ -34,6 +34,8 @@ SIZE = sum(size for _, size, _ in VARIABLES)
 #: constants that are the same in all laws, and no members of a law's record in C
 SHARED = ("one", "negligible")
 CONSTANTS = tuple(name for name in INNER_CONSTANTS if name not in SHARED)
+#: templates: a tick, and what settles the stage
+STAGE_PARTS = ("stage.c", "stage_settle.c")
 #: no law of the folder has a stage
 WITHOUT: Choices = {"stages": False, "pll": False}
 #: of the generic step
@@ -83,7 +85,7 @@ def numbers_of(record: np.void) -> dict[str, str]:
 
 
 def stage_text(part: str, choices: Choices, keys: Mapping[str, str]) -> str:
-    """``stage.c`` (a tick) or ``stage_settle.c``; without ``numbers_of``, of the generic step."""
+    """One of ``STAGE_PARTS`` in C; without the keys of ``numbers_of``, for the generic step."""
     generic = {name: f"law->{name}" for name in (*CONSTANTS, "decay")}
     generic |= {"low_omega": "law->low[1]", "high_omega": "law->high[1]"}
     return filled(chosen(template(part), choices), {**generic, **keys})
