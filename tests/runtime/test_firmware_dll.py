@@ -6,6 +6,9 @@ The layout below is the interface's (natural alignment), not read from our heade
 from __future__ import annotations
 
 import ctypes as c
+import os
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from ..support.firmware import T_S, cc
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
 
+SUPPORT = Path(__file__).parents[1] / "support"
 REAL64, EMT = 9, 1
 OK, MESSAGE = 0, 1
 TICKS = 1000
@@ -110,6 +114,16 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return build
 
 
+def accepted(seed: int, real: str, stages: bool) -> Any:
+    """Golden references and measurements (TICKS, n) without those that are refused, float64."""
+    _, refs, ys = inputs(seed, TICKS, np.dtype(real), stages)
+    rows = (*group("ref"), *carried_rows("y", stages))
+    both = np.hstack([refs, ys])
+    low, high = np.array([[r.low for r in rows], [r.high for r in rows]])
+    both[~((both >= low) & (both <= high)).all(axis=1)] = both[0]
+    return np.split(both.astype(float), [refs.shape[1]], axis=1)
+
+
 def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controller:
     """The controller of the bench, its outputs beginning at u."""
     one = Controller([LawSet("x", load_law(law, inner).laws)], T_S, ref, real=real)
@@ -133,14 +147,7 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
     u = np.array([0.5, 1.0, 1.0, 0.05][: 3 + stages], real).astype(float)
     twins = []
     for seed in (1, 2):
-        _, refs, ys = inputs(seed, TICKS, np.dtype(real), stages)
-        bad = ~np.isfinite(ys).all(axis=1)
-        for values, rows in ((ys, carried_rows("y", stages)), (refs, group("ref"))):
-            bad |= (values < [r.low for r in rows]).any(1) | (values > [r.high for r in rows]).any(
-                1
-            )
-        refs[bad], ys[bad] = refs[0], ys[0]
-        refs, ys = refs.astype(float), ys.astype(float)
+        refs, ys = accepted(seed, real, stages)
         model = Model(built(law, inner, real))
         model.start(u)
         np.testing.assert_array_equal(model.outputs[:-1], u)
@@ -153,6 +160,41 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
             assert kernel.ctl["state"][0] == RUNNING
             assert model.tick(refs[k], ys[k]) == OK
             assert model.outputs.tobytes() == np.append(expected, 0.0).tobytes(), k
+
+
+@pytest.mark.skipif(
+    not all(map(shutil.which, ("x86_64-w64-mingw32-gcc", "wine"))),
+    reason="no mingw or wine; they take half a gigabyte, so CI goes without",
+)
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_the_model_has_the_same_bits_under_windows(built: Any, real: str, tmp_path: Path) -> None:
+    folder, u = built("vsg-2", "cascaded", real).parent, [0.5, 1.0, 1.0, 0.05, 0.0]
+    refs, ys = accepted(3, real, True)
+    ticks = np.hstack([refs, ys])
+    (tmp_path / "ticks.bin").write_bytes(np.array(u).tobytes() + ticks.tobytes())
+    cross = ["-std=c99", "-O2", "-ffp-contract=off", "-static-libgcc", f"-I{folder}"]
+    sources = sorted(map(str, folder.glob("*.c")))
+    for arguments in (
+        [*cross, "-shared", *sources, "-o", "model.dll"],
+        [*cross, str(SUPPORT / "load_model.c"), "-o", "load_model.exe"],
+    ):
+        done = cc(tmp_path, *arguments, compiler="x86_64-w64-mingw32-gcc")
+        assert done.returncode == 0, done.stderr
+    quiet = {
+        "WINEPREFIX": str(tmp_path / "wine"),
+        "WINEDEBUG": "-all",
+        "WINEDLLOVERRIDES": "mscoree=",
+    }
+    subprocess.run(
+        ["wine", "load_model.exe", "model.dll"], cwd=tmp_path, check=True, timeout=200,
+        env=os.environ | quiet,
+    )  # fmt: skip
+    found = np.fromfile(tmp_path / "found.bin").reshape(TICKS, len(u))
+    model = Model(built("vsg-2", "cascaded", real))
+    model.start(u[:-1])
+    for k in range(TICKS):
+        assert model.tick(refs[k], ys[k]) == OK
+        assert model.outputs.tobytes() == found[k].tobytes(), k
 
 
 @pytest.mark.parametrize("inner", ["none", "cascaded"])
