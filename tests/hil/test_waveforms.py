@@ -6,6 +6,8 @@ import cmath
 import csv
 import math
 from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from pyarrow import parquet
 from scipy.integrate import solve_ivp
 from scipy.io import loadmat
 
+import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import DERIVED, PHASES, WAVES, describe, wave
@@ -34,7 +37,6 @@ from gfm_plant import (
     phase_jump,
     plant_advance,
     plant_equilibrium,
-    plant_init,
     plant_truth,
 )
 
@@ -62,16 +64,16 @@ class Still:
 
     def __init__(self, **options: Any) -> None:
         content = {"protection": OFF, "dc_source": {"mode": "regulated"}, **options}
-        self.par, self.st = make_plant(Plant.model_validate(content), T_S)
-        self.x, self.u = plant_equilibrium(self.par, 0.5, 1.0)
-        plant_init(self.par, self.st, self.x, self.u)
+        self.plant = make_plant(Plant.model_validate(content), T_S)
+        self.x, self.u = plant_equilibrium(self.plant.par, 0.5, 1.0)
+        self.plant.start(self.x, self.u)
         self.rows: list[NDArray[Any]] = []
 
     def advance(self, ticks: int) -> None:
         for _ in range(ticks):
             self.rows.append(np.empty(len(TRUTH)))
-            plant_truth(self.par, self.st, self.rows[-1])
-            plant_advance(self.par, self.st, self.u)
+            plant_truth(self.plant.records, 0, self.rows[-1])
+            plant_advance(self.plant.records, self.u)
 
     @property
     def waves(self) -> dict[str, NDArray[Any]]:
@@ -123,10 +125,10 @@ def test_each_phase_is_a_circuit_of_its_own() -> None:
     nothing turns; phase voltages of the grid without their zero sequence, as three wires have."""
     plant = Still(grid=WEAK)
     plant.advance(50)
-    grid_unbalance(plant.par, plant.st, (1.0, 0.5, 0.5))
-    phase_jump(plant.st, 20.0)
+    grid_unbalance(plant.plant, (1.0, 0.5, 0.5))
+    phase_jump(plant.plant, 20.0)
     plant.advance(150)
-    found, r, x = plant.waves, plant.par[0], plant.x
+    found, r, x = plant.waves, plant.plant.par[0], plant.x
     kept = dict(zip(PHASES, (1.0, 0.5, 0.5), strict=True))
 
     def grid(t: float) -> dict[str, float]:
@@ -164,10 +166,10 @@ def test_each_phase_is_a_circuit_of_its_own() -> None:
 def test_the_negative_sequence_is_that_of_the_network() -> None:
     """In the steady state of an unbalanced grid, by the phasors of each sequence's circuit."""
     plant = Still(grid=WEAK)
-    grid_unbalance(plant.par, plant.st, (1.0, 0.5, 0.5))
+    grid_unbalance(plant.plant, (1.0, 0.5, 0.5))
     plant.advance(30_200)
     waves, t = plant.waves, np.arange(30_000, 30_200) * T_S
-    r = plant.par[0]
+    r = plant.plant.par[0]
     Z_f, Z_g = complex(r["R_f"], r["L_f"]), complex(r["R_g"], r["L_g"])
     Y = 1 / Z_f + 1 / Z_g + 1j * r["C_f"]
     E = plant.u[2] * cmath.exp(1j * plant.x[6])
@@ -210,6 +212,31 @@ def test_a_blocked_bridge_carries_no_current(run: Callable[..., Run]) -> None:
         assert not one.three_phase()[f"i_{k}"][after].any()
 
 
+def test_converters_of_a_network_see_one_node(tmp_path: Path) -> None:
+    """Of different ratings, in volts and amperes: behind their lines is the same voltage, and the
+    load takes what both bring."""
+    big = tmp_path / "big.toml"
+    text = files("gfm_plant").joinpath("converters/paper.toml").read_text("utf-8")
+    big.write_text(text.replace("S_n = 4000.0", "S_n = 8000.0"), encoding="utf-8")
+    converters = {
+        "small": {"node": "bus", "law": "vsg-2"},
+        "big": {"node": "bus", "law": "vsg-2", "plant": {"converter": str(big)}},
+    }
+    loads = {"load": {"node": "bus", "P": 0.8, "Q": 0.2}}
+    network = {"converters": converters, "loads": loads}
+    runs = gfmhil.run_network({"title": "two", "duration": 1.0, "network": network})
+    seen, currents = [], []
+    for one in runs.values():
+        late = one.three_phase(0.9, 1.0, si=True)
+        turn = 2 * math.pi * one.signals["f_hz"][-1] * late["t"]  # an island finds its own
+        v, i = (2 * np.mean(late[n] * np.exp(-1j * turn)) for n in ("v_a_V", "i_oa_A"))
+        seen.append(v - complex(0.06, 2e-3 * turn[-1] / late["t"][-1]) * i)
+        currents.append(i)
+    assert abs(seen[0] - seen[1]) < 1e-3 * abs(seen[0])
+    power = 1.5 * seen[0] * sum(currents).conjugate()
+    assert power.imag / power.real == pytest.approx(0.2 / 0.8, rel=0.01)
+
+
 def test_a_recording_without_them_says_so(run: Callable[..., Run]) -> None:
     one = run(duration=0.01)
     columns = {name: x for name, x in one.columns.items() if name != "true_v_re"}
@@ -227,7 +254,7 @@ def test_the_names_are_described() -> None:
     assert describe("i_a", []).comment.startswith("current of L_f, phase a")
 
 
-def test_exports_have_them_on_request(run: Callable[..., Run], tmp_path: Any) -> None:
+def test_exports_have_them_on_request(run: Callable[..., Run], tmp_path: Path) -> None:
     one = run(duration=0.02)
     volts, pu = one.three_phase(si=True), one.three_phase()
     export_run(one.folder, "parquet", tmp_path / "run.parquet", "si")
@@ -278,7 +305,7 @@ def test_the_figure_shows_the_cycles_around_the_first_event(run: Callable[..., R
 
 
 def test_the_window_of_the_report_is_that_of_the_scenario(
-    make: Callable[..., Any], tmp_path: Any
+    make: Callable[..., Any], tmp_path: Path
 ) -> None:
     file = tmp_path / "scenario.toml"
     file.write_text('title = "t"\nduration = 0.05\nlink.type = "inproc"\n', encoding="utf-8")

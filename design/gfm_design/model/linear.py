@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
-from gfm_plant.records import PlantRecord
+from gfm_plant.options import FiniteGrid
+from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import LawStateSpace
@@ -114,9 +115,14 @@ class Mode:
 
 
 def linearise_plant(
-    par: PlantRecord, op: OperatingPoint, omega_g: float = 1.0, V_g: float = 1.0
+    par: Record,
+    op: OperatingPoint,
+    omega_g: float = 1.0,
+    V_g: float = 1.0,
+    grid: FiniteGrid | None = None,
 ) -> LinearPlant:
-    """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g."""
+    """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g,
+    ideal or finite."""
     r = par[0]
     at = np.concatenate([op.x, op.u, [omega_g, V_g]])
     slopes = np.empty((N_X + NY + 1, len(at)))
@@ -127,7 +133,7 @@ def linearise_plant(
         p_g = d[1] * (np.cos(x[DELTA]) * x[4] - np.sin(x[DELTA]) * x[5])
         slopes[:, j] = np.concatenate([f(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
     regulated, lags = int(r["i_u_gain"] == 0.0), int(r["tau_dc"] > 0.0)
-    finite, sensors = 2 * int(r["H_grid"] > 0.0), 4 * int(r["filtered"])
+    finite, sensors = 2 * int(grid is not None), 4 * int(r["filtered"])
     source, swing = N_X + regulated, N_X + regulated + lags  # where the states begin
     n = swing + finite
     s = slice(n, n + sensors)
@@ -147,12 +153,12 @@ def linearise_plant(
     else:
         A[V_DC] += per_i_dc * asked
         B[V_DC, 0] = per_i_dc * (1 - regulated)
-    if finite:  # omega_g is a state, and so is the power of the turbines
+    if grid is not None:  # omega_g is a state, and so is the power of the turbines
         A[:, swing], B_d[:, 0] = B_d[:, 0], 0.0
-        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] / r["S_grid"], slopes[-1, -1] / r["S_grid"]
-        A[swing, [swing, swing + 1]] = -r["D_grid"], 1.0
-        A[swing], B_d[swing] = A[swing] / (2 * r["H_grid"]), B_d[swing] / (2 * r["H_grid"])
-        A[swing + 1, [swing, swing + 1]] = -1 / (r["droop_grid"] * r["T_gov"]), -1 / r["T_gov"]
+        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] / grid.S, slopes[-1, -1] / grid.S
+        A[swing, [swing, swing + 1]] = -grid.D, 1.0
+        A[swing], B_d[swing] = A[swing] / (2 * grid.H), B_d[swing] / (2 * grid.H)
+        A[swing + 1, [swing, swing + 1]] = -1 / (grid.droop * grid.T_gov), -1 / grid.T_gov
     if sensors:
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
         C = np.zeros_like(C)
