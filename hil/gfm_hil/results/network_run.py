@@ -96,10 +96,12 @@ class NetworkRun(Mapping[str, Run]):
         try:
             write_scenario(folder, self.scenario)
             if figures and any(run.ticks for run in self.values()):
+                from gfm_hil.results.diagram import draw_diagram
                 from gfm_hil.results.figures import draw_comparison
 
                 path = folder / "converters.png"
                 draw_comparison(path, self.scenario, self._columns(), self._events())
+                draw_diagram(folder, self.scenario)
             write_text(folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None

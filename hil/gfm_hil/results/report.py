@@ -173,4 +173,5 @@ def write_report(
 
 
 def _inline(picture: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
+    kind = {".png": "png", ".svg": "svg+xml"}[picture.suffix]
+    return f"data:image/{kind};base64,{base64.b64encode(picture.read_bytes()).decode()}"

@@ -118,6 +118,7 @@ class Run(RecordedRun):
         Raises:
             UserError: the folder holds something already, or cannot be written.
         """
+        from gfm_hil.results.diagram import draw_diagram
         from gfm_hil.results.figures import draw_run
         from gfm_hil.results.report import write_report
 
@@ -142,6 +143,7 @@ class Run(RecordedRun):
             lines = "".join(json.dumps(event) + "\n" for event in self.events)
             write_text(folder / "events.jsonl", lines)
             pictures = draw_run(folder, self.scenario, arrays, {}, self.summary)
+            pictures.append(draw_diagram(folder, self.scenario))
             write_report(folder, self.scenario, self.summary, pictures)
             write_text(folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
         except OSError as problem:

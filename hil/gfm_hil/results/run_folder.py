@@ -290,10 +290,12 @@ def _conclude(run: Run, figures: bool) -> None:
     folder, scenario, summary = run.folder, run.scenario, run.summary
     if figures and summary["ticks"]:
         # a second of imports, which the sides' processes do without
+        from gfm_hil.results.diagram import draw_diagram
         from gfm_hil.results.figures import draw_run
         from gfm_hil.results.report import write_report
 
         pictures = draw_run(folder, scenario, run.columns, run.timing, summary)
+        pictures.append(draw_diagram(folder, scenario))
         write_report(folder, scenario, summary, pictures)
     sync_folder(folder)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")

@@ -1,0 +1,273 @@
+"""The single-line diagram of a scenario: converters, filters, lines, loads, breakers and grid.
+
+Drawn from the scenario alone, with its parameters in p.u. of each converter; those of a network's
+lines, loads and capacitors are in p.u. of the first one, as in the scenario.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Arc, Circle, Rectangle
+
+from gfm_hil.core.files import replacing
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.scenario.events import Fault
+from gfm_hil.scenario.model import Scenario
+from gfm_plant import Plant, load_converter
+
+_INK, _GREY, _RED = "#222222", "#666666", "#b34500"
+_TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
+_ROW = 1.75
+_Side = Literal["load", "bank", "grid"]
+
+
+@dataclass
+class _Bar:
+    """A node: which converters come from the left, and what hangs on its right."""
+
+    column: int = 0
+    converters: list[str] = field(default_factory=list)
+    right: list[tuple[_Side, str, bool]] = field(default_factory=list)  # kind, text, closed
+    rows: list[int] = field(default_factory=list)
+
+
+def draw_diagram(folder: Path, scenario: Scenario) -> Path:
+    """Draw the diagram into network.svg of a run folder; returns its path."""
+    figure = Figure()
+    fill_diagram(figure, scenario)
+    path = folder / "network.svg"
+    # the same bytes for the same scenario
+    with matplotlib.rc_context({"svg.hashsalt": "gfmhil"}), replacing(path) as part:
+        figure.savefig(part, format="svg", metadata={"Date": None})
+    return path
+
+
+def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
+    """Fill a figure, whose size it sets, with the diagram; events that make faults are marked."""
+    plants, laws, nodes = _converters(scenario)
+    bars, lines = _bars(scenario, nodes)
+    faults = [event for event in scenario.events if isinstance(event, Fault)]
+    top = _give_rows(bars, lines)
+    width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
+    figure.set_size_inches(0.72 * width, 0.72 * (_ROW * top + 0.4))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(-0.2, width), ylim=(-_ROW * top + 0.55, 0.95), aspect="equal")
+    axes.axis("off")
+    spots: dict[str, tuple[float, float, float]] = {}  # of lines: y, where it begins and ends
+    for name, bar in bars.items():
+        x = _at(bar)
+        for row, converter in zip(bar.rows, bar.converters, strict=False):
+            _converter(axes, row, converter, plants[converter], laws[converter])
+            _wire(axes, (_LINE, -_ROW * row), (x, -_ROW * row))
+            _inductor(axes, _LINE + 0.2, -_ROW * row)
+            spots[converter] = -_ROW * row, _TERMINAL, x
+        for row, (kind, text, closed) in zip(bar.rows, bar.right, strict=False):
+            _hang(axes, x, -_ROW * row, kind, text, closed)
+        ys = [-_ROW * row for row in bar.rows]
+        ys += [-_ROW * row for row, start, end, *_ in lines.values() if name in (start, end)]
+        axes.plot(
+            [x, x], [max(ys) + 0.35, min(ys) - 0.35], color=_INK, lw=3.5, solid_capstyle="butt"
+        )
+        axes.text(x, max(ys) + 0.45, name, ha="center", fontsize=8.5, color=_INK)
+    for name, (row, start, end, text, closed) in lines.items():
+        (left, right), y = sorted((_at(bars[start]), _at(bars[end]))), -_ROW * row
+        _wire(axes, (left, y), (right, y))
+        _inductor(axes, (left + right) / 2 - 0.4, y)
+        _breaker(axes, left + 0.5, y, closed)
+        axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
+        spots[name] = (y, left, right) if _at(bars[start]) == left else (y, right, left)
+    for event in faults:
+        _fault(axes, scenario, event, bars, spots)
+    return axes
+
+
+_SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
+
+
+def _converters(
+    scenario: Scenario,
+) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
+    """The plant, the law and the node of each converter, by its name."""
+    if scenario.network is None:
+        return {"": scenario.plant}, {"": scenario.law}, {"": ""}
+    each = {name: scenario.of(name) for name in scenario.converters}
+    nodes = {name: member.node for name, member in scenario.network.converters.items()}
+    return {n: s.plant for n, s in each.items()}, {n: s.law for n, s in each.items()}, nodes
+
+
+_Lines = dict[str, tuple[int, str, str, str, bool]]  #: row, start, end, text, closed
+
+
+def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar], _Lines]:
+    """The nodes with what is at them, and the lines between them."""
+    bars: dict[str, _Bar] = {}
+    for converter, node in nodes.items():
+        bars.setdefault(node, _Bar()).converters.append(converter)
+    grid, network = scenario.plant.grid, scenario.network
+    lines: _Lines = {}
+    at_grid: str | None = next(iter(bars))
+    if network is None:
+        if grid.load_R is not None:
+            text = f"local load\nR {grid.load_R:g} Ω, L {1e3 * (grid.load_L or 0.0):g} mH"
+            bars[next(iter(bars))].right.append(("load", text, True))
+    else:
+        at_grid = network.grid
+        for name, line in network.lines.items():
+            text = f"L {line.L:.3g}, R {line.R:.3g} p.u."
+            lines[name] = 0, line.start, line.end, text, line.closed
+            for node in (line.start, line.end):
+                bars.setdefault(node, _Bar())
+        for name, load in network.loads.items():
+            text = f"{name}\nP {load.P:g}, Q {load.Q:g} p.u."
+            bars.setdefault(load.node, _Bar()).right.append(("load", text, load.closed))
+        for name, bank in network.capacitors.items():
+            text = f"{name}\nQ {bank.Q:g} p.u."
+            bars.setdefault(bank.node, _Bar()).right.append(("bank", text, True))
+    if at_grid is not None:
+        kind = "ideal" if grid.finite is None else f"S {grid.finite.S:g}, H {grid.finite.H:g} s"
+        f_g = grid.omega_g * nominal_frequency(scenario)
+        text = f"grid, {kind}\n$V_g$ {grid.V_g:g} p.u., {f_g:g} Hz"
+        bars.setdefault(at_grid, _Bar()).right.insert(0, ("grid", text, True))
+    _give_columns(bars, lines, at_grid)
+    return bars, lines
+
+
+def _give_columns(bars: Mapping[str, _Bar], lines: _Lines, last: str | None) -> None:
+    """Put every node one column left of its neighbour on the way to the grid, which is last."""
+    away, front = {last or next(iter(bars)): 0}, [last or next(iter(bars))]
+    while front:
+        here = front.pop(0)
+        for _, start, end, *_ in lines.values():
+            other = {start: end, end: start}.get(here)
+            if other is not None and other not in away:
+                away[other] = away[here] + 1
+                front.append(other)
+    for name, bar in bars.items():
+        bar.column = max(away.values()) - away.get(name, 0)
+
+
+def _give_rows(bars: Mapping[str, _Bar], lines: _Lines) -> int:
+    """Give every node, and every line, rows of its own; returns how many there are.
+
+    Nodes at the right come first, so that wires to them pass above the others.
+    """
+    row, done = 0, set[str]()
+    for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
+        for line, (_, start, end, text, closed) in lines.items():
+            if {start, end} & done and name in (start, end):
+                lines[line] = row, start, end, text, closed
+                row += 1
+        count = max(1, len(bar.converters), len(bar.right))
+        bar.rows = [*range(row, row + count)]
+        row += count
+        done.add(name)
+    return row
+
+
+def _at(bar: _Bar) -> float:
+    return _BARS + _COLUMN * bar.column
+
+
+def _wire(axes: Axes, *points: tuple[float, float], colour: str = _INK) -> None:
+    axes.plot(*zip(*points, strict=True), color=colour, lw=1.1, solid_capstyle="round")
+
+
+def _inductor(axes: Axes, x: float, y: float) -> None:
+    """Four humps over 0.8, in place of the wire below them."""
+    axes.add_patch(Rectangle((x, y - 0.05), 0.8, 0.1, fc="white", ec="none", zorder=2.5))
+    for k in range(4):
+        axes.add_patch(Arc((x + 0.1 + 0.2 * k, y), 0.2, 0.26, theta1=0, theta2=180, ec=_INK,
+                           lw=1.1, zorder=3))  # fmt: skip
+
+
+def _capacitor(axes: Axes, x: float, y: float) -> None:
+    """From a wire down to ground."""
+    _wire(axes, (x, y), (x, y - 0.3))
+    for k in (0.3, 0.4):
+        _wire(axes, (x - 0.18, y - k), (x + 0.18, y - k))
+    _wire(axes, (x, y - 0.4), (x, y - 0.6))
+    for k, half in enumerate((0.16, 0.1, 0.04)):
+        _wire(axes, (x - half, y - 0.6 - 0.06 * k), (x + half, y - 0.6 - 0.06 * k))
+
+
+def _breaker(axes: Axes, x: float, y: float, closed: bool) -> None:
+    """A square, filled while it is closed, as IEEE Std 315 has breakers of single-line diagrams."""
+    axes.add_patch(
+        Rectangle((x - 0.11, y - 0.11), 0.22, 0.22, fc=_INK if closed else "white", ec=_INK, lw=1.1,
+                  zorder=3)
+    )  # fmt: skip
+
+
+def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
+    """DC source, bridge, filter and terminal, with what they are."""
+    y = -_ROW * row
+    parameters = load_converter(plant.converter)
+    pu = parameters.pu(plant.real_factors())
+    axes.add_patch(Circle((0.25, y), 0.25, fc="white", ec=_INK, lw=1.1))
+    axes.text(0.25, y, "DC", ha="center", va="center", fontsize=6.5, color=_INK)
+    _wire(axes, (0.5, y), (1.4, y))
+    _capacitor(axes, 0.95, y)
+    axes.add_patch(Rectangle((1.4, y - 0.35), 0.7, 0.7, fc="white", ec=_INK, lw=1.2))
+    _wire(axes, (1.4, y - 0.35), (2.1, y + 0.35))
+    axes.text(1.56, y + 0.17, "=", ha="center", va="center", fontsize=9, color=_INK)
+    axes.text(1.93, y - 0.19, "~", ha="center", va="center", fontsize=11, color=_INK)
+    _wire(axes, (2.1, y), (_LINE, y))
+    _inductor(axes, 2.5, y)
+    _capacitor(axes, _TERMINAL, y)
+    axes.plot([_TERMINAL], [y], "o", ms=3.5, color=_INK)
+    title = f"{name}: {law}" if name else law
+    axes.text(0.0, y + 0.47, f"{title}, {parameters.S_n / 1e3:g} kVA", fontsize=8.5, color=_INK)
+    line = f"$L_g$ {pu['L_g']:.3g}\n$R_g$ {pu['R_g']:.2g}"
+    if not name:  # alone at its grid
+        line += f"\nSCR {1 / abs(complex(pu['R_g'], pu['L_g'])):.3g}"
+    for x, text in (
+        (0.95, f"$C_{{dc}}$ {pu['C_dc']:.4g}"),
+        (2.9, f"$L_f$ {pu['L_f']:.3g}\n$R_f$ {pu['R_f']:.2g}"),
+        (_TERMINAL, f"$C_f$ {pu['C_f']:.3g}"),
+        (_LINE + 0.6, line),
+    ):
+        below = 0.78 if x in (0.95, _TERMINAL) else 0.15
+        axes.text(x, y - below, text, ha="center", va="top", **_SMALL)
+
+
+def _hang(axes: Axes, x: float, y: float, kind: _Side, text: str, closed: bool) -> None:
+    """What hangs on the right of a bar: a load, a bank of capacitors or the grid."""
+    _wire(axes, (x, y), (x + 1.2, y))
+    if kind == "bank":
+        _capacitor(axes, x + 1.2, y)
+    else:
+        _breaker(axes, x + 0.5, y, closed)
+    if kind == "load":
+        style = {"arrowstyle": "-|>", "color": _INK, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", (x + 1.2, y - 0.55), (x + 1.2, y), arrowprops=style)
+    if kind == "grid":
+        axes.add_patch(Circle((x + 1.5, y), 0.3, fc="white", ec=_INK, lw=1.2))
+        axes.text(x + 1.5, y - 0.02, "~", ha="center", va="center", fontsize=13, color=_INK)
+    axes.text(x + (1.95 if kind == "grid" else 1.5), y, text, va="center", **_SMALL)
+
+
+def _fault(
+    axes: Axes,
+    scenario: Scenario,
+    event: Fault,
+    bars: Mapping[str, _Bar],
+    spots: Mapping[str, tuple[float, float, float]],
+) -> None:
+    """A flash where the event puts its fault."""
+    if event.node is not None:
+        x, y = _at(bars[event.node]), -_ROW * bars[event.node].rows[0]
+    else:
+        y, start, end = spots[event.line if event.line is not None else next(iter(spots))]
+        x = start + (event.position or 0.0) * (end - start)
+    flash: Sequence[tuple[float, float]] = [(0.0, 0.0), (0.16, 0.3), (0.02, 0.3), (0.2, 0.62)]
+    _wire(axes, *((x + a, y + b) for a, b in flash), colour=_RED)
+    axes.plot([x], [y], "v", ms=5, color=_RED, zorder=4)
+    t = event.at(scenario.T_s) * scenario.T_s
+    axes.text(x + 0.26, y + 0.5, f"fault, {t:g} s", fontsize=7.5, color=_RED)

@@ -1,0 +1,85 @@
+"""The single-line diagram shows what the scenario has."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from gfm_hil.results.diagram import draw_diagram, fill_diagram
+from gfm_hil.results.run import Run
+from gfm_hil.scenario.model import Scenario, load_scenario, shipped_scenarios
+
+Make = Callable[..., Scenario]
+FAULT = {"t": 0.02, "type": "fault", "position": 0.25, "R": 0.1}
+
+
+def texts(scenario: Scenario) -> list[str]:
+    return [text.get_text() for text in fill_diagram(Figure(), scenario).texts]
+
+
+def breakers(scenario: Scenario) -> list[bool]:
+    """Of the small squares, whether each is filled."""
+    small = [p for p in fill_diagram(Figure(), scenario).patches if isinstance(p, Rectangle)]
+    return [p.get_facecolor()[0] < 0.5 for p in small if p.get_width() == pytest.approx(0.22)]
+
+
+def test_one_converter_at_its_grid(make: Make) -> None:
+    plant = {"grid": {"scr": 4.0, "x_over_r": 3.0, "omega_g": 0.99, "load_R": 40.0, "load_L": 0.01}}
+    shown = texts(make(law="vsg-2", plant=plant))
+    assert "vsg-2, 4 kVA" in shown
+    # by hand: 1/4 over sqrt(1 + 9), 3 to 1
+    assert "$L_g$ 0.237\n$R_g$ 0.079\nSCR 4" in shown
+    assert "grid, ideal\n$V_g$ 1 p.u., 49.5 Hz" in shown
+    assert "local load\nR 40 Ω, L 10 mH" in shown
+    assert not any("fault" in text for text in shown)
+
+
+def test_a_fault_is_marked_at_its_place(make: Make) -> None:
+    places = []
+    for position in (0.0, 0.25, 0.5):
+        axes = fill_diagram(Figure(), make(events=[{**FAULT, "position": position, "R": 0.1}]))
+        assert "fault, 0.02 s" in [text.get_text() for text in axes.texts]
+        places += [x for line in axes.lines if line.get_marker() == "v" for x in line.get_xdata()]
+        dots = [x for line in axes.lines if line.get_marker() == "o" for x in line.get_xdata()]
+        assert places[0] == dots[0]  # the terminal, where the capacitor is
+    assert places[2] - places[0] == pytest.approx(2 * (places[1] - places[0]))
+
+
+def test_a_network_has_all_its_parts() -> None:
+    scenario = load_scenario("three_share_a_load")
+    shown = texts(scenario)
+    named = ["A: vsg-2, 4 kVA", "B: droop-3, 4 kVA", "C: mimo-gfm-deployable, 4 kVA", "bus", "far"]
+    parts = ["feeder\nL 0.1, R 0.02 p.u.", "base\nP 0.9, Q 0.2 p.u.", "step\nP 0.6, Q 0.1 p.u."]
+    assert {*named, *parts} <= {*shown} and not any("grid" in text for text in shown)
+    assert sorted(breakers(scenario)) == [False, True, True]  # the load step is not on yet
+    finite = load_scenario("loss_of_the_last_machine")
+    assert "grid, S 1, H 3 s\n$V_g$ 1 p.u., 50 Hz" in texts(finite)
+    circles = [p for p in fill_diagram(Figure(), finite).patches if isinstance(p, Circle)]
+    assert len(circles) == 3  # two DC sources and the grid
+
+
+@pytest.mark.parametrize("name", shipped_scenarios())
+def test_every_shipped_scenario_is_drawn_within_its_picture(name: str) -> None:
+    figure = Figure()
+    axes = fill_diagram(figure, load_scenario(name))
+    figure.draw_without_rendering()
+    for text in axes.texts:
+        box = text.get_window_extent().transformed(figure.transFigure.inverted())
+        assert box.x0 >= 0 and box.x1 <= 1 and box.y0 >= 0 and box.y1 <= 1, text.get_text()
+
+
+def test_the_report_shows_it(make: Make, tmp_path: Path) -> None:
+    from gfm_hil.results.runner import run_scenario
+
+    one: Run = run_scenario(make(events=[FAULT]), tmp_path / "run")
+    report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert 'alt="network" src="data:image/svg+xml;base64,' in report
+    drawn = one.file("network.svg").read_bytes()
+    assert ET.fromstring(drawn).tag == "{http://www.w3.org/2000/svg}svg"
+    (tmp_path / "again").mkdir()
+    assert draw_diagram(tmp_path / "again", one.scenario).read_bytes() == drawn
