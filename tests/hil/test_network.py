@@ -183,3 +183,18 @@ def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:
     V = 0.5 * (a["true_V"][-1] + b["true_V"][-1])  # both feed the bus through the same short line
     assert a["p"][-1] + b["p"][-1] == pytest.approx(1.2 * V**2, rel=0.03)
     assert a["omega_u"][-1] == pytest.approx(b["omega_u"][-1], abs=1e-6)
+
+
+def test_a_machine_and_a_converter_share_a_load_by_their_droops() -> None:
+    given = content(duration=8.0)
+    given["network"]["converters"] = {"A": {**BUS, "law": "vsg-2"}}
+    given["network"]["machines"] = {"M": {**BUS, "S": 2.0, "H": 3.0, "P": 0.2}}
+    run = gfmhil.run_network(given)["A"]
+    assert run.status == "completed"
+    s = run.signals
+    assert s["true_omega_g"][-1] == pytest.approx(s["omega_u"][-1], abs=1e-6)
+    off = s["omega_u"][-1] - s["omega_u"][0]
+    V = s["true_V"][-1]
+    machine = -2.0 * off / 0.05  # its rating, over its droop
+    rise = s["p"][-1] - s["p"][0]
+    assert off < -1e-3 and rise + machine == pytest.approx(0.4 * V**2, rel=0.05)
