@@ -13,6 +13,8 @@ from gfm_plant.grid import line_breaker
 from gfm_plant.model import DELTA, V_DC
 from gfm_plant.names import TRIPS
 
+pytestmark = pytest.mark.full  # compiles the plant for several converters
+
 T_S = 1e-4
 OFF = {name: {"enabled": False} for name, *_ in TRIPS}
 MACHINE = {"node": "m", "S": 2.0, "H": 0.8, "P": 0.4, "D": 0.5, "T_gov": 0.2, "E": 1.03, "R": 0.004}
