@@ -57,10 +57,26 @@ def test_a_network_has_all_its_parts() -> None:
     parts = ["feeder\nL 0.1, R 0.02 p.u.", "base\nP 0.9, Q 0.2 p.u.", "step\nP 0.6, Q 0.1 p.u."]
     assert {*named, *parts} <= {*shown} and not any("grid" in text for text in shown)
     assert sorted(breakers(scenario)) == [False, True, True]  # the load step is not on yet
-    finite = load_scenario("loss_of_the_last_machine")
-    assert "grid, S 1, H 3 s\n$V_g$ 1 p.u., 50 Hz" in texts(finite)
-    circles = [p for p in fill_diagram(Figure(), finite).patches if isinstance(p, Circle)]
-    assert len(circles) == 3  # two DC sources and the grid
+    machine = load_scenario("loss_of_the_last_machine")
+    assert {"machine\nS 1, H 3 s, X 0.3", "SM"} <= {*texts(machine)}
+    circles = [p for p in fill_diagram(Figure(), machine).patches if isinstance(p, Circle)]
+    assert len(circles) == 3  # two DC sources and the machine
+
+
+def test_a_network_at_a_finite_grid(make: Make) -> None:
+    """Banks are at their node, and the node of the grid is the last one."""
+    network = {
+        "grid": "town",
+        "converters": {"A": {"node": "farm"}, "B": {"node": "farm"}},
+        "lines": {"cable": {"start": "town", "end": "farm", "L": 0.1, "closed": True}},
+        "capacitors": {"bank": {"node": "farm", "Q": 0.1}},
+    }
+    grid = {"finite": {"S": 20.0, "H": 4.0}}
+    scenario = make(network=network, plant={"grid": grid})
+    axes = fill_diagram(Figure(), scenario)
+    at = {text.get_text(): text.get_position()[0] for text in axes.texts}
+    assert at["farm"] < at["town"] < at["grid, S 20, H 4 s\n$V_g$ 1 p.u., 50 Hz"]
+    assert at["farm"] < at["bank\nQ 0.1 p.u."] and breakers(scenario) == [True, True]
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())

@@ -1,4 +1,4 @@
-"""The single-line diagram of a scenario: converters, filters, lines, loads, breakers and grid.
+"""The single-line diagram of a scenario: converters, filters, lines, loads, machines and grid.
 
 Drawn from the scenario alone, with its parameters in p.u. of each converter; those of a network's
 lines, loads and capacitors are in p.u. of the first one, as in the scenario.
@@ -25,7 +25,7 @@ from gfm_plant import Plant, load_converter
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
 _ROW = 1.75
-_Side = Literal["load", "bank", "grid"]
+_Side = Literal["load", "bank", "machine", "grid"]
 
 
 @dataclass
@@ -127,6 +127,9 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
         for name, load in network.loads.items():
             text = f"{name}\nP {load.P:g}, Q {load.Q:g} p.u."
             bars.setdefault(load.node, _Bar()).right.append(("load", text, load.closed))
+        for name, machine in network.machines.items():
+            text = f"{name}\nS {machine.S:g}, H {machine.H:g} s, X {machine.X:g}"
+            bars.setdefault(machine.node, _Bar()).right.append(("machine", text, True))
         for name, bank in network.capacitors.items():
             text = f"{name}\nQ {bank.Q:g} p.u."
             bars.setdefault(bank.node, _Bar()).right.append(("bank", text, True))
@@ -238,7 +241,7 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
 
 
 def _hang(axes: Axes, x: float, y: float, kind: _Side, text: str, closed: bool) -> None:
-    """What hangs on the right of a bar: a load, a bank of capacitors or the grid."""
+    """What hangs on the right of a bar: a load, a bank of capacitors, a machine or the grid."""
     _wire(axes, (x, y), (x + 1.2, y))
     if kind == "bank":
         _capacitor(axes, x + 1.2, y)
@@ -247,10 +250,11 @@ def _hang(axes: Axes, x: float, y: float, kind: _Side, text: str, closed: bool) 
     if kind == "load":
         style = {"arrowstyle": "-|>", "color": _INK, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", (x + 1.2, y - 0.55), (x + 1.2, y), arrowprops=style)
-    if kind == "grid":
+    if kind in ("grid", "machine"):
         axes.add_patch(Circle((x + 1.5, y), 0.3, fc="white", ec=_INK, lw=1.2))
-        axes.text(x + 1.5, y - 0.02, "~", ha="center", va="center", fontsize=13, color=_INK)
-    axes.text(x + (1.95 if kind == "grid" else 1.5), y, text, va="center", **_SMALL)
+        sign, size = ("~", 13) if kind == "grid" else ("SM", 8)
+        axes.text(x + 1.5, y - 0.02, sign, ha="center", va="center", fontsize=size, color=_INK)
+    axes.text(x + (1.5 if kind in ("load", "bank") else 1.95), y, text, va="center", **_SMALL)
 
 
 def _fault(
