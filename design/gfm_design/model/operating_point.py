@@ -74,6 +74,8 @@ def operating_point(
         NoEquilibrium: the law has no rest state there (a frequency that its droop cannot reach
             within the line's capacity, or no steady state at all).
     """
+    if law.law.inner is not None and law.law.inner.f_pll > 0.0:
+        ref = np.array([*ref[:2], omega_g, *ref[3:]])  # the law sees what its PLL measures
     controlled = par[0]["i_u_gain"] != 0.0
     # row 1's states are left out of a plant whose DC source ignores it
     kept = np.array([i for i, row in enumerate(law.rows) if controlled or row != 0], dtype=int)
