@@ -43,9 +43,9 @@ def record(folder: Path, seconds: float) -> tuple[Part, Part]:
     (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     plant, controller = (Part.create(folder, s, scenario.ticks) for s in ("plant", "controller"))
     bench = make_bench(scenario)
-    compile_loop(bench, plant, controller)
+    compile_loop([bench])
     timeline = Timeline(bench, folder / "events_both.jsonl", ("plant", "controller"))
-    run_inproc(bench, plant, controller, timeline, lambda ticks: True)
+    run_inproc([bench], [plant], [controller], [timeline], lambda ticks: True)
     timeline.close()
     deadlines = np.arange(scenario.ticks) * round(T_S * 1e9)
     for column, after in enumerate((0, 2_000, 4_000, 30_000)):

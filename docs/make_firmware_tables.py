@@ -14,7 +14,10 @@ from _ext.outputs import command
 from gfm_hil.core.files import write_text
 from gfm_runtime import law_names
 from gfm_runtime.firmware import TARGETS, Checked, check
+from gfm_runtime.inner_file import inner_names
 
+#: the law that is shown with each inner stage
+STAGED = "vsg-2"
 TABLES = Path(__file__).parent / "tables"
 #: target, precision and style of the columns
 MEASURED = (
@@ -28,16 +31,24 @@ MEASURED = (
 def main() -> None:
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
-        results = [_measured(folder / f"{k}", *what) for k, what in enumerate(MEASURED)]
+        results = [_measured(folder / f"{k}", "all", *what) for k, what in enumerate(MEASURED)]
+        stages = {
+            stage: [
+                _measured(folder / f"{stage}{k}", f"{STAGED} --inner {stage}", *what)[STAGED]
+                for k, what in enumerate(MEASURED)
+            ]
+            for stage in inner_names()
+        }
         export = command("gfmhil firmware export vsg-1 -o firmware", folder=folder)
         host = command("gfmhil firmware check firmware", folder=folder)
         cortex = command("gfmhil firmware check firmware --target m4f", folder=folder)
     write_text(TABLES / "firmware_cli.md", "\n\n".join([export, host, cortex]) + "\n")
     write_text(TABLES / "firmware_laws.md", _table(results))
+    write_text(TABLES / "firmware_stages.md", _stages(stages))
 
 
-def _measured(folder: Path, target: str, real: str, style: str) -> dict[str, Checked]:
-    command(f"gfmhil firmware export all --real {real} --style {style} -o {folder}")
+def _measured(folder: Path, laws: str, target: str, real: str, style: str) -> dict[str, Checked]:
+    command(f"gfmhil firmware export {laws} --real {real} --style {style} -o {folder}")
     return {found.name: found for found in check(folder, target)}
 
 
@@ -69,6 +80,20 @@ def _table(results: list[dict[str, Checked]]) -> str:
             "",
         ]
     )
+
+
+def _stages(results: dict[str, list[Checked]]) -> str:
+    heads = (f"{STAGED} with", "on", "instructions", "code [B]", "constants [B]", "state [B]",
+             "stack [B]")  # fmt: skip
+    lines = ["| " + " | ".join(heads) + " |", "| --- | --- " + "| ---: " * 5 + "|"]
+    for k, (target, real, style) in enumerate(MEASURED):
+        for stage, found in results.items():
+            one = found[k]
+            assert one.instructions is not None and one.differ == 0
+            cells = (stage, f"{target} {real}, {style}", "{}…{}".format(*one.instructions),
+                     one.code, one.constants, one.state, one.stack)  # fmt: skip
+            lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from gfm_hil.core import blas as _blas  # noqa: F401  before NumPy is first impo
 _HOMES = {
     "UserError": "gfm_hil.core.errors",
     "load_run": "gfm_hil.results.run",
+    "NetworkRun": "gfm_hil.results.network_run",
     "Run": "gfm_hil.results.run",
     "load_scenario": "gfm_hil.scenario.model",
     "Scenario": "gfm_hil.scenario.model",
@@ -24,6 +25,7 @@ _HOMES = {
     "laws": "gfm_hil.studies.law",
     "Loop": "gfm_hil.studies.loop",
     "run": "gfm_hil.studies.notebook",
+    "run_network": "gfm_hil.studies.notebook",
     "campaign": "gfm_hil.studies.notebook",
     "compare": "gfm_hil.studies.notebook",
     "Comparison": "gfm_hil.studies.notebook",

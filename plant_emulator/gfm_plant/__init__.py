@@ -1,7 +1,8 @@
 """The plant: a grid-forming converter with its filter, DC source, line, grid and instruments.
 
-Describe one with `options.Plant`, build its records with `make_plant`, put it at rest with
-`plant_equilibrium` and `plant_init`, then alternate `plant_sample` and `plant_advance`.
+Describe one with `options.Plant`, build it with `make_plant`, put it at rest with
+`plant_equilibrium` and `Network.start`, then alternate `plant_sample` and `plant_advance` on its
+records. `make_network` connects several converters.
 """
 
 import lazy_loader

@@ -1,9 +1,8 @@
 from .bases import Bases
-from .build import make_plant
+from .build import make_network, make_plant
 from .emulator import (
     plant_advance,
     plant_command,
-    plant_init,
     plant_is_delayed,
     plant_step,
     plant_truth,
@@ -18,12 +17,14 @@ from .grid import (
     grid_unbalance,
     grid_voltage,
     phase_jump,
+    take_out,
 )
 from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
-from .options import Plant
+from .network import Network
+from .options import NetworkParts, Plant
 from .parameters import ConverterParameters, load_converter
 from .protection import trip_reason
-from .records import plant_par_dtype, plant_state_dtype
+from .records import PlantRecords
 from .sensors import plant_sample
 from .steady_state import NoEquilibrium, plant_equilibrium
 
@@ -34,8 +35,11 @@ __all__ = [
     "TRUTH",
     "Bases",
     "ConverterParameters",
+    "Network",
+    "NetworkParts",
     "NoEquilibrium",
     "Plant",
+    "PlantRecords",
     "breaker",
     "clear_fault",
     "fault",
@@ -45,17 +49,16 @@ __all__ = [
     "grid_unbalance",
     "grid_voltage",
     "load_converter",
+    "make_network",
     "make_plant",
     "phase_jump",
     "plant_advance",
     "plant_command",
     "plant_equilibrium",
-    "plant_init",
     "plant_is_delayed",
-    "plant_par_dtype",
     "plant_sample",
-    "plant_state_dtype",
     "plant_step",
     "plant_truth",
+    "take_out",
     "trip_reason",
 ]

@@ -3,40 +3,49 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import expm
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
-from gfm_plant.options import COMMANDS, MEASURED, Overload, Plant, Protection
-from gfm_plant.parameters import load_converter
-from gfm_plant.records import (
-    BLOCKED,
-    FAULTED,
-    N_RING,
-    OPERATING,
-    PlantRecord,
-    plant_par_dtype,
-    plant_state_dtype,
+from gfm_plant.network import Network
+from gfm_plant.options import (
+    COMMANDS,
+    MEASURED,
+    FiniteGrid,
+    Grid,
+    NetworkParts,
+    Overload,
+    Plant,
+    Protection,
 )
-from gfm_plant.solution import BRIDGE, GRID, NEGATIVE, STATES
+from gfm_plant.parameters import ConverterParameters, load_converter
+from gfm_plant.records import (
+    N_OWN,
+    N_RING,
+    PlantRecords,
+    Record,
+    converter_par_dtype,
+    converter_state_dtype,
+    network_dtypes,
+    size_for,
+)
+from gfm_plant.wiring import Unit, Wiring
 
-_DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
+CONVERTER, FAR, LOAD = "converter", "far", "load"
+"""Names in a plant of one converter: itself, the far end of its line, and the load there."""
+
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
-_PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
-_LOOK = 10e-6  # s; how often a peak-current limit looks at the current
-_MOST = 500  # steps, or pieces, in a period
 
 
-def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
-    """Return the parameter and the state record of the plant that `options` describe.
+def make_plant(options: Plant, T_s: float) -> Network:
+    """Return the plant that `options` describe: one converter on its line, load and grid.
 
-    The state is a de-energised converter on a closed grid breaker; `plant_init` puts it into an
+    Its state is a de-energised converter on a closed grid breaker; `plant_init` puts it into an
     operating point.
 
     Args:
@@ -46,96 +55,167 @@ def make_plant(options: Plant, T_s: float) -> tuple[PlantRecord, PlantRecord]:
     Raises:
         ValueError: If the converter is unknown, or the DC source's control is too fast for T_s.
     """
-    if not (math.isfinite(T_s) and T_s > 0):
-        raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
-    par = np.zeros(1, plant_par_dtype)
-    par["fault_at"] = -1.0
-    _pack_circuit(par, options)
-    _pack_grid(par, options, T_s)
-    _pack_measurement(par, options)
-    _pack_timing(par, options, T_s)
-    _pack_protection(par, options.protection, T_s)
-    connect(par, closed=True)
-
-    st = np.zeros(1, plant_state_dtype)
-    st["x"][0, V_DC] = 1.0
-    st["unit"][0, :, 0] = st["sequence"][0, 0, 0] = 1.0
-    st["sensed"][0, 0] = 1.0
-    st["u"][0, :, 1] = st["u_now"][0, 1] = options.grid.omega_g
-    st["closed"] = 1
-    st["omega_g"] = st["omega_g_to"] = options.grid.omega_g
-    st["V_g"] = st["V_g_to"] = options.grid.V_g
-    return par, st
+    load: tuple[Branch, ...] = ()
+    if options.grid.load_R is not None and options.grid.load_L is not None:
+        bases = load_converter(options.converter).bases
+        L, R = bases.to_pu(options.grid.load_L, "L"), bases.to_pu(options.grid.load_R, "R")
+        load = (Branch(LOAD, FAR, GROUND, L, R),)
+    return _make({CONVERTER: (options, FAR)}, T_s, options.grid, FAR, load)
 
 
-def connect(par: PlantRecord, closed: bool) -> None:
-    """Set the modes of all circuits, with the grid's breaker closed or open.
+def make_network(
+    converters: Mapping[str, tuple[Plant, str]], T_s: float, grid: Grid, parts: NetworkParts
+) -> Network:
+    """Return a plant of several converters, each with its line to a node of a network.
+
+    Args:
+        converters: By name, the options of each, of which `grid` is not used, and its node.
+        T_s: Sampling period in s.
+        grid: The grid simulator, p.u., if `parts` has a node for it.
+        parts: What connects them.
 
     Raises:
-        ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast for
-            the DC link.
+        ValueError: If there are too many parts, two of one name, converters of different voltages
+            or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
-    r = par[0]
-    last = "i_g" if r["fault_at"] > 0 else "i_load" if r["L_load"] > 0 else "i_o"
-    par["n_states"] = STATES.index(last) + 1
-    faults = (0, FAULTED) if r["fault_at"] >= 0 else (0,)
-    found = {c + f: _modes(r, closed, c, f) for c in (OPERATING, BLOCKED) for f in faults}
-    _pack_pieces(par, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
-    for circuit, (modes, sources) in found.items():
-        n = par["n_modes"][0, circuit] = len(modes.rates)
-        _set(par["rate"][0, circuit, :n], modes.rates)
-        for part, half in enumerate(par["half_h"][0]):
-            _set(par["decay"][0, circuit, part, :n], np.exp(modes.rates * half))
-        _set(par["states"][0, circuit, :, :n], modes.states)
-        _set(par["modes"][0, circuit, :n], modes.modes)
-        par["drive"][0, circuit] = 0.0
-        for k, source in enumerate(sources):
-            for place in (BRIDGE,) if source.name == "bridge" else (GRID, NEGATIVE):
-                _set(par["drive"][0, circuit, :n, place], modes.drive[:, k])
+    names = [*converters, *parts.lines, *parts.loads, *parts.capacitors]
+    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
+        raise ValueError(f"network: {twice[0]} is the name of two parts")
+    branches = [Branch(name, x.start, x.end, x.L, x.R) for name, x in parts.lines.items()]
+    shunts: dict[str, Shunt] = {}
+    for name, load in parts.loads.items():
+        size = load.P**2 + load.Q**2
+        if load.Q > 0:
+            branches.append(Branch(name, load.node, GROUND, load.Q / size, load.P / size))
+        elif load.node in shunts:
+            raise ValueError(
+                f"network: {shunts[load.node].name} and {name}: two resistors at node {load.node};"
+                " make them one load"
+            )
+        else:
+            shunts[load.node] = Shunt(name, load.node, 1 / load.P)
+    banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
+    opened = {name for name, line in parts.lines.items() if not line.closed}
+    opened |= {name for name, load in parts.loads.items() if not load.closed}
+    return _make(
+        converters,
+        T_s,
+        grid,
+        parts.grid,
+        branches,
+        tuple(shunts.values()),
+        banks,
+        frozenset(opened),
+    )
 
 
-def _modes(r: Any, closed: bool, bridge: int, fault: int) -> tuple[Modes, list[Source]]:
-    """The modes of one of the circuits, and its sources."""
-    at = r["fault_at"]
-    branches, shunts, sources = [], [], []
-    if at > 0:  # the line in two pieces
-        branches.append(Branch("i_o", "terminal", "fault", at * r["L_g"], at * r["R_g"]))
-        branches.append(Branch("i_g", "fault", "far", (1 - at) * r["L_g"], (1 - at) * r["R_g"]))
-    else:
-        branches.append(Branch("i_o", "terminal", "far", r["L_g"], r["R_g"]))
-    if fault:
-        shunts.append(Shunt("fault", "fault" if at > 0 else "terminal", r["fault_R"]))
-    if bridge == OPERATING:
-        branches.append(Branch("i_f", "bridge", "terminal", r["L_f"], r["R_f"]))
-        sources.append(Source("bridge", "bridge"))
-    if r["L_load"] > 0:
-        branches.append(Branch("i_load", "far", GROUND, r["L_load"], r["R_load"]))
-    if closed:
-        sources.append(Source("grid", "far"))
-    capacitor = Capacitor("v", "terminal", r["C_f"])
-    modes = find_modes(branches, [capacitor], sources, r["omega_b"], STATES, shunts)
-    return modes, sources
+def _make(
+    converters: Mapping[str, tuple[Plant, str]],
+    T_s: float,
+    grid: Grid,
+    grid_node: str | None,
+    branches: Sequence[Branch],
+    shunts: Sequence[Shunt] = (),
+    capacitors: Sequence[Capacitor] = (),
+    opened: frozenset[str] = frozenset(),
+) -> Network:
+    """Return a plant; elements in p.u. of the first converter."""
+    if not (math.isfinite(T_s) and T_s > 0):
+        raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
+    N = len(converters)
+    states = N_OWN * N + len(branches) + len(capacitors) + 1  # one for a fault within a branch
+    net_dtype, now_dtype = network_dtypes(size_for(N, states))
+    records = PlantRecords(
+        np.zeros(N, converter_par_dtype),
+        np.zeros(N, converter_state_dtype),
+        np.zeros(1, net_dtype),
+        np.zeros(1, now_dtype),
+    )
+    par, st, net, now = records
+    units = []
+    first = load_converter(next(iter(converters.values()))[0].converter)
+    for k, (name, (options, node)) in enumerate(converters.items()):
+        one = par[k : k + 1]
+        units.append(_pack_converter_circuit(one, name, node, options, first))
+        _pack_measurement(one, options)
+        one["T_s"], one["delay"] = T_s, options.delay.samples
+        one["fraction"] = options.delay.fraction
+        _pack_protection(one, options.protection, T_s)
+    net["omega_b"], net["T_s"], net["n_converters"] = first.bases.omega_b, T_s, N
+    _pack_timing(records)
+    _pack_grid(records, units, grid.finite)
+
+    st["x"][:, V_DC] = 1.0
+    now["unit"][0, :, 0] = now["sequence"][0, 0, 0] = 1.0
+    st["sensed"][:, 0] = 1.0
+    st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
+    now["closed"] = grid_node is not None
+    now["omega_g"] = now["omega_g_to"] = grid.omega_g
+    now["V_g"] = now["V_g_to"] = grid.V_g
+    wiring = Wiring(
+        first.bases.omega_b,
+        tuple(units),
+        tuple(branches),
+        tuple(shunts),
+        tuple(capacitors),
+        grid_node,
+        opened=opened,
+    )
+    _check_paths(wiring)
+    network = Network(records, wiring)
+    network.connect(wiring)
+    return network
 
 
-def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:
-    field[..., 0], field[..., 1] = values.real, values.imag
+def _check_paths(wiring: Wiring) -> None:
+    """Raise ValueError if a part has no path to a converter."""
+    reached = {unit.node for unit in wiring.units}
+    while True:
+        more = {
+            node
+            for branch in wiring.branches
+            if branch.end != GROUND and {branch.start, branch.end} & reached
+            for node in (branch.start, branch.end)
+        }
+        if more <= reached:
+            break
+        reached |= more
+    ends = [(unit.name, unit.node) for unit in wiring.units]
+    ends += [(b.name, node) for b in wiring.branches for node in (b.start, b.end)]
+    ends += [(shunt.name, shunt.node) for shunt in wiring.shunts]
+    ends += [(capacitor.name, capacitor.node) for capacitor in wiring.capacitors]
+    ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
+    for name, node in ends:
+        if node not in reached | {GROUND}:
+            raise ValueError(
+                f"network: {name} is at node {node!r}, which has no path to a converter; nodes with"
+                f" one are {sorted(reached)}"
+            )
 
 
-def _pack_circuit(par: PlantRecord, options: Plant) -> None:
+def _pack_converter_circuit(
+    par: Record, name: str, node: str, options: Plant, first: ConverterParameters
+) -> Unit:
+    """Pack the elements of a converter, and return them in p.u. of the first one."""
     converter = load_converter(options.converter)
+    for what in ("omega_n", "V_n"):
+        if getattr(converter, what) != getattr(first, what):
+            raise ValueError(
+                f"{name}: {what} = {getattr(converter, what):g}: must be that of the first"
+                f" converter, {getattr(first, what):g}"
+            )
     bases = converter.bases
     par["omega_b"] = bases.omega_b
-    for name, value in converter.pu(options.real_factors()).items():
-        par[name] = value
+    elements = converter.pu(options.real_factors())
+    for element, value in elements.items():
+        par[element] = value
     nominal = converter.pu()
     par["L_line_n"], par["R_line_n"] = nominal["L_g"], nominal["R_g"]
-    if options.grid.load_R is not None and options.grid.load_L is not None:
-        par["R_load"] = bases.to_pu(options.grid.load_R, "R")
-        par["L_load"] = bases.to_pu(options.grid.load_L, "L")
+    ratio = first.S_n / converter.S_n
+    par["current"] = ratio
 
     per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
-
     par["i_peak"] = math.inf if options.i_peak is None else options.i_peak
 
     source = options.dc_source
@@ -145,16 +225,21 @@ def _pack_circuit(par: PlantRecord, options: Plant) -> None:
         par["i_u_gain"] = 1.0
     else:
         par["k_p"], par["k_i"] = source.k_p, source.k_i
+    return Unit(
+        name, node,
+        elements["L_f"] * ratio, elements["R_f"] * ratio, elements["C_f"] / ratio,
+        elements["L_g"] * ratio, elements["R_g"] * ratio,
+    )  # fmt: skip
 
 
-def _pack_grid(par: PlantRecord, options: Plant, T_s: float) -> None:
-    grid = options.grid.finite
+def _pack_grid(records: PlantRecords, units: Sequence[Unit], grid: FiniteGrid | None) -> None:
     if grid is None:
         return
-    par["H_grid"], par["D_grid"], par["droop_grid"] = grid.H, grid.D, grid.droop
-    par["T_gov"], par["S_grid"] = grid.T_gov, grid.S
-    r = par[0]
-    swing = math.sqrt(r["omega_b"] / (2 * grid.H * grid.S * (r["L_f"] + r["L_g"])))
+    net, T_s = records.net, float(records.net[0]["T_s"])
+    net["H_grid"], net["D_grid"], net["droop_grid"] = grid.H, grid.D, grid.droop
+    net["T_gov"], net["S_grid"] = grid.T_gov, grid.S
+    L = 1 / sum(1 / (unit.L_f + unit.L_g) for unit in units)
+    swing = math.sqrt(net[0]["omega_b"] / (2 * grid.H * grid.S * L))
     governor = math.sqrt(1 / (2 * grid.H * grid.droop * grid.T_gov))
     rate = max(swing, governor, grid.D / (2 * grid.H), 1 / grid.T_gov)
     if rate * T_s > _SWING_STEP:
@@ -164,7 +249,20 @@ def _pack_grid(par: PlantRecord, options: Plant, T_s: float) -> None:
         )
 
 
-def _pack_measurement(par: PlantRecord, options: Plant) -> None:
+def _pack_timing(records: PlantRecords) -> None:
+    """Cut the period where a command begins to act."""
+    par, net = records.par, records.net
+    cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
+    parts = len(cuts) - 1
+    net["n_parts"] = parts
+    net["stretch"][0, :parts] = np.diff(cuts) * net[0]["T_s"]
+    # a plant that is delayed as a whole goes on before the commands of the tick are in the line
+    newest = par["delay"] - (1 if min(par["delay"]) > 0 else 0)
+    for part, begin in enumerate(cuts[:-1]):
+        net["age"][0, part, : len(par)] = newest + (begin < par["fraction"])
+
+
+def _pack_measurement(par: Record, options: Plant) -> None:
     sensors = options.sensors
     par["filtered"] = sensors.bandwidth_hz is not None
     par["omega_s"] = 2 * math.pi * (sensors.bandwidth_hz or 0.0)
@@ -177,7 +275,7 @@ def _pack_measurement(par: PlantRecord, options: Plant) -> None:
     _pack_converter(par, "dac", options.dac.bits, options.dac.range, COMMANDS)
 
 
-def _pack_protection(par: PlantRecord, protection: Protection, T_s: float) -> None:
+def _pack_protection(par: Record, protection: Protection, T_s: float) -> None:
     par["trip_ticks"] = -1
     trips = [getattr(protection, name) for name, *_ in TRIPS]
     for k, trip in enumerate([*trips, *protection.overload]):
@@ -192,7 +290,7 @@ def _pack_protection(par: PlantRecord, protection: Protection, T_s: float) -> No
 
 
 def _pack_converter(
-    par: PlantRecord,
+    par: Record,
     prefix: str,
     bits: int | None,
     ranges: Mapping[Any, tuple[float, float]],
@@ -204,47 +302,3 @@ def _pack_converter(
         par[f"{prefix}_lo"][0, j] = lo
         par[f"{prefix}_hi"][0, j] = hi - lsb  # the highest code is one step below full scale
         par[f"{prefix}_lsb"][0, j] = lsb
-
-
-def _pack_timing(par: PlantRecord, options: Plant, T_s: float) -> None:
-    fraction = options.delay.fraction
-    par["T_s"], par["delay"] = T_s, options.delay.samples
-    par["stretch"] = [[fraction * T_s, (1 - fraction) * T_s]]
-
-
-def _pack_pieces(par: PlantRecord, fastest: float) -> None:
-    """Choose the pieces of Simpson's rule, and the DC link's steps in them, by the fastest mode."""
-    r = par[0]
-    longest = max(r["stretch"])
-    if fastest * longest > 2 * _PIECE * _MOST:
-        raise ValueError(
-            f"the circuit's fastest mode = {fastest:.6g} rad/s: too fast for the DC link; allowed"
-            f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
-            " plant.grid.load_L"
-        )
-    least = 1.0
-    if r["i_peak"] < math.inf:  # the hardware looks at the current once a piece
-        least = math.ceil(longest / _LOOK)
-    pieces = np.maximum(np.ceil(r["stretch"] * (fastest / (2 * _PIECE))), least)
-    par["pieces"], par["half_h"] = pieces, r["stretch"] / pieces / 2
-    per_C = r["omega_b"] / r["C_dc"]
-    rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
-    if r["tau_dc"] > 0.0:
-        rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
-    if rate * longest > 2 * _DC_STEP * _MOST:
-        raise ValueError(
-            f"plant.dc_source k_p, k_i, tau_s: with C_dc they are as fast as {rate:.6g}"
-            f" rad/s; allowed are {2 * _DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
-        )
-    par["dc_steps"] = max(1, math.ceil(rate * max(par["half_h"][0]) / _DC_STEP))
-    for part, half in enumerate(par["half_h"][0]):
-        par["sensor_weights"][0, part] = _low_pass(float(r["omega_s"] * 2 * half))
-
-
-def _low_pass(x: float) -> list[float]:
-    """Weights of a first-order low-pass after a stretch of x time constants: of its state, and of
-    its input at the beginning, the middle and the end, between which the input is a parabola."""
-    A = np.diag([1.0, 1.0, 1.0], 1)
-    A[0, 0] = -x
-    whole, f_1, f_2, f_3 = expm(A)[0]  # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
-    return [whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)]

@@ -9,23 +9,26 @@ from gfm_runtime.compiled import compiled
 
 
 @compiled
-def advance_dc_link(
-    r: Any, s: Any, part: int, p_0: float, p_1: float, p_2: float
-) -> tuple[float, float]:
+def advance_dc_link(r: Any, s: Any, half_h: float) -> tuple[float, float]:
     """Take v_dc and the DC source on by one piece of the period.
 
     The power that the bridge draws, p.u., is a parabola through its values at the beginning, the
     middle and the end, so that a link whose voltage hardly moves is integrated by Simpson's rule.
 
+    Args:
+        r, s: elements of ``par`` and ``st``.
+        half_h: half the length of the piece, s.
+
     Returns:
         v_dc in the middle and at the end, p.u.
     """
     running = s.trip == 0
+    p_0, p_1, p_2 = s.drawn[0], s.drawn[1], s.drawn[2]
     i_u = r.i_u_gain * s.u_now[0]
     i_max = r.i_max if running else 0.0
     per_C = r.omega_b / r.C_dc
     steps = r.dc_steps
-    h = r.half_h[part] / steps
+    h = half_h / steps
     b, a = 4.0 * p_1 - 3.0 * p_0 - p_2, 2.0 * (p_0 + p_2) - 4.0 * p_1
     v, i, j = s.x[V_DC], s.i_reg, s.i_source
     v_middle = v

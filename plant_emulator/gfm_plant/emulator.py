@@ -1,7 +1,7 @@
 """The plant from tick to tick: take u, advance by one sampling period, give the true values.
 
-The functions are compiled and allocate nothing. `par` and `st` are the records of
-`gfm_plant.records`, which `make_plant` builds; quantities are in p.u.
+The functions are compiled and allocate nothing. `plant` is the `PlantRecords` of a
+`gfm_plant.Network`, k the index of one of its converters; quantities are in p.u. of that converter.
 """
 
 from __future__ import annotations
@@ -17,20 +17,18 @@ from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.ramps import advance_grid, brought, brought_now, settle_grid
-from gfm_plant.records import MAX_DELAY, N_COMMANDS, OPERATING, PlantRecord
+from gfm_plant.ramps import advance_grid, brought, settle_grid
+from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
 from gfm_plant.solution import (
-    BRIDGE,
-    GRID,
     I_F,
-    I_LOAD,
     I_O,
-    NEGATIVE,
     V,
     circuit,
     drive,
     enter,
+    grid_source,
     half_step,
+    own,
     read_states,
     state,
 )
@@ -39,144 +37,169 @@ from gfm_runtime.compiled import cached, compiled
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 
 
-@compiled
-def plant_init(
-    par: PlantRecord, st: PlantRecord, x0: NDArray[np.float64], u0: NDArray[np.float64]
-) -> None:
-    """Put a plant fresh from `make_plant` into the equilibrium x0 (8,), u0 (3,) or, with the q
-    component of the bridge's voltage, (4,).
+@cached
+def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.float64]) -> None:
+    """Put a plant fresh from `make_plant`, whose w and unit phasors are set, into the equilibrium
+    x0 (N, 8), u0 (N, 4).
 
-    Delay line, sensor filters, DC source and local load are filled as if it had been there
-    forever; see `gfm_plant.steady_state` for such points.
+    Delay lines, sensor filters and DC sources are filled as if they had been there forever.
     """
-    r, s = par[0], st[0]
-    delta = x0[DELTA]
-    s.unit[GRID, 0], s.unit[GRID, 1] = 1.0, 0.0
-    cos, sin = math.cos(delta), math.sin(delta)
-    s.unit[BRIDGE, 0], s.unit[BRIDGE, 1] = cos, sin
-    for i in range(3):
-        s.w[i, 0] = x0[2 * i] * cos - x0[2 * i + 1] * sin
-        s.w[i, 1] = x0[2 * i] * sin + x0[2 * i + 1] * cos
-    if r.L_load > 0.0:
-        i_load = s.V_g / complex(r.R_load, u0[1] * r.L_load)
-        s.w[I_LOAD, 0], s.w[I_LOAD, 1] = i_load.real, i_load.imag
-    enter(r, s, OPERATING)
-    s.x[DELTA], s.x[V_DC] = delta, x0[V_DC]
-    _write_x(s)
-    for j in range(len(u0)):
-        s.u_now[j] = u0[j]
-        for k in range(MAX_DELAY + 2):
-            s.u[k, j] = u0[j]
-    p, q, v = terminal(x0[2], x0[3], x0[4], x0[5])
-    s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[V_DC], p, q, v
-    if r.i_u_gain == 0.0:
-        s.i_reg = u0[0] - r.k_p * (1.0 - x0[V_DC])
-    s.i_source, s.E[0], s.E[1] = u0[0], s.u_now[2], s.u_now[3]
-    if r.H_grid > 0.0:
-        settle_grid(r, s)
+    n, now = plant.net[0], plant.now[0]
+    enter(n, now, circuit(n, now))
+    for k in range(n.n_converters):
+        r, s = plant.par[k], plant.st[k]
+        s.x[DELTA], s.x[V_DC] = x0[k, DELTA], x0[k, V_DC]
+        _write_x(plant, k)
+        for j in range(N_COMMANDS):
+            s.u_now[j] = u0[k, j]
+            for age in range(MAX_DELAY + 2):
+                s.u[age, j] = u0[k, j]
+        p, q, v = terminal(x0[k, 2], x0[k, 3], x0[k, 4], x0[k, 5])
+        s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[k, V_DC], p, q, v
+        if r.i_u_gain == 0.0:
+            s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
+        s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
+    if n.H_grid > 0.0:
+        settle_grid(n, now)
 
 
 @compiled
-def plant_advance(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
-    """Take the command u[k] of this tick, (3,) or (4,), and go on to the next.
+def plant_advance(plant: PlantRecords, u: NDArray[np.float64]) -> None:
+    """Take the command u[k] of this tick for a plant of one converter, (3,) or (4,), and go on to
+    the next.
 
     With a delay of n samples and a fraction of one, u[k-n-1] acts for that fraction of the
     period and u[k-n] for the rest; without delay u[k] acts at once. With at least one sample of
     it u[k] need not be known before the plant goes on, see ``plant_is_delayed``.
     """
-    if plant_is_delayed(par):
-        plant_step(par, st)
-        plant_command(par, st, u)
+    if plant_is_delayed(plant):
+        plant_step(plant)
+        plant_command(plant, 0, u)
     else:
-        plant_command(par, st, u)
-        plant_step(par, st)
+        plant_command(plant, 0, u)
+        plant_step(plant)
 
 
 @compiled
-def plant_is_delayed(par: PlantRecord) -> bool:
-    """Whether u[k] does not act in period k, so that the plant advances before it takes u[k].
+def plant_is_delayed(plant: PlantRecords) -> bool:
+    """Whether no u[k] acts in period k, so that the plant advances before it takes u[k].
 
     The caller can then advance the plant while it waits for u[k].
     """
-    return bool(par[0].delay > 0)
+    delayed = True
+    for k in range(plant.net[0].n_converters):
+        delayed = delayed and plant.par[k].delay > 0
+    return delayed
 
 
 @compiled
-def plant_command(par: PlantRecord, st: PlantRecord, u: NDArray[np.float64]) -> None:
+def plant_command(plant: PlantRecords, k: int, u: NDArray[np.float64]) -> None:
     """Put u, (3,) or (4,), through the D/A into the delay line."""
-    r, s = par[0], st[0]
+    r, s = plant.par[k], plant.st[k]
     for j in range(len(u)):
-        for k in range(r.delay + 1, 0, -1):
-            s.u[k, j] = s.u[k - 1, j]
+        for age in range(r.delay + 1, 0, -1):
+            s.u[age, j] = s.u[age - 1, j]
         if math.isfinite(u[j]):
             s.u[0, j] = quantise(u[j], r.dac_lo[j], r.dac_hi[j], r.dac_lsb[j])
         else:
-            trip(r, s, BAD_COMMAND, u[j])
+            trip(plant, k, BAD_COMMAND, u[j])
 
 
 @compiled
-def plant_step(par: PlantRecord, st: PlantRecord) -> None:
-    """Go on by one sampling period under the commands in the delay line."""
-    r, s = par[0], st[0]
-    newest = max(r.delay - 1, 0)  # place in the line: u[k] itself is not in it yet, if delayed
-    before = (
-        s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
-        s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
-        s.unit[NEGATIVE, 0], s.unit[NEGATIVE, 1],
-        s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
-    )  # fmt: skip
-    for i in range(r.n_states):
-        s.w_before[i, 0], s.w_before[i, 1] = s.w[i, 0], s.w[i, 1]
-    if r.stretch[0] > 0.0:
-        _stretch(r, s, newest + 1, 0)
-    _stretch(r, s, newest, 1)
-    s.tick += 1
+def plant_step(plant: PlantRecords) -> None:
+    """Go on by one sampling period under the commands in the delay lines."""
+    n, now = plant.net[0], plant.now[0]
+    for k in range(n.n_converters):
+        s = plant.st[k]
+        s.before[0], s.before[1], s.before[2], s.before[3] = (
+            s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source
+        )  # fmt: skip
+        for j in range(4):
+            s.before[4 + j] = s.sensed[j]
+    for k in range(n.n_converters + 2):
+        now.unit_before[k, 0], now.unit_before[k, 1] = now.unit[k, 0], now.unit[k, 1]
+    for i in range(n.n_states):
+        now.w_before[i, 0], now.w_before[i, 1] = now.w[i, 0], now.w[i, 1]
+    for part in range(n.n_parts):
+        if n.stretch[part] > 0.0:
+            _stretch(plant, part)
 
+    worst, largest = 0, 0.0
+    for k in range(n.n_converters):
+        plant.st[k].tick += 1
+        size = _size(plant, k)
+        if not size < largest:
+            worst, largest = k, size
+    if largest < _FAR:
+        for k in range(n.n_converters):
+            _write_x(plant, k)
+        for k in range(n.n_converters):
+            protect(plant, k)
+    else:
+        _go_back(plant)
+        trip(plant, worst, DIVERGED, largest)
+        enter(n, now, circuit(n, now))
+    advance_grid(n, now)
+    if now.unbalance_left > 0.0:
+        now.unbalance_left -= n.T_s
+        if now.unbalance_left < 0.5 * n.T_s:
+            now.unbalance_left = now.sequence[0, 1] = 0.0
+            now.sequence[1, 0] = now.sequence[1, 1] = 0.0
+            now.sequence[0, 0] = 1.0
+    if now.faulted:
+        now.fault_left -= n.T_s
+        if now.fault_left < 0.5 * n.T_s:
+            now.faulted = 0
+            _reconnect(plant)
+
+
+@compiled
+def _size(plant: PlantRecords, k: int) -> float:
+    """Return the largest of the states of converter k, the first of which also has those of the
+    network; infinity if one is no number, or the DC link is empty."""
+    n, now, s = plant.net[0], plant.now[0], plant.st[k]
+    if not s.x[V_DC] > 0.0:
+        return math.inf
     size = abs(s.x[DELTA]) / _FAR  # the angle of an island may grow without limit
-    for i in range(r.n_states):
-        size = _larger(size, abs(s.w[i, 0]) + abs(s.w[i, 1]))
+    first, last = own(k), own(k + 1)
+    for i in range(first, last):
+        size = _larger(size, abs(now.w[i, 0]) + abs(now.w[i, 1]))
+    if k == 0:
+        for i in range(own(n.n_converters), n.n_states):
+            size = _larger(size, abs(now.w[i, 0]) + abs(now.w[i, 1]))
     for j in range(4):
         size = _larger(size, abs(s.sensed[j]))
-    size = _larger(_larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg)), abs(s.i_source))
-    if size < _FAR and s.x[V_DC] > 0.0:
-        _write_x(s)
-        protect(r, s)
-    else:  # the last good state stays
-        (
-            s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source,
-            s.unit[BRIDGE, 0], s.unit[BRIDGE, 1], s.unit[GRID, 0], s.unit[GRID, 1],
-            s.unit[NEGATIVE, 0], s.unit[NEGATIVE, 1],
-            s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3],
-        ) = before  # fmt: skip
-        for i in range(r.n_states):
-            s.w[i, 0], s.w[i, 1] = s.w_before[i, 0], s.w_before[i, 1]
-        trip(r, s, DIVERGED, size)
-        enter(r, s, circuit(s))
-    advance_grid(r, s)
-    if s.unbalance_left > 0.0:
-        s.unbalance_left -= r.T_s
-        if s.unbalance_left < 0.5 * r.T_s:
-            s.unbalance_left = s.sequence[0, 1] = s.sequence[1, 0] = s.sequence[1, 1] = 0.0
-            s.sequence[0, 0] = 1.0
-    if s.faulted:
-        s.fault_left -= r.T_s
-        if s.fault_left < 0.5 * r.T_s:
-            s.faulted = 0
-            enter(r, s, circuit(s))
-            _write_x(s)
+    return _larger(_larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg)), abs(s.i_source))
 
 
 @compiled
-def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> None:
+def _go_back(plant: PlantRecords) -> None:
+    """Take back the last step, whose result is not good."""
+    n, now = plant.net[0], plant.now[0]
+    for k in range(n.n_converters):
+        s = plant.st[k]
+        s.x[DELTA], s.x[V_DC], s.i_reg, s.i_source = (
+            s.before[0], s.before[1], s.before[2], s.before[3]
+        )  # fmt: skip
+        for j in range(4):
+            s.sensed[j] = s.before[4 + j]
+    for k in range(n.n_converters + 2):
+        now.unit[k, 0], now.unit[k, 1] = now.unit_before[k, 0], now.unit_before[k, 1]
+    for i in range(n.n_states):
+        now.w[i, 0], now.w[i, 1] = now.w_before[i, 0], now.w_before[i, 1]
+
+
+@compiled
+def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
     """Write the true values at this tick to out (11,), in the order of `TRUTH`."""
-    r, s = par[0], st[0]
+    r, s, now = plant.par[k], plant.st[k], plant.now[0]
     out[0] = s.x[V_DC]
     out[1], out[3], out[4] = terminal(s.x[2], s.x[3], s.x[4], s.x[5])
     out[2] = s.u_now[1]
     out[5] = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
     out[6] = s.x[DELTA]
-    out[7] = s.omega_g
-    out[8] = s.V_g
+    out[7] = now.omega_g
+    out[8] = now.V_g
     out[9] = s.trip
     if r.tau_dc > 0.0:
         out[10] = s.i_source
@@ -187,46 +210,53 @@ def plant_truth(par: PlantRecord, st: PlantRecord, out: NDArray[np.float64]) -> 
 
 
 @compiled
-def _stretch(r: Any, s: Any, age: int, part: int) -> None:
-    """Go on by one stretch of the period under the command at place `age` of the delay line."""
-    running = s.trip == 0
-    if running:
-        for j in range(N_COMMANDS):
-            s.u_now[j] = s.u[age, j]
-    else:
-        s.u_now[1] = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # see `trip`
-    # the modulator divides by the v_dc that it has at the beginning of its period
-    most = r.m_max * s.x[V_DC]
-    s.E[0], s.E[1] = s.u_now[2], s.u_now[3]
-    size = s.E[0] * s.E[0] + s.E[1] * s.E[1]
-    if size > most * most:
-        scale = most / math.sqrt(size)
-        s.E[0] *= scale
-        s.E[1] *= scale
-    c = circuit(s)
-    E_d, E_q = s.E[0], s.E[1]
-    for _ in range(r.pieces[part]):
-        if r.i_peak < math.inf and s.trip == 0:
-            s.E[0], s.E[1] = _within_peak(r, s, part, E_d, E_q, most)
-        _piece(r, s, c, part)
+def _stretch(plant: PlantRecords, part: int) -> None:
+    """Go on by one stretch of the period, under the commands that act in it."""
+    n, now = plant.net[0], plant.now[0]
+    for k in range(n.n_converters):
+        r, s = plant.par[k], plant.st[k]
+        if s.trip == 0:
+            for j in range(N_COMMANDS):
+                s.u_now[j] = s.u[n.age[part, k], j]
+        else:
+            s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`
+        # the modulator divides by the v_dc that it has at the beginning of its period
+        most = s.E_most = r.m_max * s.x[V_DC]
+        s.E[0], s.E[1] = s.u_now[2], s.u_now[3]
+        size = s.E[0] * s.E[0] + s.E[1] * s.E[1]
+        if size > most * most:
+            scale = most / math.sqrt(size)
+            s.E[0] *= scale
+            s.E[1] *= scale
+        s.E_told[0], s.E_told[1] = s.E[0], s.E[1]
+    c = circuit(n, now)
+    for _ in range(n.pieces[part]):
+        for k in range(n.n_converters):
+            r, s = plant.par[k], plant.st[k]
+            if r.i_peak < math.inf and s.trip == 0:
+                s.E[0], s.E[1] = _within_peak(plant, k, part)
+        _piece(plant, c, part)
 
 
 @compiled
-def _within_peak(
-    r: Any, s: Any, part: int, E_d: float, E_q: float, most: float
-) -> tuple[float, float]:
+def _within_peak(plant: PlantRecords, k: int, part: int) -> tuple[float, float]:
     """Return the bridge's mean voltage over a piece, in the converter's frame.
 
     It is the command, unless the current of L_f would leave the limit. The hardware then blocks
     pulses, which on average gives the voltage that keeps the current at the limit, in the direction
     in which the command would have led it.
     """
-    u_r, u_i = s.unit[BRIDGE, 0], s.unit[BRIDGE, 1]
-    i_d, i_q = s.w[I_F, 0] * u_r + s.w[I_F, 1] * u_i, s.w[I_F, 1] * u_r - s.w[I_F, 0] * u_i
-    v_d, v_q = s.w[V, 0] * u_r + s.w[V, 1] * u_i, s.w[V, 1] * u_r - s.w[V, 0] * u_i
+    n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
+    E_d, E_q, most = s.E_told[0], s.E_told[1], s.E_most
+    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
+    f, c = own(k) + I_F, own(k) + V
+    i_r, i_i = now.w[f, 0] * r.current, now.w[f, 1] * r.current
+    i_d, i_q = i_r * u_r + i_i * u_i, i_i * u_r - i_r * u_i
+    v_d = now.w[c, 0] * u_r + now.w[c, 1] * u_i
+    v_q = now.w[c, 1] * u_r - now.w[c, 0] * u_i
     X = s.u_now[1] * r.L_f
     drop_d, drop_q = v_d + r.R_f * i_d - X * i_q, v_q + r.R_f * i_q + X * i_d
-    reach = 2.0 * r.half_h[part] * r.omega_b / r.L_f  # p.u. of current per p.u. of voltage
+    reach = 2.0 * n.half_h[part] * r.omega_b / r.L_f  # p.u. of current per p.u. of voltage
     to_d, to_q = i_d + reach * (E_d - drop_d), i_q + reach * (E_q - drop_q)
     size = math.sqrt(to_d * to_d + to_q * to_q)
     if size <= r.i_peak:
@@ -240,57 +270,69 @@ def _within_peak(
 
 
 @compiled
-def _piece(r: Any, s: Any, c: int, part: int) -> None:
-    """Go on by one piece of a stretch under the command that acts."""
-    omega_u, E_d, E_q = s.u_now[1], s.E[0], s.E[1]
-    omega_g = s.omega_g + 0.5 * r.T_s * s.omega_g_slope  # in the middle of the tick
-    for m in range(r.n_modes[c]):
-        s.forced[m, 0] = s.forced[m, 1] = s.forced[m, 2] = s.forced[m, 3] = 0.0
+def _piece(plant: PlantRecords, c: int, part: int) -> None:
+    """Go on by one piece of a stretch under the commands that act."""
+    n, now = plant.net[0], plant.now[0]
+    omega_g = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # in the middle of the tick
+    for m in range(n.n_modes[c]):
+        now.forced[m, 0] = now.forced[m, 1] = now.forced[m, 2] = now.forced[m, 3] = 0.0
+    g_0 = brought(n, now, now.unit) if n.H_grid > 0.0 else 0.0
+    for k in range(n.n_converters):
+        _look(plant, k, 0, now.unit)
+    for k in range(n.n_converters):
+        s = plant.st[k]
+        drive(n, now, c, part, k, s.E[0], s.E[1], s.u_now[1])
+    g = grid_source(n)
+    E_r, E_i = now.V_g * now.sequence[0, 0], now.V_g * now.sequence[0, 1]
+    drive(n, now, c, part, g, E_r, E_i, omega_g)
+    if now.unbalance_left > 0.0:
+        E_r, E_i = now.V_g * now.sequence[1, 0], now.V_g * now.sequence[1, 1]
+        drive(n, now, c, part, g + 1, E_r, E_i, -omega_g)
 
-    p_0 = _drawn(s, s.unit[BRIDGE, 0], s.unit[BRIDGE, 1])
-    a_0 = a_1 = a_2 = (0.0, 0.0, 0.0)
-    if r.filtered:
-        a_0 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
-    g_0 = brought_now(r, s) if r.H_grid > 0.0 else 0.0
-
-    m_r, m_i = drive(r, s, c, part, BRIDGE, E_d, E_q, omega_u)
-    p_r, p_i = drive(
-        r, s, c, part, GRID, s.V_g * s.sequence[0, 0], s.V_g * s.sequence[0, 1], omega_g
-    )
-    n_r, n_i = 0.0, 0.0
-    if s.unbalance_left > 0.0:
-        n_r, n_i = drive(
-            r, s, c, part, NEGATIVE, s.V_g * s.sequence[1, 0], s.V_g * s.sequence[1, 1], -omega_g
-        )
-    half_step(r, s, c, part, 0)
-    if r.filtered or r.H_grid > 0.0:
-        read_states(r, s, c)
-        a_1 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
+    half_step(n, now, c, part, 0)
+    if n.H_grid > 0.0:
+        read_states(n, now, c)
     else:
-        s.w[I_F, 0], s.w[I_F, 1] = state(r, s, c, I_F)
-    p_1 = _drawn(s, m_r, m_i)
-    g_1 = brought(r, s, p_r, p_i, n_r, n_i) if r.H_grid > 0.0 else 0.0
+        for k in range(n.n_converters):
+            i = own(k)
+            now.w[i, 0], now.w[i, 1] = state(n, now, c, i)
+            if plant.par[k].filtered:
+                for j in range(i + 1, i + 3):
+                    now.w[j, 0], now.w[j, 1] = state(n, now, c, j)
+    for k in range(n.n_converters):
+        _look(plant, k, 1, now.halfway)
+    g_1 = brought(n, now, now.halfway) if n.H_grid > 0.0 else 0.0
 
-    half_step(r, s, c, part, 2)
-    read_states(r, s, c)
-    p_2 = _drawn(s, s.unit[BRIDGE, 0], s.unit[BRIDGE, 1])
-    if r.H_grid > 0.0:
-        s.brought += r.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + brought_now(r, s))
-    v_0 = s.x[V_DC]
-    v_1, v_2 = advance_dc_link(r, s, part, p_0, p_1, p_2)
-    if r.filtered:
-        a_2 = terminal(s.w[V, 0], s.w[V, 1], s.w[I_O, 0], s.w[I_O, 1])
-        _sense(r, s, 0, part, v_0, v_1, v_2)
-        for j in range(3):
-            _sense(r, s, 1 + j, part, a_0[j], a_1[j], a_2[j])
-    s.x[DELTA] += 2.0 * r.half_h[part] * r.omega_b * (omega_u - omega_g)
+    half_step(n, now, c, part, 2)
+    read_states(n, now, c)
+    if n.H_grid > 0.0:
+        now.brought += n.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + brought(n, now, now.unit))
+    for k in range(n.n_converters):
+        _look(plant, k, 2, now.unit)
+        r, s = plant.par[k], plant.st[k]
+        v_0 = s.x[V_DC]
+        v_1, v_2 = advance_dc_link(r, s, n.half_h[part])
+        if r.filtered:
+            _sense(n, s, k, 0, part, v_0, v_1, v_2)
+            for j in range(3):
+                _sense(n, s, k, 1 + j, part, s.seen[0, j], s.seen[1, j], s.seen[2, j])
+        s.x[DELTA] += 2.0 * n.half_h[part] * n.omega_b * (s.u_now[1] - omega_g)
 
 
 @compiled
-def _drawn(s: Any, u_r: float, u_i: float) -> float:
-    """Return the power that the bridge draws from the DC link, p.u.; u is its frame's phasor."""
-    w_r, w_i = s.w[I_F, 0], s.w[I_F, 1]
-    return s.E[0] * (u_r * w_r + u_i * w_i) + s.E[1] * (u_r * w_i - u_i * w_r)
+def _look(plant: PlantRecords, k: int, which: int, unit: Any) -> None:
+    """Keep the power that bridge k draws, p.u., and what its sensors see at the beginning (0), the
+    middle (1) or the end (2) of a piece, when its frame is at ``unit``."""
+    r, s, now = plant.par[k], plant.st[k], plant.now[0]
+    i = own(k)
+    w_r, w_i = now.w[i, 0] * r.current, now.w[i, 1] * r.current
+    u_r, u_i = unit[k, 0], unit[k, 1]
+    s.drawn[which] = s.E[0] * (u_r * w_r + u_i * w_i) + s.E[1] * (u_r * w_i - u_i * w_r)
+    if r.filtered:
+        a, b = i + V, i + I_O
+        s.seen[which, 0], s.seen[which, 1], s.seen[which, 2] = terminal(
+            now.w[a, 0], now.w[a, 1], now.w[b, 0] * r.current, now.w[b, 1] * r.current
+        )
 
 
 @compiled
@@ -300,28 +342,36 @@ def _larger(size: float, other: float) -> float:
 
 
 @compiled
-def _sense(r: Any, s: Any, j: int, part: int, f_0: float, f_1: float, f_2: float) -> None:
-    """Pass a quantity through the low-pass of sensor j."""
+def _sense(n: Any, s: Any, k: int, j: int, part: int, f_0: float, f_1: float, f_2: float) -> None:
+    """Pass a quantity through the low-pass of sensor j of converter k."""
     s.sensed[j] = (
-        r.sensor_weights[part, 0] * s.sensed[j]
-        + r.sensor_weights[part, 1] * f_0
-        + r.sensor_weights[part, 2] * f_1
-        + r.sensor_weights[part, 3] * f_2
+        n.sensor_weights[part, k, 0] * s.sensed[j]
+        + n.sensor_weights[part, k, 1] * f_0
+        + n.sensor_weights[part, k, 2] * f_1
+        + n.sensor_weights[part, k, 3] * f_2
     )
 
 
 @cached
-def reconnect(par: PlantRecord, st: PlantRecord) -> None:
+def reconnect(plant: PlantRecords) -> None:
     """Go on from the present state in circuits that have changed."""
-    r, s = par[0], st[0]
-    enter(r, s, circuit(s))
-    _write_x(s)
+    _reconnect(plant)
 
 
 @compiled
-def _write_x(s: Any) -> None:
+def _reconnect(plant: PlantRecords) -> None:
+    n, now = plant.net[0], plant.now[0]
+    enter(n, now, circuit(n, now))
+    for k in range(n.n_converters):
+        _write_x(plant, k)
+
+
+@compiled
+def _write_x(plant: PlantRecords, k: int) -> None:
     """Write the currents and voltages of Eq. (1)-(6): w in the converter's own frame."""
-    u_r, u_i = s.unit[BRIDGE, 0], s.unit[BRIDGE, 1]
+    r, s, now = plant.par[k], plant.st[k], plant.now[0]
+    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
     for i in range(3):
-        w_r, w_i = s.w[i, 0], s.w[i, 1]
+        scale = 1.0 if i == V else r.current
+        w_r, w_i = now.w[own(k) + i, 0] * scale, now.w[own(k) + i, 1] * scale
         s.x[2 * i], s.x[2 * i + 1] = w_r * u_r + w_i * u_i, w_i * u_r - w_r * u_i

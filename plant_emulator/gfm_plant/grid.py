@@ -8,40 +8,38 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
-from gfm_plant.build import connect
 from gfm_plant.emulator import reconnect
 from gfm_plant.model import DELTA
-from gfm_plant.records import PlantRecord
-from gfm_plant.solution import GRID, I_G, I_O, NEGATIVE
+from gfm_plant.network import Network
+from gfm_plant.wiring import FaultPlace
 
 LEAST_FAULT_R = 1e-4
 """p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
 
 
-def grid_frequency(
-    par: PlantRecord, st: PlantRecord, omega_g: float, rate: float | None = None
-) -> None:
+def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) -> None:
     """Step the frequency of an ideal grid to `omega_g`, or ramp it there at `rate` (p.u./s, > 0).
 
     Raises:
         ValueError: If a value is out of range, or the grid is finite and has its own frequency.
     """
-    if par[0]["H_grid"] > 0:
+    if plant.net[0]["H_grid"] > 0:
         raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
     _require("omega_g", omega_g, omega_g > 0, "> 0 p.u.")
-    st["omega_g_to"], st["omega_g_rate"] = omega_g, _rate(rate)
+    plant.now["omega_g_to"], plant.now["omega_g_rate"] = omega_g, _rate(rate)
     if rate is None:
-        st["omega_g"] = omega_g
+        plant.now["omega_g"] = omega_g
 
 
 def grid_voltage(
-    st: PlantRecord, V_g: float, rate: float | None = None, duration: float | None = None
+    plant: Network, V_g: float, rate: float | None = None, duration: float | None = None
 ) -> None:
     """Step the grid voltage to `V_g`, ramp it there, or let it sag and recover.
 
     Args:
-        st: State record.
+        plant: The plant.
         V_g: Voltage in p.u., >= 0.
         rate: Slope of a ramp in p.u./s, > 0.
         duration: Length of a sag in s, > 0, after which the voltage steps back to where it
@@ -55,64 +53,86 @@ def grid_voltage(
     if rate is not None and duration is not None:
         raise ValueError(f"rate = {rate}, duration = {duration}: give one, a ramp or a sag")
     if duration is None:
-        st["sag_left"] = 0.0
+        plant.now["sag_left"] = 0.0
     else:
         _require("duration", duration, duration > 0, "> 0 s")
-        if st[0]["sag_left"] == 0.0:
-            st["V_g_after"] = st["V_g_to"]
-        st["sag_left"] = duration
-    st["V_g_to"], st["V_g_rate"] = V_g, _rate(rate)
+        if plant.now[0]["sag_left"] == 0.0:
+            plant.now["V_g_after"] = plant.now["V_g_to"]
+        plant.now["sag_left"] = duration
+    plant.now["V_g_to"], plant.now["V_g_rate"] = V_g, _rate(rate)
     if rate is None:
-        st["V_g"] = V_g
+        plant.now["V_g"] = V_g
 
 
-def grid_load(par: PlantRecord, st: PlantRecord, change: float) -> None:
+def grid_load(plant: Network, change: float) -> None:
     """Add `change` to the load of a finite grid, p.u. of the grid's rating.
 
     Raises:
         ValueError: If the grid is ideal, or `change` is not finite.
     """
     _require("change", change, True, "finite")
-    if par[0]["H_grid"] == 0:
+    if plant.net[0]["H_grid"] == 0:
         raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
-    st["P_load"] += change
+    plant.now["P_load"] += change
 
 
 def fault(
-    par: PlantRecord, st: PlantRecord, position: float, R: float, duration: float | None = None
+    plant: Network,
+    position: float | None,
+    R: float,
+    duration: float | None = None,
+    line: str | None = None,
+    node: str | None = None,
 ) -> None:
     """Short the three phases to ground through `R`.
 
     Args:
-        position: Place on the line: 0 at the filter capacitor, 1 at the grid.
-        R: Resistance of the fault, p.u.; > 0 at the filter capacitor.
+        plant: The plant.
+        position: Place on the line: 0 at its start, the filter capacitor, 1 at its end; None: at a
+            node.
+        R: Resistance of the fault, p.u. of the first converter; > 0 at a capacitor.
         duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
+        line: Name of the line, or of the converter whose line it is; None: the first converter.
+        node: The node.
 
     Raises:
-        ValueError: If a value is out of range. The plant is then unchanged.
+        ValueError: If there is no such place, or a value is out of range. The plant is then
+            unchanged.
     """
-    _require("position", position, 0 <= position < 1, "in [0, 1)")
-    least = 0.0 if position > 0 else LEAST_FAULT_R
-    _require("R", R, least <= R, f">= {least:g} p.u. at position {position:g}")
+    wiring = plant.wiring
+    if position is not None:
+        _require("position", position, 0 <= position < 1, "in [0, 1)")
+        lines = wiring.named_lines()
+        line = wiring.units[0].name if line is None else line
+        if line not in lines:
+            raise ValueError(f"line = {line!r}: must be one of {sorted(lines)}")
+        node = lines[line].start
+        inside = lines[line].name if position > 0 else None
+    elif node not in wiring.nodes:
+        raise ValueError(f"node = {node!r}: must be one of {sorted(wiring.nodes)}")
+    else:
+        position, inside = 0.0, None
+    if inside is None and node == wiring.grid and wiring.closed:
+        raise ValueError(f"node = {node!r}: is an ideal voltage; put the fault on a line to it")
+    charged = {unit.terminal for unit in wiring.units} | {c.node for c in wiring.capacitors}
+    least = LEAST_FAULT_R if inside is None and node in charged else 0.0
+    where = f"position {position:g}" if line is not None else f"node {node}"
+    _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    whole = par[0]["fault_at"] <= 0
-    _rebuild(par, bool(st[0]["closed"]), fault_at=position, fault_R=R)
-    if whole:  # the line was in one piece
-        st["w"][0, I_G] = st["w"][0, I_O]
-    st["faulted"], st["fault_left"] = 1, math.inf if duration is None else duration
-    reconnect(par, st)
+    plant.rewire(replace(wiring, fault=FaultPlace(node, inside, position, R)))
+    plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
+    reconnect(plant.records)
 
 
-def clear_fault(par: PlantRecord, st: PlantRecord) -> None:
+def clear_fault(plant: Network) -> None:
     """Clear the fault, if there is one."""
-    st["faulted"] = 0
-    reconnect(par, st)
+    plant.now["faulted"] = 0
+    reconnect(plant.records)
 
 
 def grid_unbalance(
-    par: PlantRecord,
-    st: PlantRecord,
+    plant: Network,
     phases: Sequence[complex],
     duration: float | None = None,
 ) -> None:
@@ -137,31 +157,33 @@ def grid_unbalance(
         _require("duration", duration, duration > 0, "> 0 s")
     turn = complex(-0.5, math.sqrt(0.75))
     positive, negative = (a + b + c) / 3, (a + turn * b + turn.conjugate() * c) / 3
-    st["sequence"][0] = [
+    plant.now["sequence"][0] = [
         [positive.real, positive.imag],
         # of the space vector v = v+ e^(j omega t) + conj(v-) e^(-j omega t)
         [negative.real, -negative.imag],
     ]
     # what turns the other way, in a frame that turns with omega_b
-    r, s = par[0], st[0]
-    angle = 2 * math.remainder(float(r["omega_b"] * r["T_s"]) * int(s["tick"]), math.pi)
-    unit = complex(s["unit"][GRID, 0], -s["unit"][GRID, 1]) * cmath.exp(-1j * angle)
-    st["unit"][0, NEGATIVE] = unit.real, unit.imag
+    n, g = plant.net[0], _grid_source(plant)
+    angle = 2 * math.remainder(float(n["omega_b"] * n["T_s"]) * int(plant.st[0]["tick"]), math.pi)
+    at = plant.now["unit"][0, g]
+    unit = complex(at[0], -at[1]) * cmath.exp(-1j * angle)
+    plant.now["unit"][0, g + 1] = unit.real, unit.imag
     balanced = a == b == c == 1
-    st["unbalance_left"] = 0.0 if balanced else math.inf if duration is None else duration
+    plant.now["unbalance_left"] = 0.0 if balanced else math.inf if duration is None else duration
 
 
-def phase_jump(st: PlantRecord, degrees: float) -> None:
+def phase_jump(plant: Network, degrees: float) -> None:
     """Advance the grid's angle by `degrees`, so that delta falls by as much."""
     _require("degrees", degrees, True, "finite")
     angle = math.radians(degrees)
-    st["x"][0, DELTA] -= angle
-    for place, turn in ((GRID, angle), (NEGATIVE, -angle)):
-        unit = complex(*st["unit"][0, place]) * cmath.exp(1j * turn)
-        st["unit"][0, place] = unit.real, unit.imag
+    plant.st["x"][:, DELTA] -= angle
+    g = _grid_source(plant)
+    for place, turn in ((g, angle), (g + 1, -angle)):
+        unit = complex(*plant.now["unit"][0, place]) * cmath.exp(1j * turn)
+        plant.now["unit"][0, place] = unit.real, unit.imag
 
 
-def grid_impedance(par: PlantRecord, st: PlantRecord, L_g: float, R_g: float) -> None:
+def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     """Set the line to `L_g` and `R_g` times the elements of the converter file.
 
     Its current is continuous, but in an island, where the flux of line and load is. Factors of the
@@ -173,11 +195,15 @@ def grid_impedance(par: PlantRecord, st: PlantRecord, L_g: float, R_g: float) ->
     """
     _require("L_g", L_g, L_g > 0, "a factor > 0")
     _require("R_g", R_g, R_g >= 0, "a factor >= 0")
-    _rebuild(par, bool(st[0]["closed"]), L_g=L_g * par[0]["L_line_n"], R_g=R_g * par[0]["R_line_n"])
-    reconnect(par, st)
+    r, unit = plant.par[0], plant.wiring.units[0]
+    ratio = float(r["current"])
+    new_L, new_R = float(L_g * r["L_line_n"]), float(R_g * r["R_line_n"])
+    changed = replace(unit, L_g=new_L * ratio, R_g=new_R * ratio)
+    plant.rewire(replace(plant.wiring, units=(changed, *plant.wiring.units[1:])))
+    plant.par["L_g"][0], plant.par["R_g"][0] = new_L, new_R
 
 
-def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
+def breaker(plant: Network, closed: bool) -> None:
     """Open or close the breaker between the grid and the local load at the far end of the line.
 
     While it is closed the grid alone sets the load's voltage. When it opens, line and load are in
@@ -188,24 +214,53 @@ def breaker(par: PlantRecord, st: PlantRecord, closed: bool) -> None:
     Raises:
         ValueError: If it opens onto no load.
     """
-    if closed == bool(st[0]["closed"]):
+    if closed == bool(plant.now[0]["closed"]):
         return
-    if not closed and par[0]["L_load"] == 0:
+    if plant.wiring.grid is None:
+        raise ValueError("network.grid: not set; an island has no grid breaker")
+    if not closed and not plant.wiring.has_load:
         raise ValueError(
             "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
         )
-    _rebuild(par, closed)
-    st["closed"] = closed
-    reconnect(par, st)
+    plant.rewire(replace(plant.wiring, closed=closed))
+    plant.now["closed"] = closed
 
 
-def _rebuild(par: PlantRecord, closed: bool, **elements: float) -> None:
-    """Set elements of the circuit and find its modes; a ValueError leaves `par` as it was."""
-    changed = par.copy()
-    for name, value in elements.items():
-        changed[name] = value
-    connect(changed, closed)
-    par[:] = changed
+def line_breaker(plant: Network, name: str, closed: bool) -> None:
+    """Open or close the breaker of a line or a load.
+
+    What opens interrupts its current; the flux that it shared with others stays in them.
+
+    Args:
+        plant: The plant.
+        name: Of the line or load, or of the converter whose line it is.
+        closed: False opens it.
+
+    Raises:
+        ValueError: If there is no such breaker.
+    """
+    wiring = plant.wiring
+    breakers = {shown: line.name for shown, line in wiring.named_lines().items()}
+    breakers |= {part: part for part in wiring.parts}
+    if name not in breakers:
+        raise ValueError(f"name = {name!r}: must be one of {sorted(breakers)}")
+    one = frozenset({breakers[name]})
+    plant.rewire(replace(wiring, opened=wiring.opened - one if closed else wiring.opened | one))
+
+
+def take_out(plant: Network) -> None:
+    """Make the circuits for the next trip, after one of several converters has tripped."""
+    row = int(plant.now[0]["row"])
+    if row == 0 or len(plant.par) == 1:
+        return
+    out = plant.wiring.blocked | {row - 1}
+    plant.now["row"] = 0
+    plant.rewire(replace(plant.wiring, blocked=out))
+
+
+def _grid_source(plant: Network) -> int:
+    """Place of the grid's positive sequence among the sources; the negative one follows."""
+    return len(plant.par)
 
 
 def _rate(rate: float | None) -> float:

@@ -300,6 +300,10 @@ class Plant(Options):
             )
         return self
 
+    def with_seed(self, seed: int) -> Plant:
+        """The same plant with another seed of the sensors' noise."""
+        return self.model_copy(update={"sensors": self.sensors.model_copy(update={"seed": seed})})
+
     def real_factors(self) -> dict[Element, float]:
         """Real over nominal value of the elements that are not nominal, those of the line by
         ``grid.scr`` included.
@@ -317,3 +321,47 @@ class Plant(Options):
                 f"plant.grid.x_over_r = {self.grid.x_over_r}: needs a converter file with R_g > 0"
             )
         return {**self.factors, **{name: line[name] / nominal[name] for name in line}}
+
+
+class Line(Options):
+    """R and L in series between two nodes of a network."""
+
+    start: str = Field(min_length=1, description="node at its start")
+    end: str = Field(min_length=1, description="node at its end")
+    L: Positive = Field(description="p.u. of the first converter")
+    R: NonNegative = Field(0.0, description="p.u. of the first converter")
+    closed: bool = Field(True, description="its breaker at the start")
+
+
+class Load(Options):
+    """A load between a node and ground: R and L in series that draw P and Q at nominal voltage and
+    frequency; without Q a resistor."""
+
+    node: str = Field(min_length=1, description="where it is")
+    P: NonNegative = Field(description="active power at nominal voltage, p.u. of the first one")
+    Q: NonNegative = Field(0.0, description="reactive power there, p.u.")
+    closed: bool = Field(True, description="its breaker at the start")
+
+    @model_validator(mode="after")
+    def _draws_something(self) -> Load:
+        if self.P == self.Q == 0.0:
+            raise ValueError("P = 0, Q = 0: must draw something")
+        return self
+
+
+class CapacitorBank(Options):
+    """Capacitors between a node and ground."""
+
+    node: str = Field(min_length=1, description="where it is")
+    Q: Positive = Field(description="reactive power at nominal voltage, p.u. of the first one")
+
+
+class NetworkParts(Options):
+    """What connects several converters, by its names."""
+
+    grid: str | None = Field(
+        None, min_length=1, description="node of the grid of plant.grid; an island if none"
+    )
+    lines: dict[str, Line] = Field({}, description="between nodes, by name")
+    loads: dict[str, Load] = Field({}, description="by name")
+    capacitors: dict[str, CapacitorBank] = Field({}, description="by name")

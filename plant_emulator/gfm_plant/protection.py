@@ -9,7 +9,6 @@ exact to their rounding, so that nothing drifts.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -24,58 +23,64 @@ from gfm_plant.names import (
     TRIP_REASONS,
     TRIPS,
 )
-from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecord
-from gfm_plant.solution import I_F, V, circuit, enter
+from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecords
+from gfm_plant.solution import I_F, V, circuit, enter, own
 from gfm_runtime.compiled import compiled
 
 _LEAST_V = 0.2  # p.u.; a smaller voltage has no angle that a relay could read
 
 
 @compiled
-def trip(r: Any, s: Any, reason: int, value: float) -> None:
-    """Latch a trip, if none is latched: the bridge blocks and the DC source turns off.
+def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
+    """Latch a trip of converter k, if none is latched: its bridge blocks, its DC source turns off.
 
-    The current of L_f is taken as interrupted at once. From here on the plant obeys no command;
-    its frame turns with the grid.
+    The current of L_f is taken as interrupted at once. From here on the converter obeys no command;
+    its frame turns with the grid. The circuits are at hand for one converter that trips; a second
+    one trips a tick later, when Python has made those for two (`gfm_plant.grid.take_out`).
     """
-    if s.trip == 0:
+    s, n, now = plant.st[k], plant.net[0], plant.now[0]
+    if s.trip == 0 and now.row == 0:
         s.trip = reason
         s.trip_tick = s.tick
         s.trip_value = value
-        s.x[0] = s.x[1] = s.w[I_F, 0] = s.w[I_F, 1] = s.i_source = s.E[0] = s.E[1] = 0.0
-        enter(r, s, circuit(s))
-        s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, s.omega_g, 0.0, 0.0
+        i = own(k) + I_F
+        s.x[0] = s.x[1] = now.w[i, 0] = now.w[i, 1] = s.i_source = s.E[0] = s.E[1] = 0.0
+        now.row = 1 + k
+        enter(n, now, circuit(n, now))
+        s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, now.omega_g, 0.0, 0.0
 
 
 @compiled
-def protect(r: Any, s: Any) -> None:
-    """Check every threshold on the true values of this tick."""
+def protect(plant: PlantRecords, k: int) -> None:
+    """Check every threshold of converter k on the true values of this tick."""
+    r, s = plant.par[k], plant.st[k]
     i = math.sqrt(s.x[0] ** 2 + s.x[1] ** 2)
     v = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
     v_dc = s.x[7]
     omega = s.u_now[1]
     if r.places > 0:
-        _look_back(r, s, i)
+        _look_back(plant, k, i)
         if r.by_voltage:
             omega = s.omega_v
-    _watch(r, s, 0, i, 1.0)
-    _watch(r, s, 1, v, 1.0)
-    _watch(r, s, 2, v, -1.0)
-    _watch(r, s, 3, v_dc, 1.0)
-    _watch(r, s, 4, v_dc, -1.0)
-    _watch(r, s, 5, omega, 1.0)
-    _watch(r, s, 6, omega, -1.0)
+    _watch(plant, k, 0, i, 1.0)
+    _watch(plant, k, 1, v, 1.0)
+    _watch(plant, k, 2, v, -1.0)
+    _watch(plant, k, 3, v_dc, 1.0)
+    _watch(plant, k, 4, v_dc, -1.0)
+    _watch(plant, k, 5, omega, 1.0)
+    _watch(plant, k, 6, omega, -1.0)
     if r.places > 0:
-        for k in range(N_TRIPS, N_TRIPS + N_OVERLOADS):
-            _watch(r, s, k, s.i_rms, 1.0)
+        for step in range(N_TRIPS, N_TRIPS + N_OVERLOADS):
+            _watch(plant, k, step, s.i_rms, 1.0)
 
 
 @compiled
-def _look_back(r: Any, s: Any, i: float) -> None:
+def _look_back(plant: PlantRecords, k: int, i: float) -> None:
     """Take the RMS of the current i and the speed of the voltage over the last cycle, or over the
     ticks so far while they are fewer."""
+    r, s, now = plant.par[k], plant.st[k], plant.now[0]
     a, b = s.v_before[0], s.v_before[1]
-    c, d = s.w[V, 0], s.w[V, 1]
+    c, d = now.w[own(k) + V, 0], now.w[own(k) + V, 1]
     if s.looked == 0:
         s.omega_v = s.u_now[1]
     elif min(a * a + b * b, c * c + d * d) > _LEAST_V * _LEAST_V:
@@ -100,22 +105,24 @@ def _look_back(r: Any, s: Any, i: float) -> None:
 
 
 @compiled
-def _watch(r: Any, s: Any, k: int, value: float, sign: float) -> None:
-    if r.trip_ticks[k] < 0 or sign * (value - r.trip_limit[k]) <= 0.0:
-        s.crossed[k] = 0
+def _watch(plant: PlantRecords, k: int, what: int, value: float, sign: float) -> None:
+    r, s = plant.par[k], plant.st[k]
+    if r.trip_ticks[what] < 0 or sign * (value - r.trip_limit[what]) <= 0.0:
+        s.crossed[what] = 0
         return
     # The tick that first sees a crossing starts the time.
-    if s.crossed[k] >= r.trip_ticks[k]:
-        trip(r, s, k + 1 if k < N_TRIPS else OVERLOAD, value)
-    s.crossed[k] += 1
+    if s.crossed[what] >= r.trip_ticks[what]:
+        trip(plant, k, what + 1 if what < N_TRIPS else OVERLOAD, value)
+    s.crossed[what] += 1
 
 
-def trip_reason(st: PlantRecord, par: PlantRecord) -> str:
-    """Say what tripped, with quantity, value, threshold and time; "" without a trip."""
-    code, tick, value = int(st[0]["trip"]), int(st[0]["trip_tick"]), float(st[0]["trip_value"])
+def trip_reason(plant: PlantRecords, k: int = 0) -> str:
+    """Say what tripped converter k, with quantity, value, threshold and time; "" without a trip."""
+    r, s = plant.par[k], plant.st[k]
+    code, tick, value = int(s["trip"]), int(s["trip_tick"]), float(s["trip_value"])
     if code == 0:
         return ""
-    T_s = float(par[0]["T_s"])
+    T_s = float(r["T_s"])
     at = f"at tick {tick} (t = {tick * T_s:.6g} s)"
     if code == DIVERGED:
         return f"diverged: the state left the range of the model {at}"
@@ -124,16 +131,16 @@ def trip_reason(st: PlantRecord, par: PlantRecord) -> str:
     if code == CONTROLLER:
         return NO_FRESH_U if value == SILENT else CONTROLLER_SAFE
     if code == OVERLOAD:
-        ticks = par[0]["trip_ticks"][N_TRIPS:]
-        step = np.flatnonzero((ticks >= 0) & (st[0]["crossed"][N_TRIPS:] > ticks))[0]
-        k, quantity, sign = N_TRIPS + int(step), "RMS of i over a cycle", +1
+        ticks = r["trip_ticks"][N_TRIPS:]
+        step = np.flatnonzero((ticks >= 0) & (s["crossed"][N_TRIPS:] > ticks))[0]
+        what, quantity, sign = N_TRIPS + int(step), "RMS of i over a cycle", +1
     else:
-        k = code - 1
-        _, quantity, sign = TRIPS[k]
-        if quantity == "omega_u" and par[0]["by_voltage"]:
+        what = code - 1
+        _, quantity, sign = TRIPS[what]
+        if quantity == "omega_u" and r["by_voltage"]:
             quantity = "omega of V over a cycle"
-    limit = par[0]["trip_limit"][k]
-    persistence = int(par[0]["trip_ticks"][k]) * T_s
+    limit = r["trip_limit"][what]
+    persistence = int(r["trip_ticks"][what]) * T_s
     lasting = f" for {persistence:.6g} s" if persistence else ""
     return (
         f"{TRIP_REASONS[code]}: {quantity} = {value:.6g} p.u. {'>' if sign > 0 else '<'}"

@@ -1,31 +1,74 @@
-"""The memory of a plant: two NumPy records that the compiled functions read and write.
+"""The memory of a plant: NumPy records that the compiled functions read and write.
 
-Both travel as arrays of shape (1,): compiled code reaches a field by plain pointer arithmetic,
-nothing is allocated in a tick, and a run can be saved or compared as bytes. Units are p.u. and s
-unless stated; the order of measured channels is (v_dc, p, q, V), then those of an inner stage.
+``par`` and ``st`` have one element for each converter, ``net`` and ``now`` one for the network that
+connects them. Compiled code reaches a field by plain pointer arithmetic, nothing is allocated in a
+tick, and a run can be saved or compared as bytes. Units are p.u. and s unless stated: those of a
+converter are p.u. of its own rating, those of the network p.u. of the first converter's. The order
+of measured channels is (v_dc, p, q, V), then those of an inner stage.
 """
 
 from __future__ import annotations
 
+from functools import cache
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-PlantRecord = NDArray[np.void]
-"""Shape (1,) of `plant_par_dtype` or `plant_state_dtype`."""
+Record = NDArray[np.void]
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
-N_W = 5  # states of the circuit, see `solution.STATES`
-N_SOURCES = 3  # the bridge, and the positive and the negative sequence of the grid
-N_CIRCUITS = 4
-OPERATING, BLOCKED, FAULTED = 0, 1, 2
-"""The circuits: with the bridge in operation, or BLOCKED, without the filter inductor; and each of
-them + FAULTED."""
+N_OWN = 3  # states of the circuit that a converter brings: i_f, v, i_o
 N_MEASURED, N_COMMANDS = 10, 4  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
 N_RING = 256  # places of a ring that holds one cycle
 
-plant_par_dtype = np.dtype(
+SIZES = {1: 5, 2: 16, 4: 32, 12: 96}
+"""Records come in sizes, because each is compiled once a machine: converters, and states of the
+circuit, that fit in."""
+
+
+def size_for(converters: int, states: int) -> int:
+    """Return the key of `SIZES` for so many converters, and states of the circuit.
+
+    Raises:
+        ValueError: If there are too many.
+    """
+    for size, most in SIZES.items():
+        if size >= converters and most >= states:
+            return size
+    raise ValueError(
+        f"network: {converters} converters and {states} currents and voltages; at most"
+        f" {max(SIZES)} and {max(SIZES.values())}"
+    )
+
+
+class PlantRecords(NamedTuple):
+    """A plant: converters and the network between them, see ``gfm_plant.make_plant``.
+
+    Attributes:
+        par, st: parameters and state of the converters, shape (N,), of `converter_par_dtype` and
+            `converter_state_dtype`.
+        net, now: parameters and state of the network, shape (1,), of `network_dtypes`.
+    """
+
+    par: Record
+    st: Record
+    net: Record
+    now: Record
+
+    def copy(self) -> PlantRecords:
+        """Return the same plant at the same instant, in memory of its own."""
+        return PlantRecords(*(record.copy() for record in self))
+
+    def restore(self, kept: PlantRecords) -> None:
+        """Take the parameters and the instant of a copy."""
+        for record, old in zip(self, kept, strict=True):
+            record[:] = old
+
+
+converter_par_dtype = np.dtype(
     [
         ("omega_b", "f8"),  # rad/s
         # the elements of Eq. (1)-(8)
@@ -35,17 +78,17 @@ plant_par_dtype = np.dtype(
         ("L_g", "f8"),
         ("R_g", "f8"),
         ("C_dc", "f8"),
-        # the line as the converter file has it, and the local load (L_load = 0: none)
+        # the line as the converter file has it
         ("L_line_n", "f8"),
         ("R_line_n", "f8"),
-        ("L_load", "f8"),
-        ("R_load", "f8"),
+        ("current", "f8"),  # p.u. of the network in p.u. of the converter: ratio of their ratings
         # DC source: i_dc = i_u_gain i_u + k_p (1 - v_dc) + k_i integral, |i_dc| <= i_max
         ("i_u_gain", "f8"),
         ("k_p", "f8"),
         ("k_i", "f8"),
         ("i_max", "f8"),
         ("tau_dc", "f8"),  # its lag, s (0: none)
+        ("dc_steps", "i8"),  # of RK4 for the DC link in half a piece, see `net`
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
         ("i_peak", "f8"),
@@ -64,33 +107,10 @@ plant_par_dtype = np.dtype(
         ("dac_lo", "f8", (N_COMMANDS,)),
         ("dac_hi", "f8", (N_COMMANDS,)),
         ("dac_lsb", "f8", (N_COMMANDS,)),
-        # a finite grid on its own rating (H_grid = 0: ideal); its rating over the converter's
-        ("H_grid", "f8"),
-        ("D_grid", "f8"),
-        ("droop_grid", "f8"),
-        ("T_gov", "f8"),
-        ("S_grid", "f8"),
-        # one sampling period: a stretch under u[k - delay - 1], which has no length without a
-        # fraction of delay, then one under u[k - delay]; each is cut into pieces for Simpson's
-        # rule, and each piece in halves
+        # from the tick that samples y[k] to the effect of u[k]: samples, and a fraction of one
         ("T_s", "f8"),
         ("delay", "i8"),
-        ("stretch", "f8", (2,)),  # s
-        ("pieces", "i8", (2,)),
-        ("half_h", "f8", (2,)),  # s
-        ("dc_steps", "i8"),  # of RK4 for the DC link in each half
-        ("sensor_weights", "f8", (2, 4)),  # of the last reading, and of a piece's parabola
-        # the modes of each circuit: in operation, and with the bridge blocked
-        ("n_states", "i8"),  # of w, without those at its end that the plant does not have
-        # a fault: its place on the line, 0 at the terminal and 1 at the grid (-1: none), and R
-        ("fault_at", "f8"),
-        ("fault_R", "f8"),
-        ("n_modes", "i8", (N_CIRCUITS,)),
-        ("rate", "f8", (N_CIRCUITS, N_W, 2)),  # real and imaginary part, also below; 1/s
-        ("decay", "f8", (N_CIRCUITS, 2, N_W, 2)),  # in half a piece of each stretch
-        ("drive", "f8", (N_CIRCUITS, N_W, N_SOURCES, 2)),
-        ("states", "f8", (N_CIRCUITS, N_W, N_W, 2)),
-        ("modes", "f8", (N_CIRCUITS, N_W, N_W, 2)),
+        ("fraction", "f8"),
         # protection: threshold, and ticks it may stay crossed (-1: disabled)
         ("trip_limit", "f8", (N_TRIPS + N_OVERLOADS,)),
         ("trip_ticks", "i8", (N_TRIPS + N_OVERLOADS,)),
@@ -103,21 +123,9 @@ plant_par_dtype = np.dtype(
     align=True,
 )
 
-plant_state_dtype = np.dtype(
+converter_state_dtype = np.dtype(
     [
         ("tick", "i8"),
-        # in the common frame, real and imaginary parts: modes, what drives them in the present
-        # stretch (in its first and its second half), states, and the sources' unit phasors
-        ("z", "f8", (N_W, 2)),
-        ("forced", "f8", (N_W, 4)),
-        # each source's gain on the modes, for which speed and stretch, and turn in half a piece
-        ("gain", "f8", (N_SOURCES, N_W, 2)),
-        ("gain_omega", "f8", (N_SOURCES,)),
-        ("gain_part", "i8", (N_SOURCES,)),
-        ("turn", "f8", (N_SOURCES, 2)),
-        ("w", "f8", (N_W, 2)),
-        ("unit", "f8", (N_SOURCES, 2)),
-        ("w_before", "f8", (N_W, 2)),  # w at the last tick
         ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
         ("i_source", "f8"),  # current of a DC source with a lag
@@ -125,29 +133,13 @@ plant_state_dtype = np.dtype(
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (N_COMMANDS,)),  # the command that acts at this instant
-        # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
-        ("closed", "i8"),
-        ("omega_g", "f8"),
-        ("omega_g_to", "f8"),
-        ("omega_g_rate", "f8"),
-        ("V_g", "f8"),
-        ("V_g_to", "f8"),
-        ("V_g_rate", "f8"),
-        ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
-        ("V_g_after", "f8"),  # voltage it recovers to
-        # positive and negative sequence over V_g, real and imaginary part, and s until they are
-        # 1 and 0 again
-        ("sequence", "f8", (2, 2)),
-        ("unbalance_left", "f8"),
-        ("faulted", "i8"),
-        ("fault_left", "f8"),  # s until the fault is cleared
-        # a finite grid, p.u. of its rating: power of turbines, set point of governors, load; its
-        # d/dt omega_g, 1/s; energy that the line has brought since the last tick, p.u. of S_n s
-        ("P_turbine", "f8"),
-        ("P_set", "f8"),
-        ("P_load", "f8"),
-        ("omega_g_slope", "f8"),
-        ("brought", "f8"),
+        # in a piece of time: power that the bridge draws, and what the sensors see, at its
+        # beginning, middle and end; the command's voltage and the largest that v_dc gives
+        ("drawn", "f8", (3,)),
+        ("seen", "f8", (3, 3)),
+        ("E_told", "f8", (2,)),
+        ("E_most", "f8"),
+        ("before", "f8", (8,)),  # at the last tick: delta, v_dc, DC source (2), sensors (4)
         # protection: ticks in a row that each threshold was crossed, and the latched trip
         ("crossed", "i8", (N_TRIPS + N_OVERLOADS,)),
         # one cycle: ticks looked at; sums over them of i^2 and of the turn of the capacitor's
@@ -165,3 +157,90 @@ plant_state_dtype = np.dtype(
     ],
     align=True,
 )
+
+
+@cache
+def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void]]:
+    """Return the dtypes of a network's parameters and state; ``converters`` is a key of `SIZES`.
+
+    Circuits come in pairs of one row each without and with the fault: row 0 as the converters are,
+    and row 1 + k with the bridge of converter k blocked besides. Sources are the bridges, then the
+    positive and the negative sequence of the grid.
+    """
+    n_w, n_s, n_parts, n_c = SIZES[converters], converters + 2, converters + 1, 2 * (converters + 1)
+    par = np.dtype(
+        [
+            ("omega_b", "f8"),  # rad/s
+            # a finite grid on its own rating (H_grid = 0: ideal); its rating over the network's
+            ("H_grid", "f8"),
+            ("D_grid", "f8"),
+            ("droop_grid", "f8"),
+            ("T_gov", "f8"),
+            ("S_grid", "f8"),
+            ("to_grid", "f8", (n_w,)),  # what each state of w brings to the grid, as a current
+            # one sampling period in stretches, between the instants at which a command begins to
+            # act; each is cut into pieces for Simpson's rule, and each piece in halves
+            ("T_s", "f8"),
+            ("n_converters", "i8"),
+            ("n_parts", "i8"),
+            ("stretch", "f8", (n_parts,)),  # s
+            ("pieces", "i8", (n_parts,)),
+            ("half_h", "f8", (n_parts,)),  # s
+            ("age", "i8", (n_parts, converters)),  # place in `u` of the command that acts
+            # of the last reading, and of a piece's parabola
+            ("sensor_weights", "f8", (n_parts, converters, 4)),
+            # the modes of each circuit
+            ("n_states", "i8"),  # of w, without those at its end that the plant does not have
+            ("n_modes", "i8", (n_c,)),
+            ("rate", "f8", (n_c, n_w, 2)),  # real and imaginary part, also below; 1/s
+            ("decay", "f8", (n_c, n_parts, n_w, 2)),  # in half a piece of each stretch
+            ("drive", "f8", (n_c, n_w, n_s, 2)),
+            ("states", "f8", (n_c, n_w, n_w, 2)),
+            ("modes", "f8", (n_c, n_w, n_w, 2)),
+        ],
+        align=True,
+    )
+    state = np.dtype(
+        [
+            # in the common frame, real and imaginary parts: modes, what drives them in the present
+            # stretch (in its first and its second half), states, and the sources' unit phasors
+            ("z", "f8", (n_w, 2)),
+            ("forced", "f8", (n_w, 4)),
+            # each source's gain on the modes, for which speed and stretch, and turn in half a piece
+            ("gain", "f8", (n_s, n_w, 2)),
+            ("gain_omega", "f8", (n_s,)),
+            ("gain_part", "i8", (n_s,)),
+            ("turn", "f8", (n_s, 2)),
+            ("w", "f8", (n_w, 2)),
+            ("unit", "f8", (n_s, 2)),
+            ("halfway", "f8", (n_s, 2)),  # the unit phasors in the middle of a piece
+            ("w_before", "f8", (n_w, 2)),  # w at the last tick
+            ("unit_before", "f8", (n_s, 2)),
+            ("row", "i8"),  # of the circuits, without the fault
+            # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
+            ("closed", "i8"),
+            ("omega_g", "f8"),
+            ("omega_g_to", "f8"),
+            ("omega_g_rate", "f8"),
+            ("V_g", "f8"),
+            ("V_g_to", "f8"),
+            ("V_g_rate", "f8"),
+            ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
+            ("V_g_after", "f8"),  # voltage it recovers to
+            # positive and negative sequence over V_g, real and imaginary part, and s until they are
+            # 1 and 0 again
+            ("sequence", "f8", (2, 2)),
+            ("unbalance_left", "f8"),
+            ("faulted", "i8"),
+            ("fault_left", "f8"),  # s until the fault is cleared
+            # a finite grid, p.u. of its rating: power of turbines, set point of governors, load;
+            # its d/dt omega_g, 1/s; energy that came since the last tick, p.u. of the network and s
+            ("P_turbine", "f8"),
+            ("P_set", "f8"),
+            ("P_load", "f8"),
+            ("omega_g_slope", "f8"),
+            ("brought", "f8"),
+        ],
+        align=True,
+    )
+    return par, state

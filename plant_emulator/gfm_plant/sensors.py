@@ -10,19 +10,20 @@ from numpy.typing import NDArray
 from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussians
 from gfm_plant.quantise import quantise
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import PlantRecords
 from gfm_runtime.compiled import compiled
 from gfm_runtime.signals import NY
 
 
 @compiled
-def plant_sample(par: PlantRecord, st: PlantRecord, y: NDArray[np.float64]) -> None:
-    """Write the readings of the A/D at this tick to y (5,): (v_dc, p, omega_u, q, V) in p.u.
+def plant_sample(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
+    """Write the readings of converter k's A/D at this tick to y (5,): (v_dc, p, omega_u, q, V) in
+    p.u. of the converter.
 
     omega_u is the command that acts at this instant, without error. A y of (11,) gets the currents
     and voltages of an inner stage besides, (i_d, i_q, v_d, v_q, i_od, i_oq), which pass no filter.
     """
-    r, s = par[0], st[0]
+    r, s = plant.par[k], plant.st[k]
     if r.filtered:
         v_dc, p, q, V = s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3]
     else:

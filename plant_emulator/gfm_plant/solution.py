@@ -16,15 +16,24 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gfm_plant.records import BLOCKED, FAULTED, OPERATING
+from gfm_plant.records import N_OWN
 from gfm_runtime.compiled import compiled
 
-STATES = ("i_f", "v", "i_o", "i_load", "i_g")
-"""The names of w: currents of filter, line and local load; v is the filter capacitor's voltage, and
-i_g the current of the line's far piece, if the line has a place for a fault."""
-I_F, V, I_O, I_LOAD, I_G = 0, 1, 2, 3, 4
-BRIDGE, GRID, NEGATIVE = 0, 1, 2
-"""Places of the sources: the grid has one for each sequence of an unbalanced voltage."""
+I_F, V, I_O = 0, 1, 2
+"""Places of a converter's states in w, from ``own(k)`` on: currents of filter and line, and the
+voltage of the filter capacitor."""
+
+
+@compiled
+def own(k: int) -> int:
+    """Return where the states of converter k begin in w. Its source is number k."""
+    return N_OWN * k
+
+
+@compiled
+def grid_source(n: Any) -> int:
+    """Return the place of the grid's positive sequence; its negative sequence is the next one."""
+    return n.n_converters
 
 
 @compiled
@@ -41,105 +50,104 @@ def turned(x: float) -> tuple[float, float]:
 
 @compiled
 def drive(
-    r: Any, s: Any, c: int, part: int, k: int, E_r: float, E_i: float, omega: float
-) -> tuple[float, float]:
+    n: Any, now: Any, c: int, part: int, k: int, E_r: float, E_i: float, omega: float
+) -> None:
     """Add to the forcing of every mode what source k does to it, and turn its phasor.
 
-    Returns the unit phasor in the middle of the piece.
-
     Args:
+        n, now: elements of ``net`` and ``now``, also below.
         c: the circuit in force.
         part: which stretch of the period, in which a piece lasts twice ``half_h[part]``.
         E_r, E_i: the source's voltage over its unit phasor, p.u.
         omega: its speed, p.u.; negative for a negative sequence.
     """
-    if s.gain_omega[k] != omega or s.gain_part[k] != part:
-        _find_gains(r, s, c, part, k, omega)
-    cos, sin = s.turn[k, 0], s.turn[k, 1]
-    s_r = E_r * s.unit[k, 0] - E_i * s.unit[k, 1]
-    s_i = E_r * s.unit[k, 1] + E_i * s.unit[k, 0]
-    for m in range(r.n_modes[c]):
-        g_r, g_i = s.gain[k, m, 0], s.gain[k, m, 1]
+    if now.gain_omega[k] != omega or now.gain_part[k] != part:
+        _find_gains(n, now, c, part, k, omega)
+    cos, sin = now.turn[k, 0], now.turn[k, 1]
+    s_r = E_r * now.unit[k, 0] - E_i * now.unit[k, 1]
+    s_i = E_r * now.unit[k, 1] + E_i * now.unit[k, 0]
+    for m in range(n.n_modes[c]):
+        g_r, g_i = now.gain[k, m, 0], now.gain[k, m, 1]
         f_r, f_i = g_r * s_r - g_i * s_i, g_r * s_i + g_i * s_r
-        s.forced[m, 0] += f_r
-        s.forced[m, 1] += f_i
-        s.forced[m, 2] += f_r * cos - f_i * sin
-        s.forced[m, 3] += f_r * sin + f_i * cos
-    u_r, u_i = s.unit[k, 0], s.unit[k, 1]
+        now.forced[m, 0] += f_r
+        now.forced[m, 1] += f_i
+        now.forced[m, 2] += f_r * cos - f_i * sin
+        now.forced[m, 3] += f_r * sin + f_i * cos
+    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
     h_r, h_i = u_r * cos - u_i * sin, u_r * sin + u_i * cos
+    now.halfway[k, 0], now.halfway[k, 1] = h_r, h_i
     u_r, u_i = h_r * cos - h_i * sin, h_r * sin + h_i * cos
     length = 1.5 - 0.5 * (u_r * u_r + u_i * u_i)  # takes the rounding out of it
-    s.unit[k, 0], s.unit[k, 1] = u_r * length, u_i * length
-    return h_r, h_i
+    now.unit[k, 0], now.unit[k, 1] = u_r * length, u_i * length
 
 
 @compiled
-def _find_gains(r: Any, s: Any, c: int, part: int, k: int, omega: float) -> None:
+def _find_gains(n: Any, now: Any, c: int, part: int, k: int, omega: float) -> None:
     """Find what source k does to each mode in half a piece, per unit of its voltage; this stays
     the same while its speed does, as that of an ideal grid."""
-    speed = r.omega_b * (omega - 1.0)
-    cos, sin = turned(speed * r.half_h[part])
-    for m in range(r.n_modes[c]):
-        d_r, d_i = -r.rate[c, m, 0], speed - r.rate[c, m, 1]
-        n_r, n_i = cos - r.decay[c, part, m, 0], sin - r.decay[c, part, m, 1]
+    speed = n.omega_b * (omega - 1.0)
+    cos, sin = turned(speed * n.half_h[part])
+    for m in range(n.n_modes[c]):
+        d_r, d_i = -n.rate[c, m, 0], speed - n.rate[c, m, 1]
+        n_r, n_i = cos - n.decay[c, part, m, 0], sin - n.decay[c, part, m, 1]
         size = d_r * d_r + d_i * d_i
-        h = r.half_h[part]
+        h = n.half_h[part]
         if size * h * h > 1e-8:
             g_r, g_i = (n_r * d_r + n_i * d_i) / size, (n_i * d_r - n_r * d_i) / size
         else:  # nearly the mode's own frequency: h e^(lambda h) (1 + z/2 + z^2/6), z = d h
             z_r, z_i = d_r * h, d_i * h
             f_r = 1.0 + z_r / 2.0 + (z_r * z_r - z_i * z_i) / 6.0
             f_i = z_i / 2.0 + z_r * z_i / 3.0
-            a_r, a_i = h * r.decay[c, part, m, 0], h * r.decay[c, part, m, 1]
+            a_r, a_i = h * n.decay[c, part, m, 0], h * n.decay[c, part, m, 1]
             g_r, g_i = a_r * f_r - a_i * f_i, a_r * f_i + a_i * f_r
-        b_r, b_i = r.drive[c, m, k, 0], r.drive[c, m, k, 1]
-        s.gain[k, m, 0], s.gain[k, m, 1] = g_r * b_r - g_i * b_i, g_r * b_i + g_i * b_r
-    s.turn[k, 0], s.turn[k, 1] = cos, sin
-    s.gain_omega[k], s.gain_part[k] = omega, part
+        b_r, b_i = n.drive[c, m, k, 0], n.drive[c, m, k, 1]
+        now.gain[k, m, 0], now.gain[k, m, 1] = g_r * b_r - g_i * b_i, g_r * b_i + g_i * b_r
+    now.turn[k, 0], now.turn[k, 1] = cos, sin
+    now.gain_omega[k], now.gain_part[k] = omega, part
 
 
 @compiled
-def half_step(r: Any, s: Any, c: int, part: int, which: int) -> None:
+def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
     """Take the modes on by half a piece: ``which`` is 0 for its first half, 2 for its second."""
-    for m in range(r.n_modes[c]):
-        a_r, a_i = r.decay[c, part, m, 0], r.decay[c, part, m, 1]
-        z_r, z_i = s.z[m, 0], s.z[m, 1]
-        s.z[m, 0] = a_r * z_r - a_i * z_i + s.forced[m, which]
-        s.z[m, 1] = a_r * z_i + a_i * z_r + s.forced[m, which + 1]
+    for m in range(n.n_modes[c]):
+        a_r, a_i = n.decay[c, part, m, 0], n.decay[c, part, m, 1]
+        z_r, z_i = now.z[m, 0], now.z[m, 1]
+        now.z[m, 0] = a_r * z_r - a_i * z_i + now.forced[m, which]
+        now.z[m, 1] = a_r * z_i + a_i * z_r + now.forced[m, which + 1]
 
 
 @compiled
-def state(r: Any, s: Any, c: int, i: int) -> tuple[float, float]:
+def state(n: Any, now: Any, c: int, i: int) -> tuple[float, float]:
     """Return state i of w, by the modes."""
     w_r = w_i = 0.0
-    for m in range(r.n_modes[c]):
-        w_r += r.states[c, i, m, 0] * s.z[m, 0] - r.states[c, i, m, 1] * s.z[m, 1]
-        w_i += r.states[c, i, m, 0] * s.z[m, 1] + r.states[c, i, m, 1] * s.z[m, 0]
+    for m in range(n.n_modes[c]):
+        w_r += n.states[c, i, m, 0] * now.z[m, 0] - n.states[c, i, m, 1] * now.z[m, 1]
+        w_i += n.states[c, i, m, 0] * now.z[m, 1] + n.states[c, i, m, 1] * now.z[m, 0]
     return w_r, w_i
 
 
 @compiled
-def read_states(r: Any, s: Any, c: int) -> None:
+def read_states(n: Any, now: Any, c: int) -> None:
     """Write all states of w by the modes."""
-    for i in range(r.n_states):
-        s.w[i, 0], s.w[i, 1] = state(r, s, c, i)
+    for i in range(n.n_states):
+        now.w[i, 0], now.w[i, 1] = state(n, now, c, i)
 
 
 @compiled
-def circuit(s: Any) -> int:
+def circuit(n: Any, now: Any) -> int:
     """Return which circuit is in force."""
-    return (BLOCKED if s.trip else OPERATING) + (FAULTED if s.faulted else 0)
+    return now.row + (n.n_converters + 1 if now.faulted else 0)
 
 
 @compiled
-def enter(r: Any, s: Any, c: int) -> None:
+def enter(n: Any, now: Any, c: int) -> None:
     """Start the modes of circuit c from w, which is projected onto what that circuit can hold."""
-    for k in range(len(s.gain_part)):
-        s.gain_part[k] = -1
-    for m in range(r.n_modes[c]):
+    for k in range(len(now.gain_part)):
+        now.gain_part[k] = -1
+    for m in range(n.n_modes[c]):
         z_r = z_i = 0.0
-        for i in range(r.n_states):
-            z_r += r.modes[c, m, i, 0] * s.w[i, 0] - r.modes[c, m, i, 1] * s.w[i, 1]
-            z_i += r.modes[c, m, i, 0] * s.w[i, 1] + r.modes[c, m, i, 1] * s.w[i, 0]
-        s.z[m, 0], s.z[m, 1] = z_r, z_i
-    read_states(r, s, c)
+        for i in range(n.n_states):
+            z_r += n.modes[c, m, i, 0] * now.w[i, 0] - n.modes[c, m, i, 1] * now.w[i, 1]
+            z_i += n.modes[c, m, i, 0] * now.w[i, 1] + n.modes[c, m, i, 1] * now.w[i, 0]
+        now.z[m, 0], now.z[m, 1] = z_r, z_i
+    read_states(n, now, c)

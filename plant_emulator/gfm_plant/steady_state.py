@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_plant.model import N_U, N_X, V_DC, f, g
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import Record
 
 _ROUNDS = 30
 _STEP = 1e-30  # complex step: exact to rounding, as no difference is taken
@@ -19,7 +19,7 @@ class NoEquilibrium(ArithmeticError):
 
 
 def plant_equilibrium(
-    par: PlantRecord, P: float, V: float, V_g: float = 1.0, omega_g: float = 1.0
+    par: Record, P: float, V: float, V_g: float = 1.0, omega_g: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the equilibrium x (8,), u (3,) with p = P, terminal voltage V and v_dc = 1.
 
@@ -50,7 +50,7 @@ def plant_equilibrium(
     raise NoEquilibrium(f"no equilibrium found at P = {P} p.u., V = {V} p.u., V_g = {V_g} p.u.")
 
 
-def _start(par: PlantRecord, P: float, V: float, V_g: float, omega_g: float) -> NDArray[np.float64]:
+def _start(par: Record, P: float, V: float, V_g: float, omega_g: float) -> NDArray[np.float64]:
     """Return a first z = (x, u): the line exactly, the filter as if it were not there."""
     if not (V > 0 and V_g > 0 and omega_g > 0):
         raise NoEquilibrium(f"V = {V}, V_g = {V_g}, omega_g = {omega_g}: all must be > 0 p.u.")
@@ -70,7 +70,7 @@ def _start(par: PlantRecord, P: float, V: float, V_g: float, omega_g: float) -> 
 
 
 def _linearise(
-    z: NDArray[np.float64], d: NDArray[np.complex128], par: PlantRecord, P: float, V: float
+    z: NDArray[np.float64], d: NDArray[np.complex128], par: Record, P: float, V: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what must vanish at z = (x, u), (11,): f and the misses of p, V, v_dc; and d/dz."""
     residual = np.empty(N_X + N_U)  # the same in every column, as a nudge of 1e-30 is nothing

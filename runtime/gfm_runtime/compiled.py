@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.caching import _SourceFileBackedLocatorMixin
+from numba.core.caching import IndexDataCacheFile, _SourceFileBackedLocatorMixin
 
 #: options of njit and cfunc
 FREE: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
@@ -70,3 +70,16 @@ def _stamp(locator: Any) -> Any:
 
 
 _SourceFileBackedLocatorMixin.get_source_stamp = _stamp  # type: ignore[method-assign]
+
+
+def _load_index(file: Any) -> Any:
+    """What numba finds in a cache. It also holds the types of arguments, which an update may have
+    taken away: such a cache is as good as none."""
+    try:
+        return _own_load_index(file)
+    except (AttributeError, ImportError):
+        return {}
+
+
+_own_load_index = IndexDataCacheFile._load_index
+IndexDataCacheFile._load_index = _load_index  # type: ignore[method-assign]

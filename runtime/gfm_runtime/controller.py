@@ -140,8 +140,12 @@ def _schedule(ctl, est, y):
 
 
 @inlined
-def _step_with_inner(law, state, c):
-    """One tick of a law and its inner stage: ``c.out`` from ``c.ref`` and ``c.y``."""
+def step_with_inner(law, state, c):
+    """One tick of a law and its inner stage: ``c.out`` (4,) from ``c.ref`` (5,) and ``c.y`` (11,).
+
+    ``c`` is a record that has the fields ``ref``, ``ref_seen``, ``y``, ``u`` and ``out`` of
+    ``controller_dtype``.
+    """
     take_measurements(state, c.y)
     for j in range(NY):
         c.ref_seen[j] = c.ref[j]
@@ -193,7 +197,7 @@ def control(ctl, laws, states, est, y, u):
                 settle_inner(laws[k], states[k], c.u, c.out[2], c.out[3])
             c.active, c.changes = k, c.changes + 1
     if inner:
-        _step_with_inner(laws[c.active], states[c.active], c)
+        step_with_inner(laws[c.active], states[c.active], c)
         for i in (1, 0, 2, 3):
             if not math.isfinite(c.out[i]):
                 _go_safe(c, BAD_U, i)

@@ -189,13 +189,16 @@ _PACKED = (
 )  # fmt: skip
 
 
+#: the stage's constants in ``law_dtype``, in the law's precision
+INNER_CONSTANTS = (*_PLAIN, *_PACKED)
+
 #: integers of the stage in ``law_dtype``: places in ``KINDS`` and ``PRIORITIES``, and yes or no
 INNER_NUMBERS = [("inner", "i8"), ("priority", "i8"), ("freeze", "i8")]
 
 
 def inner_fields(f: np.dtype[Any]) -> list[Any]:
     """The inner stage's constants in ``law_dtype``."""
-    return [(name, f) for name in (*_PLAIN, *_PACKED)]
+    return [(name, f) for name in INNER_CONSTANTS]
 
 
 def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
@@ -412,6 +415,8 @@ def settle_inner(law, state, u, e_d, e_q):
         state.v_f[k], state.i_f[k] = m[V_D + k], m[I_D + k]
         state.x_c[k] = state.x_v[k] = 0
     state.away[0], state.away[1] = 0, 0
+    state.e[0], state.e[1] = e_d, e_q
+    e_d, e_q = state.e[0], state.e[1]  # in the law's own precision
     need_d, need_q = e_d, e_q
     X = state.omega * law.L_f
     lack_d, lack_q = e_d - m[V_D] + X * m[I_Q], e_q - m[V_Q] - X * m[I_D]
@@ -433,7 +438,6 @@ def settle_inner(law, state, u, e_d, e_q):
         X = state.omega * law.X_v
         need_d = m[V_D] + law.R_v * through_d - X * through_q + drop_d
         need_q = m[V_Q] + law.R_v * through_q + X * through_d + drop_q
-    state.e[0], state.e[1] = e_d, e_q
     state.away[0], state.away[1] = need_d - u[2], need_q
 
 

@@ -17,7 +17,7 @@ from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
@@ -58,7 +58,8 @@ def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
     c = bench.controller
     c.set("P_ref", REFERENCES[1] + size)
     signals = np.full((ticks, len(PLANT_COLUMNS)), np.nan)
-    run_ticks(bench, signals, np.empty((ticks, len(CONTROLLER_COLUMNS))), 0, ticks)
+    other = np.empty((1, ticks, len(CONTROLLER_COLUMNS)))
+    run_ticks(bench.plant.records, stack([bench]), signals[None], other, 0, ticks)
     p = signals[:, PLANT_COLUMNS.index("true_p")] - REFERENCES[1]
     t, y = ClosedLoop.of(law, bench.scenario.plant).step_response("P_ref", seconds=ticks * 1e-4)
     assert t[1] == pytest.approx(1e-4) and y.shape == (ticks + 1, 5)

@@ -12,7 +12,7 @@ from gfm_design.margins.all_margins import loop_margins
 from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import linearise_plant
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.scenario.model import check_scenario
@@ -107,7 +107,7 @@ def test_law_and_stage_are_the_compiled_kernels_slopes(stage: str, law: str) -> 
 
 def test_the_plant_under_a_turned_voltage_is_the_plant_in_a_turned_frame() -> None:
     # central differences of f itself, with the voltage on f's own d axis
-    par, _ = make_plant(Plant.model_validate(PLANT), T_S)
+    par = make_plant(Plant.model_validate(PLANT), T_S).par
     op, h = loop_of(STAGES["cascaded"]).made_of.op, 1e-6
     plant = linearise_plant(par, op, inner=True)
     turn = np.conj(op.e) / abs(op.e)
@@ -141,6 +141,14 @@ def bench_of(stage: str, law: str, ticks: int, plant: dict[str, Any], place: Any
     return make_bench(check_scenario({**content, "inner": str(path)}, "test"))
 
 
+def recorded(bench: Bench, ticks: int) -> dict[str, np.ndarray]:
+    """The plant's columns by name, of a run from the bench's start."""
+    names, others = (signals_of(role, True) for role in ("plant", "controller"))
+    rows, other = np.full((1, ticks, len(names)), np.nan), np.empty((1, ticks, len(others)))
+    assert run_ticks(bench.plant.records, stack([bench]), rows, other, 0, ticks) == ticks
+    return dict(zip(names, rows[0].T, strict=True))
+
+
 PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
 
 
@@ -168,12 +176,10 @@ def test_a_step_is_that_of_the_nonlinear_bench(
     c = bench.controller
     loop = ClosedLoop.of(c.active_law, bench.scenario.plant, REFERENCES)
     c.set("P_ref", REFERENCES[1] + size)
-    names = {role: list(signals_of(role, True)) for role in ("plant", "controller")}
-    rows = {role: np.full((ticks, len(n)), np.nan) for role, n in names.items()}
-    assert run_ticks(bench, rows["plant"], rows["controller"], 0, ticks) == ticks
+    rows = recorded(bench, ticks)
     _, y = loop.step_response("P_ref", seconds=ticks * T_S)
     for name, column, rest in (("true_p", 1, loop.made_of.op.y[1]), ("true_V", 4, None)):
-        found = rows["plant"][:, names["plant"].index(name)]
+        found = rows[name]
         moved = (found - (found[0] if rest is None else rest)) / size
         assert np.abs(moved - y[:ticks, column]).max() < 2e-3 * np.abs(y[:, column]).max(), name
 
@@ -181,10 +187,7 @@ def test_a_step_is_that_of_the_nonlinear_bench(
 def test_the_bench_rests_where_a_pll_measures_another_frequency(tmp_path: Any) -> None:
     plant = {**PLANT, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}
     bench = bench_of(PLL, "vsg-5", 300, plant, tmp_path)
-    names = {role: list(signals_of(role, True)) for role in ("plant", "controller")}
-    rows = {role: np.empty((300, len(n))) for role, n in names.items()}
-    run_ticks(bench, rows["plant"], rows["controller"], 0, 300)
-    assert np.ptp(rows["plant"][:, names["plant"].index("true_p")]) < 1e-11
+    assert np.ptp(recorded(bench, 300)["true_p"]) < 1e-11
 
 
 def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues() -> None:

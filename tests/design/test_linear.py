@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode, hold, linearise_plant
 from gfm_design.model.operating_point import operating_point
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
@@ -45,7 +45,7 @@ def near(found: list[Mode], frequency_hz: float) -> Mode:
 def test_plant_agrees_with_central_differences() -> None:
     # 1e-6 p.u. up and down: an error of order 1e-12 from the curvature, 1e-10 from rounding,
     # both on derivatives of up to 2e4 1/s
-    par, _ = make_plant(Plant(), 1e-4)
+    par = make_plant(Plant(), 1e-4).par
     op = operating_point(par, discretise(get_law("vsg-2"), 1e-4), REF)
     plant, d, h = linearise_plant(par, op), np.array([1.0, 1.0]), 1e-6
     for j in range(N_X):
@@ -66,7 +66,7 @@ def test_plant_agrees_with_central_differences() -> None:
 
 @pytest.mark.parametrize("T", [0.0, 1e-5, 1e-4, 1e-2])
 def test_hold_agrees_with_scipy(T: float) -> None:
-    par, _ = make_plant(Plant.model_validate({**RIG, **REGULATED}), 1e-4)
+    par = make_plant(Plant.model_validate({**RIG, **REGULATED}), 1e-4).par
     plant = linearise_plant(par, operating_point(par, discretise(get_law("vsg-2"), 1e-4), REF))
     n = len(plant.A)
     M = np.zeros((n + 3, n + 3))
@@ -93,9 +93,16 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
     for k in range(ticks):
         predicted[k] = loop.plant.C[1] @ x[: len(loop.plant.A)]
         x = loop.A @ x
-    phase_jump(bench.st, -math.degrees(angle))
+    phase_jump(bench.plant, -math.degrees(angle))
     parts = [Part.create(place, role, ticks) for role in ("plant", "controller")]
-    done = run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
+    done = run_ticks(
+        bench.plant.records,
+        stack([bench]),
+        parts[0].signals[None],
+        parts[1].signals[None],
+        0,
+        ticks,
+    )
     assert done == ticks
     p = parts[0].signals[:, PLANT_COLUMNS.index("y_p")]
     return p - bench.start.y[1], predicted

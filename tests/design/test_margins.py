@@ -28,7 +28,7 @@ from gfm_design.margins.tolerance import (
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import LinearLaw, LinearPlant
 from gfm_hil.cli import main
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
@@ -195,9 +195,16 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     """Growth of p's swing on the nonlinear bench: its last third over its middle third."""
     content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": plant}
     bench = make_bench(check_scenario(content, "test"))
-    phase_jump(bench.st, -math.degrees(1e-7))
+    phase_jump(bench.plant, -math.degrees(1e-7))
     parts = [Part.create(tmp, role, ticks) for role in ("plant", "controller")]
-    run_ticks(bench, parts[0].signals, parts[1].signals, 0, ticks)
+    run_ticks(
+        bench.plant.records,
+        stack([bench]),
+        parts[0].signals[None],
+        parts[1].signals[None],
+        0,
+        ticks,
+    )
     p = np.diff(parts[0].signals[:, PLANT_COLUMNS.index("true_p")])
     third = ticks // 3
     return float(np.abs(p[2 * third :]).max() / np.abs(p[third : 2 * third]).max())

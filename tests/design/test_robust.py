@@ -56,7 +56,7 @@ def delay_margin(law: str, dc: Source = "controlled") -> float:
 )
 def test_stack_is_the_sampled_loop(point: Point) -> None:
     """An independent computation: the runtime discretises the law, support.py gives the matrix."""
-    par, _ = make_plant(point.plant(), T_S)
+    par = make_plant(point.plant(), T_S).par
     # the printed k_35 is k_34/D_q to four digits; a search ties it exactly
     law = discretise(get_law("mimo-gfm", k_35=1.0844 / 0.05), T_S)
     op = operating_point(par, law, point.references())
@@ -70,7 +70,7 @@ def test_stack_is_the_sampled_loop(point: Point) -> None:
 
 def test_overshoot_is_that_of_the_loop_stepped_tick_by_tick() -> None:
     point = Point(0.1, 1.0, 20.0, 5.0)
-    par, _ = make_plant(point.plant(), T_S)
+    par = make_plant(point.plant(), T_S).par
     law = discretise(get_law(LAW), T_S)
     op = operating_point(par, law, point.references())
     plant = linearise_plant(par, op)

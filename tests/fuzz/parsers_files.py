@@ -176,8 +176,12 @@ def _firmware(place: Path) -> Iterator[Take]:
 
 
 def _reports() -> list[str]:
-    modules = make_modules({"psc-1": get_law("psc-1")}, 1e-4, "float32")
-    return [reports(modules, 1e-4, style)["report.json"] for style in STYLES]
+    laws = (get_law("psc-1"), load_law("psc-1", "cascaded").laws[0])
+    return [
+        reports(make_modules({"psc-1": law}, 1e-4, "float32"), 1e-4, style)["report.json"]
+        for law in laws
+        for style in STYLES
+    ]
 
 
 @contextlib.contextmanager

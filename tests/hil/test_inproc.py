@@ -229,7 +229,9 @@ def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
     bench = make_bench(scenario)
     parts = {role: Part.create(tmp_path, role, scenario.ticks) for role in ROLES}
     timeline = Timeline(bench, tmp_path / "events_both.jsonl", ROLES)
-    run_inproc(bench, parts["plant"], parts["controller"], timeline, lambda ticks: ticks < 4000)
+    run_inproc(
+        [bench], [parts["plant"]], [parts["controller"]], [timeline], lambda ticks: ticks < 4000
+    )
     timeline.close()
     (tmp_path / "scenario.toml").write_text("")
     done = finish(scenario, tmp_path, bench.controller.labels, 0.0)

@@ -124,7 +124,7 @@ def test_a_set_point_reverts(device, run):
     assert read(device, 704, "WSetRvrtRem") == 1
     wait_for(lambda: last(run)["ref_P_ref"] == 0.8)
     wait_for(lambda: last(run)["ref_P_ref"] == 0.5)
-    assert read(device, 704, "WSetEna") == 0
+    wait_for(lambda: read(device, 704, "WSetEna") == 0)  # once the run has answered the server
     write(device, 704, WSetRvrtTms=0)
 
 

@@ -298,3 +298,24 @@ def test_the_digest_is_of_contents_not_of_places(make, tmp_path):
     assert make(law=str(path)).digest() != digests[0]
     assert make(seed=1).digest() != make().digest()
     assert make(title="other").digest() == make().digest()
+
+
+def test_a_step_of_the_short_circuit_ratio_gives_the_line_of_that_ratio() -> None:
+    from gfm_hil.scenario.events import GridImpedance, apply_grid_event
+    from gfm_plant import Plant, make_plant
+
+    found = make_plant(Plant(), 1e-4)
+    event = GridImpedance(type="grid-impedance", t=0.1, scr=3.0, x_over_r=10.0)
+    apply_grid_event(event, found)
+    wanted = make_plant(Plant.model_validate({"grid": {"scr": 3.0, "x_over_r": 10.0}}), 1e-4)
+    for name in ("L_g", "R_g"):
+        assert found.par[name][0] == pytest.approx(wanted.par[name][0], rel=1e-14)
+    assert found.wiring.units[0].L_g == pytest.approx(wanted.wiring.units[0].L_g, rel=1e-14)
+    assert event.label() == "SCR 3, X/R 10"
+
+
+@pytest.mark.parametrize("line", [{}, {"L_g": 2.0}, {"scr": 3.0}, {"L_g": 2.0, "x_over_r": 3.0}])
+def test_a_line_is_given_by_its_elements_or_by_its_ratio(line: dict[str, float]) -> None:
+    content = {"title": "line", "duration": 1.0, **event(type="grid-impedance", **line)}
+    with pytest.raises(UserError, match="give L_g and R_g, or scr and x_over_r"):
+        check_scenario(content, "test")

@@ -10,7 +10,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gfm_plant import clear_fault, fault, grid_impedance
-from gfm_plant.solution import BRIDGE, I_G
 
 WEAK = {"scr": 3.0, "x_over_r": 6.0}
 NO_TRIP = {name: {"enabled": False} for name in ("over_current", "under_voltage", "over_voltage")}
@@ -50,11 +49,11 @@ def test_fault_and_clearing_against_the_equations(
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source={"mode": "regulated"})
     x = plant.x[:6]
     w = np.array([complex(*x[:2]), complex(*x[2:4]), complex(*x[4:]), complex(*x[4:])])
-    fault(plant.par, plant.st, at, R, duration=0.02)
+    fault(plant.plant, at, R, duration=0.02)
     plant.advance(200)
     w = moved(plant, w, 0.02, at, R)
     if at > 0:
-        i_g = complex(*plant.st["w"][0, I_G]) / complex(*plant.st["unit"][0, BRIDGE])
+        i_g = plant.phasor("beyond")
         assert abs(w[2] - w[3]) > 0.1
         w[2] = w[3] = at * w[2] + (1 - at) * w[3]  # the line keeps its flux
         assert i_g == pytest.approx(w[3], abs=1e-9)  # cleared at the end of the last tick
@@ -68,7 +67,7 @@ def test_fault_and_clearing_against_the_equations(
 def test_bolted_fault_in_the_steady_state(rest: Callable[..., Any]) -> None:
     """The bridge feeds its filter and 0.3 of the line: phasors at nominal frequency, by hand."""
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source={"mode": "regulated", "k_p": 200.0})
-    fault(plant.par, plant.st, 0.3, 0.0)
+    fault(plant.plant, 0.3, 0.0)
     plant.advance(20_000)
     r = plant.par[0]
     Z_f, Z = complex(r["R_f"], r["L_f"]), 0.3 * complex(r["R_g"], r["L_g"])
@@ -76,7 +75,7 @@ def test_bolted_fault_in_the_steady_state(rest: Callable[..., Any]) -> None:
     v = plant.u[2] / (1 + Z_f * Y)
     assert complex(*plant.st["x"][0, 2:4]) == pytest.approx(v, abs=1e-6)
     assert complex(*plant.st["x"][0, 4:6]) == pytest.approx(v / Z, abs=1e-6)
-    clear_fault(plant.par, plant.st)
+    clear_fault(plant.plant)
     plant.advance(20_000)
     assert plant.st["x"][0, :7] == pytest.approx(plant.x[:7], abs=1e-6)
 
@@ -84,13 +83,13 @@ def test_bolted_fault_in_the_steady_state(rest: Callable[..., Any]) -> None:
 def test_fault_on_a_tripped_plant_and_a_new_line(rest: Callable[..., Any]) -> None:
     """A bolted fault trips by current; the grid then feeds it alone through 0.8 of the line."""
     plant = rest(grid=WEAK)
-    fault(plant.par, plant.st, 0.2, 0.0)
+    fault(plant.plant, 0.2, 0.0)
     plant.advance(50)
     assert plant.truth()["trip"] == 1
-    grid_impedance(plant.par, plant.st, 2 * plant.par[0]["L_g"] / plant.par[0]["L_line_n"], 100.0)
+    grid_impedance(plant.plant, 2 * plant.par[0]["L_g"] / plant.par[0]["L_line_n"], 100.0)
     plant.advance(20_000)
     r = plant.par[0]
-    i_g = abs(complex(*plant.st["w"][0, I_G]))
+    i_g = abs(plant.phasor("beyond"))
     assert i_g == pytest.approx(1 / abs(0.8 * complex(r["R_g"], r["L_g"])), abs=1e-6)
     assert plant.truth()["V"] < 1e-6
 
@@ -108,7 +107,7 @@ def test_impossible_faults_change_nothing(
     rest: Callable[..., Any], at: float, R: float, duration: float | None, message: str
 ) -> None:
     plant = rest()
-    before = plant.par.copy(), plant.st.copy()
+    before = plant.plant.copy()
     with pytest.raises(ValueError, match=message):
-        fault(plant.par, plant.st, at, R, duration)
-    assert (plant.par, plant.st) == before
+        fault(plant.plant, at, R, duration)
+    assert plant.plant.records == before.records

@@ -23,7 +23,7 @@ def test_rests_where_it_starts(rest: Callable[..., Any]) -> None:
 def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
     """The converter's u is held, so its angle runs away from the grid's: both interact."""
     plant = rest(grid={"finite": GRID}, dc_source={"mode": "regulated"})
-    s, c = plant.st[0], GRID
+    s, c = plant.now[0], GRID
 
     def slope(_: float, z: Any) -> Any:
         w, P = z[8] - 1.0, z[9]
@@ -37,7 +37,7 @@ def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
             plant.par[0]["k_i"] * error,
         ]])  # fmt: skip
 
-    grid_load(plant.par, plant.st, 0.01)
+    grid_load(plant.plant, 0.01)
     P_set, load = float(s["P_set"]), float(s["P_load"])
     t = np.arange(1, 3001) * 1e-4
     z = np.concatenate([plant.x, [1.0, s["P_turbine"], plant.u[0]]])
@@ -57,7 +57,7 @@ def test_alone_it_settles_by_its_droop(rest: Callable[..., Any]) -> None:
     """Without the converter: -change / (1 / droop + D), by hand; the nadir lies lower."""
     local = {"load_R": 72.2, "load_L": 0.05}
     plant = rest(grid={"finite": GRID, **local}, dc_source={"mode": "regulated"})
-    breaker(plant.par, plant.st, closed=False)
+    breaker(plant.plant, closed=False)
     w = []
     for _ in range(100):
         plant.advance(1000)
@@ -71,9 +71,9 @@ def test_alone_it_settles_by_its_droop(rest: Callable[..., Any]) -> None:
 def test_wrong_grids(rest: Callable[..., Any]) -> None:
     own = rest(grid={"finite": GRID})
     with pytest.raises(ValueError, match=r"plant.grid.finite: such a grid sets its own frequency"):
-        grid_frequency(own.par, own.st, 0.99)
+        grid_frequency(own.plant, 0.99)
     with pytest.raises(ValueError, match=r"plant.grid.finite: not set"):
-        grid_load(rest().par, rest().st, 0.1)
+        grid_load(rest().plant, 0.1)
     fast = Plant.model_validate({"grid": {"finite": {"S": 1.0, "H": 1e-6}}})
     with pytest.raises(ValueError, match=r"plant.grid.finite: it swings at .* raise S, H"):
         make_plant(fast, 1e-4)

@@ -10,14 +10,13 @@ from scipy.integrate import solve_ivp
 
 from gfm_plant import breaker, grid_frequency, grid_impedance, grid_voltage, phase_jump
 from gfm_plant.model import DELTA
-from gfm_plant.solution import BRIDGE, I_LOAD
 
 LOAD = {"load_R": 72.2, "load_L": 0.05}  # 2 p.u. and 0.43512 p.u.
 
 
 def load_current(plant: Any) -> complex:
     """Of the local load, in the converter's frame."""
-    return complex(*plant.st["w"][0, I_LOAD]) / complex(*plant.st["unit"][0, BRIDGE])
+    return plant.phasor("load")
 
 
 def test_start_values(rest: Callable[..., Any]) -> None:
@@ -29,7 +28,7 @@ def test_start_values(rest: Callable[..., Any]) -> None:
 
 def test_frequency_step_turns_the_angle(rest: Callable[..., Any]) -> None:
     plant = rest()
-    grid_frequency(plant.par, plant.st, 0.999)
+    grid_frequency(plant.plant, 0.999)
     before = plant.truth()["delta"]
     plant.advance(10)
     # Eq. (7): delta' = omega_b (omega_u - omega_g) = 0.314 rad/s for 1 ms
@@ -39,7 +38,7 @@ def test_frequency_step_turns_the_angle(rest: Callable[..., Any]) -> None:
 @pytest.mark.parametrize(("goal", "sign"), [(0.998, -1), (1.002, 1)])
 def test_frequency_ramp(rest: Callable[..., Any], goal: float, sign: int) -> None:
     plant = rest()
-    grid_frequency(plant.par, plant.st, goal, rate=0.1)
+    grid_frequency(plant.plant, goal, rate=0.1)
     values = []
     for _ in range(300):
         values.append(plant.truth()["omega_g"])
@@ -51,14 +50,14 @@ def test_frequency_ramp(rest: Callable[..., Any], goal: float, sign: int) -> Non
 
 def test_voltage_step_ramp_and_sag(rest: Callable[..., Any]) -> None:
     plant = rest()
-    grid_voltage(plant.st, 0.9)
+    grid_voltage(plant.plant, 0.9)
     assert plant.truth()["V_g"] == 0.9
-    grid_voltage(plant.st, 1.0, rate=10.0)
+    grid_voltage(plant.plant, 1.0, rate=10.0)
     plant.advance(50)
     assert plant.truth()["V_g"] == pytest.approx(0.95)
     plant.advance(60)
     assert plant.truth()["V_g"] == 1.0
-    grid_voltage(plant.st, 0.7, duration=0.0123)
+    grid_voltage(plant.plant, 0.7, duration=0.0123)
     plant.advance(122)
     assert plant.truth()["V_g"] == 0.7
     plant.advance(1)
@@ -67,24 +66,24 @@ def test_voltage_step_ramp_and_sag(rest: Callable[..., Any]) -> None:
 
 def test_sag_within_a_sag_recovers_to_before_both(rest: Callable[..., Any]) -> None:
     plant = rest()
-    grid_voltage(plant.st, 0.8, duration=0.01)
+    grid_voltage(plant.plant, 0.8, duration=0.01)
     plant.advance(5)
-    grid_voltage(plant.st, 0.6, duration=0.001)
+    grid_voltage(plant.plant, 0.6, duration=0.001)
     plant.advance(10)
     assert plant.truth()["V_g"] == 1.0
 
 
 def test_step_within_a_sag_cancels_the_recovery(rest: Callable[..., Any]) -> None:
     plant = rest()
-    grid_voltage(plant.st, 0.8, duration=0.001)
-    grid_voltage(plant.st, 0.95)
+    grid_voltage(plant.plant, 0.8, duration=0.001)
+    grid_voltage(plant.plant, 0.95)
     plant.advance(20)
     assert plant.truth()["V_g"] == 0.95
 
 
 def test_phase_jump_of_the_grid(rest: Callable[..., Any]) -> None:
     plant = rest()
-    phase_jump(plant.st, 10.0)
+    phase_jump(plant.plant, 10.0)
     assert plant.truth()["delta"] == pytest.approx(plant.x[DELTA] - math.radians(10))
     plant.advance(5)
     assert plant.truth()["p"] < 0.5  # a leading grid takes less power
@@ -92,7 +91,7 @@ def test_phase_jump_of_the_grid(rest: Callable[..., Any]) -> None:
 
 def test_a_full_turn_changes_nothing(rest: Callable[..., Any]) -> None:
     plant = rest()
-    phase_jump(plant.st, 360.0)
+    phase_jump(plant.plant, 360.0)
     plant.advance(100)
     assert plant.truth()["p"] == pytest.approx(0.5, abs=1e-9)
 
@@ -100,7 +99,7 @@ def test_a_full_turn_changes_nothing(rest: Callable[..., Any]) -> None:
 def test_impedance_change_is_a_factor_on_the_nominal_line(rest: Callable[..., Any]) -> None:
     plant = rest(factors={"L_g": 2.0})
     current = plant.st["x"][0, 4:6].copy()
-    grid_impedance(plant.par, plant.st, 5.0, 3.0)
+    grid_impedance(plant.plant, 5.0, 3.0)
     assert plant.par[0]["L_g"] == pytest.approx(5 * 0.0174049446)
     assert plant.par[0]["R_g"] == pytest.approx(3 * 0.06 / 36.1)
     assert plant.st["x"][0, 4:6] == pytest.approx(current, abs=1e-15)
@@ -110,14 +109,14 @@ def test_impedance_change_is_a_factor_on_the_nominal_line(rest: Callable[..., An
 
 def test_breaker_conserves_flux(rest: Callable[..., Any]) -> None:
     plant = rest(grid=LOAD)
-    L_g, L_load = plant.par[0]["L_g"], plant.par[0]["L_load"]
+    L_g, L_load = plant.par[0]["L_g"], plant.plant.wiring.branches[0].L
     assert L_load == pytest.approx(0.4351236)
     i_o, i_load = complex(*plant.st["x"][0, 4:6]), load_current(plant)
     assert abs(i_load) == pytest.approx(1 / math.hypot(2.0, 0.4351236))
-    breaker(plant.par, plant.st, closed=False)
+    breaker(plant.plant, closed=False)
     current = (L_g * i_o + L_load * i_load) / (L_g + L_load)
     assert complex(*plant.st["x"][0, 4:6]) == pytest.approx(current)
-    breaker(plant.par, plant.st, closed=True)
+    breaker(plant.plant, closed=True)
     assert complex(*plant.st["x"][0, 4:6]) == pytest.approx(current)
     assert load_current(plant) == pytest.approx(current)
     assert plant.par[0]["L_g"] == L_g
@@ -134,14 +133,14 @@ def test_local_load_rests_while_the_breaker_is_closed(rest: Callable[..., Any]) 
 def test_local_load_follows_the_grid(rest: Callable[..., Any]) -> None:
     """Against SciPy: L_load di/dt = omega_b (v_g - R_load i) - j omega_b omega_u L_load i."""
     plant = rest(grid=LOAD)
-    r = plant.par[0]
+    (load,) = plant.plant.wiring.branches
     start = load_current(plant)
-    grid_voltage(plant.st, 0.5)
+    grid_voltage(plant.plant, 0.5)
     plant.advance(100)
     w, v_g = 100 * math.pi, 0.5 * np.exp(-1j * plant.x[DELTA])
 
     def slope(_: float, i: Any) -> Any:
-        return w / r["L_load"] * (v_g - r["R_load"] * i) - 1j * w * i
+        return w / load.L * (v_g - load.R * i) - 1j * w * i
 
     exact = solve_ivp(slope, (0, 0.01), [start], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
     assert load_current(plant) == pytest.approx(exact, abs=1e-10)
@@ -150,8 +149,8 @@ def test_local_load_follows_the_grid(rest: Callable[..., Any]) -> None:
 def test_island_runs_at_the_converters_frequency(rest: Callable[..., Any]) -> None:
     """Its waveform in a fixed frame rotates at omega_u, independent of the disconnected grid."""
     plant = rest(dc_source={"mode": "regulated"}, grid=LOAD)
-    breaker(plant.par, plant.st, closed=False)
-    grid_frequency(plant.par, plant.st, 0.9)
+    breaker(plant.plant, closed=False)
+    grid_frequency(plant.plant, 0.9)
     u = plant.near(omega_u=0.02)
     plant.advance(10_000, u)  # 1 s: transients have decayed
     x = plant.st["x"][0]
@@ -168,8 +167,8 @@ def test_island_runs_at_the_converters_frequency(rest: Callable[..., Any]) -> No
 
 def test_impedance_change_of_an_island(rest: Callable[..., Any]) -> None:
     plant = rest(grid=LOAD)
-    breaker(plant.par, plant.st, closed=False)
-    grid_impedance(plant.par, plant.st, 2.0, 1.0)
+    breaker(plant.plant, closed=False)
+    grid_impedance(plant.plant, 2.0, 1.0)
     plant.advance(10_000)  # transients have decayed: line and load are in series
     x = plant.st["x"][0]
     Z = complex(2.0 + 0.06 / 36.1, 0.4351236 + 2 * 0.0174049446)
@@ -179,22 +178,22 @@ def test_impedance_change_of_an_island(rest: Callable[..., Any]) -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (lambda p: grid_frequency(p.par, p.st, 0.0), "omega_g = 0.0: must be > 0"),
-        (lambda p: grid_frequency(p.par, p.st, 1.0, rate=-1.0), "rate = -1.0: must be > 0"),
-        (lambda p: grid_voltage(p.st, -0.1), "V_g = -0.1: must be >= 0"),
-        (lambda p: grid_voltage(p.st, 0.5, duration=0.0), "duration = 0.0: must be > 0"),
-        (lambda p: grid_voltage(p.st, 0.5, 1.0, 1.0), "rate = 1.0, duration = 1.0: give one"),
-        (lambda p: phase_jump(p.st, math.inf), "degrees = inf: must be finite"),
-        (lambda p: grid_impedance(p.par, p.st, 0.0, 1.0), "L_g = 0.0: must be a factor > 0"),
-        (lambda p: grid_impedance(p.par, p.st, 1e-9, 0.0), "fastest mode"),
-        (lambda p: breaker(p.par, p.st, closed=False), "load_R, plant.grid.load_L: not set"),
+        (lambda p: grid_frequency(p.plant, 0.0), "omega_g = 0.0: must be > 0"),
+        (lambda p: grid_frequency(p.plant, 1.0, rate=-1.0), "rate = -1.0: must be > 0"),
+        (lambda p: grid_voltage(p.plant, -0.1), "V_g = -0.1: must be >= 0"),
+        (lambda p: grid_voltage(p.plant, 0.5, duration=0.0), "duration = 0.0: must be > 0"),
+        (lambda p: grid_voltage(p.plant, 0.5, 1.0, 1.0), "rate = 1.0, duration = 1.0: give one"),
+        (lambda p: phase_jump(p.plant, math.inf), "degrees = inf: must be finite"),
+        (lambda p: grid_impedance(p.plant, 0.0, 1.0), "L_g = 0.0: must be a factor > 0"),
+        (lambda p: grid_impedance(p.plant, 1e-9, 0.0), "fastest mode"),
+        (lambda p: breaker(p.plant, closed=False), "load_R, plant.grid.load_L: not set"),
     ],
 )
 def test_impossible_actions_change_nothing(
     rest: Callable[..., Any], action: Callable[[Any], None], message: str
 ) -> None:
     plant = rest()
-    before = plant.par.copy(), plant.st.copy()
+    before = plant.plant.copy()
     with pytest.raises(ValueError, match=message):
         action(plant)
-    assert (plant.par, plant.st) == before
+    assert plant.plant.records == before.records

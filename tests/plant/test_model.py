@@ -16,7 +16,7 @@ D = np.array([0.998, 0.97])
 
 @pytest.fixture
 def par() -> NDArray[np.void]:
-    return make_plant(Plant(), 1e-4)[0]
+    return make_plant(Plant(), 1e-4).par
 
 
 def test_as_printed_in_the_paper(par: NDArray[np.void]) -> None:

@@ -89,10 +89,10 @@ def test_boards_of_the_rig() -> None:
 
 def test_the_line_by_its_short_circuit_ratio() -> None:
     """SCR = 2 and X/R = 10, by hand: 1/2 p.u. = sqrt(R^2 + X^2) with X = 10 R."""
-    par, _ = make_plant(Plant.model_validate({"grid": {"scr": 2.0, "x_over_r": 10.0}}), 1e-4)
+    par = make_plant(Plant.model_validate({"grid": {"scr": 2.0, "x_over_r": 10.0}}), 1e-4).par
     assert par["R_g"][0] == pytest.approx(0.0497518595, rel=1e-9)
     assert par["L_g"][0] == pytest.approx(0.497518595, rel=1e-9)
-    assert par["L_line_n"][0] == make_plant(Plant(), 1e-4)[0]["L_g"][0]  # of the file, for events
+    assert par["L_line_n"][0] == make_plant(Plant(), 1e-4).par["L_g"][0]  # of the file, for events
 
 
 @pytest.mark.parametrize(

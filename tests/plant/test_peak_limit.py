@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gfm_plant import Plant, make_plant, plant_advance, plant_equilibrium, plant_init
+from gfm_plant import Plant, make_plant, plant_advance, plant_equilibrium
 from gfm_plant.grid import fault
 
 T_S, LIMIT = 1e-4, 2.0
@@ -15,15 +15,15 @@ def current(i_peak: float | None, R: float, modulation: str = "space-vector") ->
     """|i| of a bridge that goes on as before while its terminal is short-circuited through R."""
     options = {"i_peak": i_peak, "modulation": modulation, "grid": {"scr": 3.0, "x_over_r": 6}}
     off = {name: {"enabled": False} for name in ("over_current", "under_voltage")}
-    par, st = make_plant(Plant.model_validate({**options, "protection": off}), T_S)
-    x, u = plant_equilibrium(par, 0.5, 1.0)
-    plant_init(par, st, x, u)
+    plant = make_plant(Plant.model_validate({**options, "protection": off}), T_S)
+    x, u = plant_equilibrium(plant.par, 0.5, 1.0)
+    plant.start(x, u)
     seen = []
     for k in range(300):
         if k == 20:
-            fault(par, st, 0.0, R, 0.01)
-        plant_advance(par, st, u)
-        seen.append(np.hypot(*st["x"][0, :2]))
+            fault(plant, 0.0, R, 0.01)
+        plant_advance(plant.records, u)
+        seen.append(np.hypot(*plant.st["x"][0, :2]))
     return np.array(seen)
 
 

@@ -33,10 +33,10 @@ def test_trip_after_its_time(
     plant = rest(protection={name: {"threshold": threshold, "delay_s": 0.002}})
     plant.advance(20)  # first seen at tick 1, so 1.9 ms have passed
     assert plant.truth()["trip"] == 0
-    assert trip_reason(plant.st, plant.par) == ""
+    assert trip_reason(plant.plant.records) == ""
     plant.advance(1)
     assert TRIP_REASONS[int(plant.truth()["trip"])] == name.replace("_", "-")
-    reason = trip_reason(plant.st, plant.par)
+    reason = trip_reason(plant.plant.records)
     assert reason.startswith(text)
     assert reason.endswith("p.u. for 0.002 s at tick 21 (t = 0.0021 s)")
     assert plant.truth()["i"] == 0.0
@@ -87,7 +87,7 @@ def test_command_that_is_no_number(rest: Callable[..., Any], bad: float) -> None
     plant = rest()
     plant.advance(3)
     plant.advance(1, np.array([0.5, 1.0, bad]))
-    assert trip_reason(plant.st, plant.par).startswith(
+    assert trip_reason(plant.plant.records).startswith(
         f"command not finite: u held {bad} at tick 3"
     )
     plant.advance(10)
@@ -115,7 +115,7 @@ def test_divergence_leaves_finite_values(rest: Callable[..., Any], u: list[float
     plant = rest(protection=OFF, sensors={"bandwidth_hz": 1000.0})
     plant.advance(2000, np.array(u))
     assert plant.truth()["trip"] == code_of("diverged")
-    assert "diverged: the state left the range of the model" in trip_reason(plant.st, plant.par)
+    assert "diverged: the state left the range of the model" in trip_reason(plant.plant.records)
     assert np.isfinite(plant.sample()).all()
     assert np.isfinite(list(plant.truth().values())).all()
 
@@ -125,9 +125,9 @@ def test_a_blocked_plant_outlives_a_grid_beyond_the_model(rest: Callable[..., An
     plant, other = rest(), rest()
     for one in (plant, other):
         one.advance(1, np.array([0.5, 1.0, math.nan]))
-    grid_voltage(plant.st, 1e9)
+    grid_voltage(plant.plant, 1e9)
     plant.advance(20)
-    grid_voltage(plant.st, 1.0)
+    grid_voltage(plant.plant, 1.0)
     plant.advance(1)
     assert plant.truth()["V"] < 2.0
     for one in (plant, other):

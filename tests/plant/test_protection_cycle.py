@@ -20,27 +20,27 @@ HIGH = {"over_current": {"threshold": 100.0}}
 
 
 @njit
-def look(par: Any, st: Any, i: Any, v: Any, seen: Any) -> None:
+def look(plant: Any, i: Any, v: Any, seen: Any) -> None:
     """Show the protection currents (n,) and voltages (n, 2), and keep what it makes of them."""
-    r, s = par[0], st[0]
+    s, now = plant.st[0], plant.now[0]
     for k in range(len(i)):
         s.tick += 1
         s.x[0], s.x[1] = i[k], 0.0
-        s.w[1, 0], s.w[1, 1] = v[k, 0], v[k, 1]
+        now.w[1, 0], now.w[1, 1] = v[k, 0], v[k, 1]
         s.x[2], s.x[3] = 1.0, 0.0
-        protect(r, s)
+        protect(plant, 0)
         seen[k, 0], seen[k, 1], seen[k, 2] = s.i_rms, s.omega_v, s.trip
 
 
 def shown(i: Any, angle: Any = 0.0, size: Any = 1.0, T_s: float = 1e-4, **protection: Any) -> Any:
     """RMS, frequency and trip, shape (n,) each, and the plant."""
     n = max(np.size(i), np.size(angle))
-    par, st = make_plant(Plant.model_validate({"protection": {**HIGH, **protection}}), T_s)
+    plant = make_plant(Plant.model_validate({"protection": {**HIGH, **protection}}), T_s).records
     angle, size = np.broadcast_to(angle, n), np.broadcast_to(size, n)
     v = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
     seen = np.empty((n, 3))
-    look(par, st, np.broadcast_to(np.asarray(i, float), n).copy(), v, seen)
-    return seen[:, 0], seen[:, 1], seen[:, 2], par, st
+    look(plant, np.broadcast_to(np.asarray(i, float), n).copy(), v, seen)
+    return seen[:, 0], seen[:, 1], seen[:, 2], plant
 
 
 @pytest.mark.parametrize("T_s", [1e-4, 2.5e-5, 1e-3])
@@ -73,31 +73,31 @@ def test_the_overload_profile_one_percent_above_and_below(
     current = factor * threshold
     before = 1000
     i = np.concatenate([np.full(before, 1.0), np.full(8000, current)])
-    *_, trip, par, st = shown(i, overload=PROFILE[step : step + 1])
+    *_, trip, plant = shown(i, overload=PROFILE[step : step + 1])
     if not trips:
         assert not trip.any()
         return
     crossing = CYCLE * (threshold**2 - 1) / (current**2 - 1)
     at = before + math.floor(crossing) + 1 + round(delay * 1e4)
     assert TRIP_REASONS[int(trip[-1])] == "overload"
-    assert int(st[0]["trip_tick"]) == pytest.approx(at, abs=1)
-    assert trip_reason(st, par).startswith(f"overload: RMS of i over a cycle = {current:.3g}"[:33])
-    assert f"> {threshold:g} p.u. for {delay:g} s at tick" in trip_reason(st, par)
+    assert int(plant.st[0]["trip_tick"]) == pytest.approx(at, abs=1)
+    assert trip_reason(plant).startswith(f"overload: RMS of i over a cycle = {current:.3g}"[:33])
+    assert f"> {threshold:g} p.u. for {delay:g} s at tick" in trip_reason(plant)
 
 
 def test_each_step_of_the_profile_has_its_own_time() -> None:
     short = np.concatenate([np.full(1000, 1.0), np.full(350, 2.5), np.full(8000, 1.5)])
-    *_, trip, _, _ = shown(short, overload=PROFILE)  # 35 ms of 2.5 p.u.
+    *_, trip, _ = shown(short, overload=PROFILE)  # 35 ms of 2.5 p.u.
     assert not trip.any()
     between = np.concatenate([np.full(1000, 1.0), np.full(8000, 1.8)])
-    *_, trip, par, st = shown(between, overload=PROFILE)
-    assert "> 1.6 p.u. for 0.5 s" in trip_reason(st, par)
+    *_, trip, plant = shown(between, overload=PROFILE)
+    assert "> 1.6 p.u. for 0.5 s" in trip_reason(plant)
 
 
 @pytest.mark.parametrize("omega", [0.94, 1.0, 1.06])
 def test_the_frequency_of_the_voltage(omega: float) -> None:
     turn = 100 * np.pi * (omega - 1.0) * np.arange(3000) * 1e-4  # in a frame of 50 Hz
-    _, found, trip, par, st = shown(1.0, turn, frequency="voltage", over_frequency={
+    _, found, trip, plant = shown(1.0, turn, frequency="voltage", over_frequency={
         "threshold": 1.05, "delay_s": 0.05}, under_frequency={"threshold": 0.95, "delay_s": 0.05},
     )  # fmt: skip
     assert found[1:] == pytest.approx(omega, abs=1e-12)
@@ -105,10 +105,10 @@ def test_the_frequency_of_the_voltage(omega: float) -> None:
         assert not trip.any()
     else:
         side = "over" if omega > 1 else "under"
-        assert trip_reason(st, par).startswith(
+        assert trip_reason(plant).startswith(
             f"{side}-frequency: omega of V over a cycle = {omega:g} p.u. "
         )
-        assert int(st[0]["trip_tick"]) == pytest.approx(502, abs=1)
+        assert int(plant.st[0]["trip_tick"]) == pytest.approx(502, abs=1)
 
 
 def test_an_offset_of_the_line_and_a_voltage_that_is_gone_are_no_frequency() -> None:
@@ -139,7 +139,7 @@ def test_a_sag_through_which_the_profile_lets_the_plant_ride(rest: Callable[...,
     for protection, code in ((at_once, "over-current"), ({"overload": PROFILE}, "none")):
         plant = rest(protection={**HIGH, **protection})
         plant.advance(400)
-        grid_voltage(plant.st, 0.95, None, 0.003)
+        grid_voltage(plant.plant, 0.95, None, 0.003)
         plant.advance(400)
         assert TRIP_REASONS[int(plant.truth()["trip"])] == code
 

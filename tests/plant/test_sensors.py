@@ -88,11 +88,11 @@ def test_noise_depends_on_seed_tick_and_channel_alone() -> None:
     options = {"noise_std": {"p": 0.01, "q": 0.01}, "seed": 7}
     samples = []
     for ticks in (5, 1000, 5):
-        par, st = make_plant(Plant.model_validate({"sensors": options}), 1e-4)
-        st["tick"] = ticks
+        plant = make_plant(Plant.model_validate({"sensors": options}), 1e-4).records
+        plant.st["tick"] = ticks
         y = np.empty(5)
-        plant_sample(par, st, y)
-        plant_sample(par, st, y)  # sampling again draws no new noise
+        plant_sample(plant, 0, y)
+        plant_sample(plant, 0, y)  # sampling again draws no new noise
         samples.append(y)
     assert (samples[0] == samples[2]).all()
     assert samples[0][1] != samples[1][1]

@@ -11,7 +11,6 @@ from gfm_plant import (
     make_plant,
     plant_advance,
     plant_equilibrium,
-    plant_init,
 )
 from gfm_plant.model import f, g
 
@@ -19,7 +18,7 @@ from gfm_plant.model import f, g
 @pytest.mark.parametrize("P", [-1.0, 0.0, 0.5, 1.0])
 @pytest.mark.parametrize(("V", "V_g", "omega_g"), [(1.0, 1.0, 1.0), (1.05, 0.95, 0.98)])
 def test_it_rests(P: float, V: float, V_g: float, omega_g: float) -> None:
-    par, _ = make_plant(Plant(), 1e-4)
+    par = make_plant(Plant(), 1e-4).par
     x, u = plant_equilibrium(par, P, V, V_g, omega_g)
     assert np.abs(f(x, u, np.array([omega_g, V_g]), par)).max() < 1e-8
     y = g(x, u)
@@ -27,17 +26,17 @@ def test_it_rests(P: float, V: float, V_g: float, omega_g: float) -> None:
 
 
 def test_emulator_stays_there() -> None:
-    par, st = make_plant(Plant(), 1e-4)
-    x, u = plant_equilibrium(par, 0.5, 1.0)
-    plant_init(par, st, x, u)
+    plant = make_plant(Plant(), 1e-4)
+    x, u = plant_equilibrium(plant.par, 0.5, 1.0)
+    plant.start(x, u)
     for _ in range(1000):
-        plant_advance(par, st, u)
-    assert st["x"][0] == pytest.approx(x, abs=1e-12)
+        plant_advance(plant.records, u)
+    assert plant.st["x"][0] == pytest.approx(x, abs=1e-12)
 
 
 def test_against_phasors() -> None:
     """The bridge voltage behind the filter, by circuit theory."""
-    par, _ = make_plant(Plant(), 1e-4)
+    par = make_plant(Plant(), 1e-4).par
     r = par[0]
     x, u = plant_equilibrium(par, 0.8, 1.02)
     v, i_o = complex(x[2], x[3]), complex(x[4], x[5])
@@ -49,7 +48,7 @@ def test_against_phasors() -> None:
 
 @pytest.mark.parametrize("factor", [1.0, 10.0, 50.0])
 def test_up_to_the_limit_of_the_line(factor: float) -> None:
-    par, _ = make_plant(Plant(factors={"L_g": factor, "R_g": factor}), 1e-4)
+    par = make_plant(Plant(factors={"L_g": factor, "R_g": factor}), 1e-4).par
     R, X = par[0]["R_g"], par[0]["L_g"]
     Z = math.hypot(R, X)
     most = R / Z**2 + 1 / Z
@@ -61,6 +60,6 @@ def test_up_to_the_limit_of_the_line(factor: float) -> None:
 
 
 def test_no_voltage() -> None:
-    par, _ = make_plant(Plant(), 1e-4)
+    par = make_plant(Plant(), 1e-4).par
     with pytest.raises(NoEquilibrium, match="all must be > 0"):
         plant_equilibrium(par, 0.5, 1.0, V_g=0.0)

@@ -36,8 +36,8 @@ TURN = cmath.exp(1j * math.pi / 3)
 )
 def test_sequences(rest: Callable[..., Any], phases: Any, positive: float, negative: float) -> None:
     plant = rest()
-    grid_unbalance(plant.par, plant.st, phases)
-    found = [abs(complex(*row)) for row in plant.st["sequence"][0]]
+    grid_unbalance(plant.plant, phases)
+    found = [abs(complex(*row)) for row in plant.now["sequence"][0]]
     assert found == pytest.approx([positive, negative], abs=1e-12)
 
 
@@ -45,11 +45,11 @@ def test_each_sequence_meets_its_own_impedances(rest: Callable[..., Any]) -> Non
     """After the transients, by phasors: the bridge is a short circuit to the negative sequence."""
     plant = rest(grid=WEAK, protection=OFF, dc_source={"mode": "regulated"})
     plant.advance(7)
-    grid_unbalance(plant.par, plant.st, (1.0, 0.5, 0.5))
+    grid_unbalance(plant.plant, (1.0, 0.5, 0.5))
     plant.advance(30_000)
     v = np.empty(200, complex)  # of one cycle, in the frame that turns at nominal frequency
     for k in range(200):
-        v[k] = complex(*plant.st["w"][0, V])
+        v[k] = complex(*plant.now["w"][0, V])
         plant.advance()
     r = plant.par[0]
     Z_f, Z_g = complex(r["R_f"], -r["L_f"]), complex(r["R_g"], -r["L_g"])
@@ -81,9 +81,9 @@ def test_transient_and_clearing_against_the_equations(rest: Callable[..., Any]) 
         ]
         return r["omega_b"] * (np.array(rates) - 1j * w)
 
-    grid_unbalance(plant.par, plant.st, (0.0, 1.0, 1.0), duration=0.01)
+    grid_unbalance(plant.plant, (0.0, 1.0, 1.0), duration=0.01)
     plant.advance(50)
-    phase_jump(plant.st, 20.0)
+    phase_jump(plant.plant, 20.0)
     plant.advance(150)
     w = x[0:6:2] + 1j * x[1:6:2]
     for begin, end in ((0.0, 0.005), (0.005, 0.01), (0.01, 0.02)):
@@ -91,12 +91,12 @@ def test_transient_and_clearing_against_the_equations(rest: Callable[..., Any]) 
         w = solve_ivp(slope, span, w, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     found = plant.st["x"][0, 0:6:2] + 1j * plant.st["x"][0, 1:6:2]
     np.testing.assert_allclose(found, w, atol=1e-8)
-    assert plant.st["unbalance_left"][0] == 0.0
+    assert plant.now["unbalance_left"][0] == 0.0
 
 
 def test_the_dc_link_ripples_at_twice_the_frequency(rest: Callable[..., Any]) -> None:
     plant = rest(grid=WEAK, protection=OFF, dc_source={"mode": "regulated"})
-    grid_unbalance(plant.par, plant.st, (1.0, 0.7, 1.0))
+    grid_unbalance(plant.plant, (1.0, 0.7, 1.0))
     plant.advance(20_000)
     v_dc = []
     for _ in range(2000):
@@ -108,9 +108,9 @@ def test_the_dc_link_ripples_at_twice_the_frequency(rest: Callable[..., Any]) ->
 
 def test_impossible_factors_change_nothing(rest: Callable[..., Any]) -> None:
     plant = rest()
-    before = plant.st.copy()
+    before = plant.plant.copy()
     with pytest.raises(ValueError, match=r"duration = 0.0: must be > 0"):
-        grid_unbalance(plant.par, plant.st, (1.0, 0.5, 1.0), duration=0.0)
+        grid_unbalance(plant.plant, (1.0, 0.5, 1.0), duration=0.0)
     with pytest.raises(ValueError, match="phases = nan: must be finite"):
-        grid_unbalance(plant.par, plant.st, (1.0, math.nan, 1.0))
-    assert plant.st == before
+        grid_unbalance(plant.plant, (1.0, math.nan, 1.0))
+    assert plant.plant.records == before.records

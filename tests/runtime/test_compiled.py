@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numba.core.caching import IndexDataCacheFile
 from numba.core.errors import TypingError
 
 from gfm_runtime.compiled import compiled, inlined
@@ -55,3 +56,13 @@ def test_other_functions_keep_numbas_own_rule(tmp_path: Path) -> None:
     file.write_text("x = 1\n")
     theirs = SimpleNamespace(_py_file=str(file))
     assert _stamp(theirs) == _own_stamp(theirs)
+
+
+def test_a_cache_that_names_a_type_of_an_older_version_is_as_good_as_none(tmp_path: Path) -> None:
+    index = IndexDataCacheFile(str(tmp_path), "tick", "stamp")
+    kept = type("Gone", (), {"__module__": __name__})
+    globals()["Gone"] = kept
+    index._save_index({"signature": kept})
+    assert index._load_index() == {"signature": kept}
+    del globals()["Gone"]
+    assert index._load_index() == {}

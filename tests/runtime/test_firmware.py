@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,51 +15,69 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.cli import main
-from gfm_runtime import Law, LawError, LawSet, get_law
+from gfm_runtime import Law, LawError, LawSet, get_law, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
-from gfm_runtime.firmware.c_text import literal, plain
+from gfm_runtime.firmware.c_text import chosen, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SWITCH
-from gfm_runtime.firmware.module import BAD_REF, INTEGERS, NUMBERS
+from gfm_runtime.firmware.module import BAD_REF, fields
 from gfm_runtime.firmware.report import read_report
-from gfm_runtime.inner import Inner
-from gfm_runtime.signals import NU, NY, group
+from gfm_runtime.firmware.stage import VARIABLES
+from gfm_runtime.inner import Inner, settle
+from gfm_runtime.signals import NU, NY, carried, group
 from gfm_runtime.states import OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
 
+from ..support.firmware import SOME, STAGED
 from ..support.laws import LAWS, repeatable
 
 T_S = 1e-4
-#: one of each error map, one without states, the most states
-SOME = ("vsg-1", "psc-dc", "dvoc", "hybrid-angle", "matching-2", "vsg-12")
+#: a few laws with inner stages
+SOME_STAGED = ("vsg-2 cascaded", "threshold-impedance d", "virtual-stator q", "no stage")
 
 
 def of(*names: str) -> dict[str, Law]:
-    return {name: LAWS[name] for name in names}
+    return {name: (LAWS | STAGED)[name] for name in names}
 
 
 def columns(rows: Any, real: str, *prefixes: str) -> list[Any]:
-    """Blocks of the columns whose names begin with a prefix, as numbers."""
+    """Blocks of the columns whose names begin with a prefix, as numbers; x are the law's states."""
+    found = [rf"{p}_{'[0-9]' * (p == 'x')}" for p in prefixes]
     return [
-        rows.words[:, [c.startswith(f"{p}_") for c in rows.columns]].view(real) for p in prefixes
+        rows.words[:, [bool(re.match(one, c)) for c in rows.columns]].view(real) for one in found
     ]
 
 
 # --- golden rows ---
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("name", LAWS)
-def test_golden_rows_are_what_the_controller_does(name: str) -> None:
-    """Rows in float64 against ``control``, the tick of the bench: u, states, refusals, changes."""
-    modules = make_modules(of(name), T_S, "float64")
+@pytest.mark.parametrize(
+    ("name", "real"),
+    [("vsg-2 cascaded", "float64")]
+    + [
+        pytest.param(name, real, marks=pytest.mark.full)
+        for name, real in [(n, "float64") for n in (*LAWS, *STAGED)]
+        + [(n, "float32") for n in (*SOME, *STAGED)]
+        if (name, real) != ("vsg-2 cascaded", "float64")
+    ],
+)
+def test_golden_rows_are_what_the_controller_does(name: str, real: str) -> None:
+    """Rows against ``control``, the tick of the bench: u, states, refusals, changes."""
+    law = (LAWS | STAGED)[name]
+    modules = make_modules({name: law}, T_S, real)
     rows = golden(modules, 2 * SHIPPED)
-    refs, ys, us, xs, trends = columns(rows, "f8", "ref", "y", "u", "x", "trend")
-    twins = [LawSet(n, (LAWS[name],)) for n in ("one", "other")]
-    bench = Controller(twins, T_S, refs[0])
-    bench.start(np.zeros(modules[0].n), np.array([s.default for s in group("u")]))
-    u = np.zeros(NU)
+    refs, ys, us, xs, trends = (
+        np.asarray(part, "f8") for part in columns(rows, real, "ref", "y", "u", "x", "trend")
+    )
+    twins = [LawSet(n, (law,)) for n in ("one", "other")]
+    bench = Controller(twins, T_S, refs[0], real=real)
+    start = np.array([s.default for s in group("u")])
+    bench.start(np.zeros(modules[0].n), start)
+    u, own = np.zeros(us.shape[1]), np.zeros(NU)
+    bench.states["pll"], bench.states["omega_pll"] = (1.0, 0.0), 1.0  # as init leaves them
+    bench.states["e"] = (start[2], 0.0)
+    variables = [(v, columns(rows, real, v)[0]) for v, size, _ in VARIABLES if size > 1]
     for k, (op, _, result) in enumerate(rows.words[:, :3]):
         assert (k == 0) == (op == INIT)
         if result == BAD_REF and bench.ctl["state"][0] == RUNNING:
@@ -68,8 +87,12 @@ def test_golden_rows_are_what_the_controller_does(name: str) -> None:
             bench.select("other" if bench.active == "one" else "one")
         if op == RESET:
             i = int(bench.ctl["active"][0])
-            u[:] = bench.states[i]["u"]
-            settle_into(bench.laws[i], bench.states[i], refs[k], ys[k], u, np.zeros(NU))
+            own[:] = bench.states[i]["u"]
+            settle_into(bench.laws[i], bench.states[i], refs[k], ys[k], own, np.zeros(NU))
+            if modules[0].stages:
+                one = slice(i, i + 1)
+                e = bench.states[i]["e"].astype(float)
+                settle(bench.laws[one], bench.states[one], own, ys[k], *e)
             bench.reset()
             bench.ctl["state"] = RUNNING
         control(bench.ctl, bench.laws, bench.states, bench.est, ys[k], u)
@@ -78,6 +101,8 @@ def test_golden_rows_are_what_the_controller_does(name: str) -> None:
         np.testing.assert_array_equal(us[k], u)
         np.testing.assert_array_equal(xs[k], state["x"][: xs.shape[1]])
         np.testing.assert_array_equal(trends[k], state["trend"])
+        for variable, values in variables if modules[0].stages else ():
+            np.testing.assert_array_equal(values[k], state[variable], variable)
 
 
 @pytest.mark.full
@@ -105,6 +130,45 @@ def test_golden_rows_reach_all_paths(real: str) -> None:
     assert np.ptp(ramps) < 1e-6 < abs(ramps[0])
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("name", [n for n in STAGED if n != "no stage"])
+def test_golden_rows_reach_all_paths_of_a_stage(name: str) -> None:
+    real = "float32"
+    module = make_modules(of(name), T_S, real)[0]
+    stage = module.law.inner if module.law else None
+    assert stage is not None
+    rows = golden([module], SHIPPED)
+    limited = rows.words[:, rows.columns.index("limited")] == 1
+    i_ref, e, i_f, pll = columns(rows, real, "i_ref", "e", "i_f", "pll")
+    assert 20 < limited.sum() < SHIPPED - 20
+    size = np.hypot(*i_ref.T.astype(float))
+    at_limit = np.isclose(size, stage.I_max, rtol=1e-6)
+    assert at_limit.any()
+    if stage.kind == "threshold-impedance":
+        assert (limited & ~at_limit).any() and (np.hypot(*i_f.T) < stage.I_thr).any()
+    else:
+        np.testing.assert_array_equal(limited, limited & at_limit)
+    most = stage.m * columns(rows, real, "y")[0][:, 0]
+    at_modulation = np.isclose(np.hypot(*e.T), most, rtol=1e-6)
+    assert at_modulation.any() and not at_modulation.all()
+    if math.isfinite(stage.P_max):
+        for side in ("x_high", "x_low"):
+            assert rows.words[:, rows.columns.index(side)].any(), side
+    x, y = columns(rows, real, "x", "y")
+    voltage = np.hypot(y[:, 7], y[:, 8])
+    assert (voltage < 0.05).any(), "the PLL holds its frequency"
+    if stage.f_pll:
+        assert len(np.unique(pll[:, 0])) > SHIPPED / 2
+    held = [i for i in range(module.n) if module.record["row"][i] == 2]
+    if stage.freeze and held:
+        ops = rows.words[:, 0]
+        running = limited[1:] & (ops[1:] == 0) & (rows.words[1:, 2] == OK)
+        still = np.all(x[1:, held] == x[:-1, held], axis=1)
+        assert still[running].mean() > 0.5 and not still[~limited[1:]].all()
+    away = columns(rows, real, "away")[0]
+    assert (away == 0).any() and (away != 0).any()
+
+
 def test_golden_rows_of_a_law_do_not_depend_on_their_number() -> None:
     modules = make_modules(of("dvoc"), T_S, "float32")
     few, many = golden(modules, SHIPPED), golden(modules, 2 * SHIPPED)
@@ -129,9 +193,10 @@ def test_a_literal_is_its_number_to_the_bit(value: float) -> None:
 
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("real", REALS)
-def test_the_code_calls_and_keeps_nothing_of_its_own(real: str, style: Any) -> None:
+@pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])
+def test_the_code_calls_and_keeps_nothing_of_its_own(laws: Any, real: str, style: Any) -> None:
     """No libm but sqrt and fabs, no malloc, no variable outside of a function."""
-    files = export(of(*SOME), T_S, real, style)
+    files = export(of(*laws), T_S, real, style)
     end = "f" if real == "float32" else ""
     for name, text in files.items():
         if not (name.startswith("gfm") and name.endswith(".c")):
@@ -178,19 +243,73 @@ def test_a_remark_cannot_end_its_comment() -> None:
     assert "int x" not in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
 
 
+CHOICE = """int f(void)
+{
+    /* @if one@ */
+        a();
+        /* @if two@ */
+            b();
+        /* @end@ */
+    /* @elif three@ */
+        c();
+    /* @else@ */
+        d();
+    /* @end@ */
+}
+/* @if two@ */
+int g(void);
+/* @end@ */
+"""
+
+
+def test_a_choice_is_made_or_left_to_c() -> None:
+    made = chosen(CHOICE, {"one": True, "two": True, "three": True})
+    assert made == "int f(void)\n{\n    a();\n    b();\n}\nint g(void);\n"
+    made = chosen(CHOICE, {"one": False, "two": False, "three": True})
+    assert made == "int f(void)\n{\n    c();\n}\n"
+    made = chosen(CHOICE, {"one": False, "two": "x", "three": False})
+    assert made == "int f(void)\n{\n    d();\n}\nint g(void);\n"
+    left = chosen(CHOICE, {"one": "p", "two": False, "three": "q"})
+    assert left == (
+        "int f(void)\n{\n    if (p) {\n        a();\n    } else if (q) {\n        c();\n"
+        "    } else {\n        d();\n    }\n}\n"
+    )
+
+
+def test_the_header_of_a_stage_is_the_signal_table() -> None:
+    text = export(of("vsg-2 cascaded", "no stage"), T_S, "float32", "unrolled")["gfm_no_stage.h"]
+    for letter, vector in (("Y", "y"), ("U", "u")):
+        found = re.findall(rf"^    GFM_NO_STAGE_{letter}_(\w+),", text, re.MULTILINE)
+        assert found == [name.upper() for name in carried(vector, True)]  # type: ignore[arg-type]
+    law = load_law("vsg-2", "cascaded").laws
+    text = export({"x": law[0]}, T_S, "float32", "records", 120 * math.pi)["gfm_x.h"]
+    assert "Inner stage at f_n = 60 Hz: cascaded, m = 1.3025508, freeze = True" in text
+    assert "k_v = 1.0" in text and "I_thr" not in text, "only what acts"
+
+
+def test_the_stage_is_that_of_the_converters_frequency() -> None:
+    at_50, at_60 = (
+        make_modules(of("virtual-stator d"), T_S, "float64", 2 * math.pi * f)[0].record
+        for f in (50.0, 60.0)
+    )
+    assert at_60["stator_b"] == pytest.approx(1.2 * at_50["stator_b"], rel=1e-15)
+    assert at_60["k_pll"] == pytest.approx(at_50["k_pll"] / 1.2, rel=1e-15)
+
+
 # --- report ---
 
 
 @pytest.mark.parametrize("real", REALS)
-def test_the_report_gives_the_records_back(real: str, tmp_path: Path) -> None:
-    files = export(of(*SOME), T_S, real, "records")
+@pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])
+def test_the_report_gives_the_records_back(laws: Any, real: str, tmp_path: Path) -> None:
+    files = export(of(*laws), T_S, real, "records")
     (tmp_path / "report.json").write_text(files["report.json"], encoding="utf-8")
     found = read_report(tmp_path)
     assert (found.real, found.style) == (real, "records")
-    for module, name in zip(found.modules, SOME, strict=True):
-        assert module.name == name
-        record = make_modules(of(name), T_S, real)[0].record
-        for field in (*INTEGERS, *NUMBERS):
+    for module, made in zip(found.modules, make_modules(of(*laws), T_S, real), strict=True):
+        assert (module.name, module.stages) == (made.name, made.stages)
+        record = made.record
+        for field in (name for part in fields(made.stages) for name in part):
             assert module.record[field].tobytes() == record[field].tobytes()
 
 
@@ -206,6 +325,28 @@ def test_the_report_counts_the_operations_as_by_hand() -> None:
         "comparisons": 3 * 2 + 6 + 10 + 6 + 1,  # limits, what fades, inputs (6 not symmetric), u
     }
     assert found["bytes"]["state"] == 4 * (1 + 3 + 3 + 3)
+
+
+def test_the_report_counts_the_operations_of_a_stage_as_by_hand() -> None:
+    """What a virtual stator adds; in brackets its equations in ``gfm_runtime.inner``."""
+    counts = []
+    for stage in (None, Inner("virtual-stator")):
+        law = replace(LAWS["droop-1"], inner=stage)
+        text = export({"x": law}, T_S, "float32", "unrolled")["report.json"]
+        counts.append(json.loads(text)["laws"][0])
+    plain, staged = counts
+    more = {name: staged["operations"][name] - n for name, n in plain["operations"].items()}
+    assert more == {
+        # low-passes, i* (b, r_d, r_q, size, i*), limit, current loop, modulation, away
+        "multiplications": 4 + (1 + 3 + 3 + 2 + 4) + (3 + 2) + 5 + (4 + 2) + 2,
+        # E, low-passes, i* (keep and lose, r_d, r_q, size, i*), limit, current loop, modulation,
+        # whether u is finite
+        "additions": 1 + 8 + (2 + 3 + 3 + 1 + 2) + 1 + 8 + 1 + 2,
+        "divisions": 2 + 1 + 1,
+        "square_roots": 1 + 1,
+        "comparisons": 1 + 1 + 2 + 6,  # limit, modulation, what fades, inputs
+    }
+    assert staged["bytes"]["state"] - plain["bytes"]["state"] == 4 * 19
 
 
 # --- refusals ---
@@ -226,23 +367,20 @@ def test_limits_that_are_not_finite_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("key", "value", "why"),
-    [("n", 13, "13 states"), ("n", -1, "-1 states"), ("error_map", 7, "error map 7"),
+    [("priority", 4, "priority = 4 is not possible"), ("k_c", "0x0p+0", "k_c = 0.0 is not"),
+     ("row", [0, 1], "is not as"), ("I_max", "inf", "I_max must be finite"),
+     ("n", 13, "13 states"), ("n", -1, "-1 states"), ("error_map", 7, "error map 7"),
      ("A", "nan", "is not as"), ("loop", "inf", "loop must be finite"),
      ("decay", "0x1p+9999", "is not as")],
 )  # fmt: skip
 def test_a_record_that_the_kernel_cannot_hold_is_refused(
     key: str, value: Any, why: str, tmp_path: Path
 ) -> None:
-    whole = json.loads(export(of("vsg-1"), T_S, "float32", "unrolled")["report.json"])
+    whole = json.loads(export(of("vsg-2 cascaded"), T_S, "float32", "unrolled")["report.json"])
     whole["laws"][0]["record"][key] = value
     (tmp_path / "report.json").write_text(json.dumps(whole), encoding="utf-8")
     with pytest.raises(LawError, match=why):
         read_report(tmp_path)
-
-
-def test_an_inner_stage_is_refused() -> None:
-    with pytest.raises(LawError, match=r"'x'.*inner stage"):
-        make_modules({"x": replace(LAWS["vsg-1"], inner=Inner("cascaded"))}, T_S, "float32")
 
 
 @pytest.mark.parametrize(
@@ -311,11 +449,21 @@ def test_the_command_writes_what_the_function_gives(
     assert [[int(w, 16) for w in line.split(",")] for line in lines[1:]] == rows.words.tolist()
 
 
+def test_the_command_exports_an_inner_stage(tmp_path: Path) -> None:
+    command = ["firmware", "export", "vsg-2", "droop-1", "--inner", "cascaded", "--f_n", "60"]
+    assert main([*command, "-o", str(tmp_path)]) == 0
+    laws = {name: load_law(name, "cascaded").laws[0] for name in ("vsg-2", "droop-1")}
+    for name, text in export(laws, T_S, "float32", "unrolled", 120 * math.pi).items():
+        assert (tmp_path / name).read_text(encoding="utf-8") == text
+
+
 def test_what_the_command_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, why in (
         (["golden", "vsg-1", "--ticks", "0"], "--ticks 0: must be at least 1"),
         (["export", "vsg-1", "vsg-1", "-o", str(tmp_path)], "law 'vsg-1': is named twice"),
         (["export", "vsg", "-o", str(tmp_path)], "law 'vsg': unknown"),
+        (["export", "vsg-1", "--inner", "cascade", "-o", str(tmp_path)], "did you mean 'cascaded'"),
+        (["export", "vsg-1", "--f_n", "0", "-o", str(tmp_path)], "--f_n 0: must be > 0 Hz"),
         (["export", "vsg-1", "--T_s", "0", "-o", str(tmp_path)], "T_s: 0.0 s must be > 0"),
     ):
         assert main(["firmware", *arguments]) == 2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_runtime import get_law
+from gfm_runtime import get_law, load_law
 from gfm_runtime.firmware import (
     CHECKED,
     REALS,
@@ -25,7 +25,7 @@ from gfm_runtime.firmware import (
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
-from ..support.firmware import T_S, cc, exported
+from ..support.firmware import STAGED, T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
@@ -48,10 +48,22 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], P
     }
 
 
-def differing(folder: Path, target: str, flags: str) -> int:
+@pytest.fixture(scope="module")
+def staged(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], Path]:
+    """A folder with laws with inner stages for each precision and style."""
+    return {
+        (real, style): exported(
+            tmp_path_factory.mktemp(f"staged-{style}-{real}"), real, style, of=STAGED
+        )
+        for real in REALS
+        for style in STYLES
+    }
+
+
+def differing(folder: Path, target: str, flags: str, of: Any = LAWS) -> int:
     """Words that differ over all laws; each law must have gone through all its rows."""
     found = check(folder, target, flags)
-    assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
+    assert [c.name for c in found] == list(of) and {c.rows for c in found} == {CHECKED}
     return sum(c.differ for c in found)
 
 
@@ -68,6 +80,19 @@ def test_every_law_has_the_kernels_bits(
     folders: Any, real: str, target: str, style: str, flags: str
 ) -> None:
     assert differing(folders[real, style], target, flags) == 0
+
+
+@pytest.mark.parametrize(
+    ("target", "real", "style", "flags"),
+    [
+        ("host", "float32", "unrolled", "-O2"), ("host", "float64", "records", "-O3"),
+        ("clang", "float64", "unrolled", "-O2"),
+    ],
+)  # fmt: skip
+def test_every_stage_has_the_kernels_bits(
+    staged: Any, real: str, target: str, style: str, flags: str
+) -> None:
+    assert differing(staged[real, style], target, flags, STAGED) == 0
 
 
 @pytest.mark.parametrize(
@@ -97,19 +122,23 @@ def test_a_change_of_gains_has_the_kernels_bits(tmp_path: Path, style: Any) -> N
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("real", REALS)
 def test_the_code_compiles_without_a_warning(
-    folders: Any, real: str, style: str, compiler: str
+    folders: Any, staged: Any, real: str, style: str, compiler: str
 ) -> None:
-    folder = folders[real, style]
-    sources = sorted(p.name for p in folder.glob("*.c"))
-    done = cc(folder, *STRICT, "-fsyntax-only", *sources, compiler=compiler)
-    assert (done.returncode, done.stderr) == (0, "")
+    for folder in (folders[real, style], staged[real, style]):
+        sources = sorted(p.name for p in folder.glob("*.c"))
+        done = cc(folder, *STRICT, "-fsyntax-only", *sources, compiler=compiler)
+        assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize(
+    ("style", "laws"),
+    [(style, laws) for style in STYLES for laws in (LAWS, STAGED)],
+    ids=[f"{style}-{laws}" for style in STYLES for laws in ("plain", "staged")],
+)
 def test_sanitizers_find_nothing_and_the_self_test_passes(
-    folders: Any, style: str, tmp_path: Path
+    folders: Any, staged: Any, style: str, laws: Any, tmp_path: Path
 ) -> None:
-    folder = folders["float32", style]
+    folder = (folders if laws is LAWS else staged)["float32", style]
     program = str(tmp_path / "selftest")
     done = cc(
         folder, *STRICT, "-O1", "-fsanitize=undefined,address,float-divide-by-zero",
@@ -118,15 +147,17 @@ def test_sanitizers_find_nothing_and_the_self_test_passes(
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     ran = subprocess.run([program], capture_output=True, text=True, check=False)
-    rows = golden(make_modules(LAWS, T_S, "float32"), 210)
+    rows = golden(make_modules(laws, T_S, "float32"), 210)
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout == f"{len(rows.words)} rows, 0 words differ\n"
 
 
 @pytest.mark.parametrize("real", REALS)
-def test_no_symbol_of_libm_but_sqrt(folders: Any, real: str, tmp_path: Path) -> None:
+def test_no_symbol_of_libm_but_sqrt(folders: Any, staged: Any, real: str, tmp_path: Path) -> None:
     folder = folders[real, "unrolled"]
     sources = [str(folder / f"gfm_{law}.c") for law in ("vsg_1", "psc_dc", "dvoc", "hybrid_angle")]
+    sources += [str(staged[real, "unrolled"] / "gfm_vsg_2_cascaded.c")]
+    sources += [str(staged[real, "records"] / "gfm.c")]
     for flags in ("-O0", "-O2"):
         assert cc(tmp_path, *STRICT, flags, "-c", *sources).returncode == 0
         objects = [p.name for p in tmp_path.glob("*.o")]
@@ -149,14 +180,16 @@ def test_what_would_change_bits_does_not_compile(folders: Any, flag: str, why: s
     assert done.returncode != 0 and why in done.stderr
 
 
-def test_the_page_s_example_compiles(folders: Any) -> None:
+def test_the_pages_examples_compile(tmp_path: Path) -> None:
     page = (PAGES / "firmware.md").read_text(encoding="utf-8")
-    code = re.search(r"```c\n(.*?)```", page, re.DOTALL)
-    assert code is not None
-    folder = folders["float32", "unrolled"]
-    (folder / "example.txt").write_text("void block_the_bridge(void);\n" + code[1])
-    done = cc(folder, *STRICT, "-fsyntax-only", "-x", "c", "example.txt")
-    assert (done.returncode, done.stderr) == (0, "")
+    plain, with_stage = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    exported(tmp_path, "float32", "unrolled", "vsg-1")
+    law = load_law("vsg-2", "cascaded").laws[0]
+    exported(tmp_path, "float32", "unrolled", of={"vsg-2": law})
+    for code in (plain, with_stage):
+        (tmp_path / "example.txt").write_text("void block_the_bridge(void);\n" + code)
+        done = cc(tmp_path, *STRICT, "-fsyntax-only", "-x", "c", "example.txt")
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_cmake_builds_a_folder(folders: Any, tmp_path: Path) -> None:

@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from gfm_hil.cli import main
+from gfm_runtime import load_law
 from gfm_runtime.firmware import CHECKED, TARGETS, check
+from gfm_runtime.inner_file import inner_names
 
-from ..support.firmware import cc, exported
+from ..support.firmware import STAGED, cc, exported
 from ..support.laws import LAWS
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
@@ -45,6 +47,45 @@ def test_every_law_has_the_kernels_bits_on_a_processor(
         counts = {c.name: c.instructions or (0, 0) for c in found}
         now = {c.name: ["{}…{}".format(*counts[c.name]), str(c.code)] for c in found}
         assert kept == now, "python docs/make_firmware_tables.py makes the table anew"
+
+
+@pytest.mark.parametrize(
+    ("target", "real", "style"),
+    [
+        ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
+        ("m7", "float64", "unrolled"),
+        pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
+    ],
+)  # fmt: skip
+def test_every_stage_has_the_kernels_bits_on_a_processor(
+    tmp_path: Path, target: str, real: str, style: str
+) -> None:
+    found = check(exported(tmp_path, real, style, of=STAGED), target)
+    assert [c.name for c in found] == list(STAGED) and {c.rows for c in found} == {CHECKED}
+    assert sum(c.differ for c in found) == 0
+
+
+def test_the_table_of_stages_is_what_is_measured(tmp_path: Path) -> None:
+    compiler = TARGETS["m4f"].prefix + TARGETS["m4f"].compiler
+    version = cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0]
+    if version not in (PAGES / "tables" / "firmware_laws.md").read_text(encoding="utf-8"):
+        pytest.skip(f"the tables are not of {version}")
+    table = (PAGES / "tables" / "firmware_stages.md").read_text(encoding="utf-8")
+    for stage in inner_names():
+        exported(tmp_path, "float32", "unrolled", of={"vsg-2": load_law("vsg-2", stage).laws[0]})
+        (one,) = check(tmp_path, "m4f")
+        assert one.instructions is not None
+        counted = "{}…{}".format(*one.instructions)
+        row = (
+            stage,
+            "m4f float32, unrolled",
+            counted,
+            one.code,
+            one.constants,
+            one.state,
+            one.stack,
+        )
+        assert f"| {' | '.join(map(str, row))} |" in table, "make_firmware_tables.py makes it anew"
 
 
 def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:

@@ -40,10 +40,10 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
     timeline = Timeline(b, folder / "events.jsonl", ROLES)
     columns = signals_of("plant", b.inner)
     rows = np.full((scenario.ticks, len(columns)), np.nan)
-    command, sent = b.u.copy(), []
+    command, sent, plant = b.u.copy(), [], b.plant.records
     for tick in range(scenario.ticks):
         timeline.carry_out(tick)
-        plant_sample(b.par, b.st, b.y)
+        plant_sample(plant, 0, b.y)
         if tick % every == 0:
             read = b.y.copy()
             through_cantools("y", read)
@@ -52,8 +52,8 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
             sent.append(command.copy())
             through_cantools("u", sent[-1])
         applied = sent[max(0, tick // every - (every > 1))]
-        record_sample(rows[tick], b.y, b.par, b.st)
+        record_sample(rows[tick], b.y, plant, 0)
         record_command(rows[tick], applied)
-        plant_advance(b.par, b.st, applied)
+        plant_advance(plant, applied)
     timeline.close()
     return {name: rows[:, j] for j, name in enumerate(columns)}

@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.model.linear import LinearLaw, LinearPlant, hold
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import Record
 from gfm_runtime.signals import NU
 
 Matrix = NDArray[np.float64]
 
 
-def reference_loop(par: PlantRecord, plant: LinearPlant, law: LinearLaw) -> Matrix:
+def reference_loop(par: Record, plant: LinearPlant, law: LinearLaw) -> Matrix:
     """The loop's matrix from tick to tick; state: plant, law, u[k-1], u[k-2], ..."""
     r = par[0]
-    old = r["stretch"][0]  # time for which u[k-delay-1] acts, then u[k-delay]
+    old = r["fraction"] * r["T_s"]  # time for which u[k-delay-1] acts, then u[k-delay]
     new = r["T_s"] - old
     to_switch, by_old = hold(plant.A, plant.B, old)
     to_end, by_new = hold(plant.A, plant.B, new)

@@ -43,7 +43,7 @@ from gfm_design.norms.performance import (
 from gfm_plant import Plant, load_converter, make_plant
 from gfm_plant.model import DELTA
 from gfm_plant.parameters import Element
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import Record
 from gfm_runtime.catalogue import get_law
 from gfm_runtime.errors import LawError
 from gfm_runtime.law import Law
@@ -94,7 +94,7 @@ class Origin:
     law: DiscreteLaw
     ideal: bool
     ref: Matrix
-    par: PlantRecord
+    par: Record
     op: OperatingPoint
 
 
@@ -165,17 +165,16 @@ class ClosedLoop:
             law = discretise(get_law(law) if isinstance(law, str) else law, T_s)
         plant = plant or Plant()
         ref = np.asarray(references, float)
-        return cls._made(plant, law, ideal, ref, make_plant(plant, law.T_s)[0])
+        return cls._made(plant, law, ideal, ref, make_plant(plant, law.T_s).par)
 
     @classmethod
-    def _made(
-        cls, plant: Plant, law: DiscreteLaw, ideal: bool, ref: Matrix, par: PlantRecord
-    ) -> Self:
+    def _made(cls, plant: Plant, law: DiscreteLaw, ideal: bool, ref: Matrix, par: Record) -> Self:
         grid, delay, inner = plant.grid, plant.delay, law.law.inner
         if ideal and inner is not None:
             raise LawError("inner", NOT_IDEAL)
         op = operating_point(par, law, ref, grid.omega_g, grid.V_g)
-        linear = linearise_plant(par, op, grid.omega_g, grid.V_g, inner is not None)
+        around = grid.omega_g, grid.V_g, grid.finite, inner is not None
+        linear = linearise_plant(par, op, *around)
         controlled = plant.dc_source.mode == "controlled"
         state_space = realise(law.law) if ideal else law
         reaction = linearise_law(law.law, state_space, op, ref, controlled)

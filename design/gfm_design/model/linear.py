@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
-from gfm_plant.records import PlantRecord
+from gfm_plant.options import FiniteGrid
+from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import LawStateSpace
@@ -118,14 +119,15 @@ class Mode:
 
 
 def linearise_plant(
-    par: PlantRecord,
+    par: Record,
     op: OperatingPoint,
     omega_g: float = 1.0,
     V_g: float = 1.0,
+    grid: FiniteGrid | None = None,
     inner: bool = False,
 ) -> LinearPlant:
-    """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g;
-    ``inner``: with the commands and the measurements of an inner stage."""
+    """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g,
+    ideal or finite; ``inner``: with the commands and the measurements of an inner stage."""
     r = par[0]
     commands = op.commands if inner else op.u
     n_u = len(commands)
@@ -138,7 +140,7 @@ def linearise_plant(
         p_g = d[1] * (np.cos(x[DELTA]) * x[4] - np.sin(x[DELTA]) * x[5])
         slopes[:, j] = np.concatenate([_rates(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
     regulated, lags = int(r["i_u_gain"] == 0.0), int(r["tau_dc"] > 0.0)
-    finite, sensors = 2 * int(r["H_grid"] > 0.0), 4 * int(r["filtered"])
+    finite, sensors = 2 * int(grid is not None), 4 * int(r["filtered"])
     source, swing = N_X + regulated, N_X + regulated + lags  # where the states begin
     n = swing + finite
     s = slice(n, n + sensors)
@@ -158,12 +160,12 @@ def linearise_plant(
     else:
         A[V_DC] += per_i_dc * asked
         B[V_DC, 0] = per_i_dc * (1 - regulated)
-    if finite:  # omega_g is a state, and so is the power of the turbines
+    if grid is not None:  # omega_g is a state, and so is the power of the turbines
         A[:, swing], B_d[:, 0] = B_d[:, 0], 0.0
-        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] / r["S_grid"], slopes[-1, -1] / r["S_grid"]
-        A[swing, [swing, swing + 1]] = -r["D_grid"], 1.0
-        A[swing], B_d[swing] = A[swing] / (2 * r["H_grid"]), B_d[swing] / (2 * r["H_grid"])
-        A[swing + 1, [swing, swing + 1]] = -1 / (r["droop_grid"] * r["T_gov"]), -1 / r["T_gov"]
+        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] / grid.S, slopes[-1, -1] / grid.S
+        A[swing, [swing, swing + 1]] = -grid.D, 1.0
+        A[swing], B_d[swing] = A[swing] / (2 * grid.H), B_d[swing] / (2 * grid.H)
+        A[swing + 1, [swing, swing + 1]] = -1 / (grid.droop * grid.T_gov), -1 / grid.T_gov
     if sensors:
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
         C = np.zeros_like(C)
@@ -175,7 +177,7 @@ def linearise_plant(
     return LinearPlant(A, B, B_d, C, C_true)
 
 
-def _rates(x: Vector, u: Vector, d: Vector, par: PlantRecord) -> Vector:
+def _rates(x: Vector, u: Vector, d: Vector, par: Record) -> Vector:
     """``gfm_plant.model.f``, under (i_u, omega_u, e_d, e_q) too: f has its voltage on the d axis,
     and its equations are the same in any frame that is turned by a constant angle."""
     if len(u) == NU:

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant import NoEquilibrium, plant_equilibrium
+from gfm_plant import Network, NoEquilibrium, plant_equilibrium
+from gfm_plant.circuit import GROUND
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
-from gfm_plant.records import PlantRecord
+from gfm_plant.records import Record
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.tustin import DiscreteLaw
@@ -56,7 +58,7 @@ class OperatingPoint:
 
 
 def operating_point(
-    par: PlantRecord,
+    par: Record,
     law: DiscreteLaw,
     ref: Vector,
     omega_g: float = 1.0,
@@ -74,28 +76,152 @@ def operating_point(
         NoEquilibrium: the law has no rest state there (a frequency that its droop cannot reach
             within the line's capacity, or no steady state at all).
     """
-    if law.law.inner is not None and law.law.inner.f_pll > 0.0:
-        ref = np.array([*ref[:2], omega_g, *ref[3:]])  # the law sees what its PLL measures
-    controlled = par[0]["i_u_gain"] != 0.0
-    # row 1's states are left out of a plant whose DC source ignores it
-    kept = np.array([i for i, row in enumerate(law.rows) if controlled or row != 0], dtype=int)
-    start_x, start_u = plant_equilibrium(par, ref[1], ref[4], V_g, omega_g)
-    z = np.concatenate([start_x, [start_u[0], start_u[2]], np.zeros(len(kept))])
-    d = np.array([omega_g, V_g])
+    side = _Side(par, law, np.asarray(ref))
+    z = side.first(V_g, omega_g)
 
     def residual(z: Vector) -> Vector:
-        x, u, y, x_law = _unpack(z, par, law, omega_g, kept)
+        return side.residual(z, V_g, omega_g)
+
+    found = _newton(residual, z)
+    if found is None:
+        raise NoEquilibrium(side.no_rest(f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."))
+    return side.found(found, omega_g)
+
+
+def operating_points(
+    plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]
+) -> list[OperatingPoint]:
+    """Solve for the common operating point of several converters, each under its law.
+
+    Unknowns are those of each converter, and the voltages of the nodes; of an island also the
+    frequency. The currents that meet at a node add up to nothing.
+
+    Args:
+        plant: as it is to start.
+        laws, refs: of each converter, as for ``operating_point``.
+
+    Returns:
+        That of each converter, its angle against the grid or, in an island, the first node.
+
+    Raises:
+        NoEquilibrium: there is none, or Newton's method does not find it.
+    """
+    wiring, now = plant.wiring, plant.now[0]
+    sides = [
+        _Side(plant.par[k : k + 1], law, np.asarray(ref))
+        for k, (law, ref) in enumerate(zip(laws, refs, strict=True))
+    ]
+    fixed = wiring.grid if wiring.closed else None
+    free = [node for node in wiring.nodes if node != fixed]
+    island = fixed is None
+    sizes = [side.size for side in sides]
+    ends = np.cumsum(sizes)
+
+    def parts(z: Vector) -> tuple[list[Vector], dict[str, complex], float]:
+        own = np.split(z[: ends[-1]], ends[:-1])
+        pairs = z[ends[-1] : ends[-1] + 2 * len(free)].reshape(-1, 2)
+        volts = {node: complex(*pair) for node, pair in zip(free, pairs, strict=True)}
+        if fixed is not None:
+            volts[fixed] = complex(now["V_g"])
+        return own, volts, float(z[-1]) if island else float(now["omega_g"])
+
+    def residual(z: Vector) -> Vector:
+        own, volts, omega = parts(z)
+        missing = dict.fromkeys(wiring.nodes, 0j)  # current that comes to each node
+        rows = []
+        for side, unit, mine in zip(sides, wiring.units, own, strict=True):
+            v = volts[unit.node]
+            rows.append(side.residual(mine, abs(v), omega, cmath.phase(v)))
+            i_o = complex(mine[4], mine[5]) * cmath.exp(1j * mine[DELTA])
+            missing[unit.node] += i_o / float(side.par[0]["current"])
+        for branch in wiring.branches:
+            if branch.name not in wiring.opened:
+                ends_of = volts.get(branch.start, 0j) - volts.get(branch.end, 0j)
+                i = ends_of / complex(branch.R, omega * branch.L)
+                missing[branch.start] -= i
+                if branch.end != GROUND:
+                    missing[branch.end] += i
+        for shunt in wiring.shunts:
+            if shunt.name in wiring.opened:
+                continue
+            missing[shunt.node] -= volts[shunt.node] / shunt.R
+        for capacitor in wiring.capacitors:
+            missing[capacitor.node] -= 1j * omega * capacitor.C * volts[capacitor.node]
+        met = [part for node in free for part in (missing[node].real, missing[node].imag)]
+        return np.concatenate([*rows, met, [volts[free[0]].imag] if island else []])
+
+    starts = [side.first(1.0, 1.0) for side in sides]
+    z0 = np.concatenate([*starts, np.tile([1.0, 0.0], len(free)), [1.0] if island else []])
+    z = _newton(residual, z0)
+    if z is None:
+        names = [
+            f"{u.name} ({side.law.law.name})" for u, side in zip(wiring.units, sides, strict=True)
+        ]
+        raise NoEquilibrium(f"{', '.join(names)}: have no common steady state")
+    own, _, omega = parts(z)
+    return [side.found(mine, omega) for side, mine in zip(sides, own, strict=True)]
+
+
+class _Side:
+    """One converter under its law: unknowns, what must vanish, and what is found.
+
+    The unknowns are the plant's state (8,), the DC current, E_u, and the law's states.
+    """
+
+    def __init__(self, par: Record, law: DiscreteLaw, ref: Vector) -> None:
+        self.par, self.law, self.ref = par, law, ref
+        self.controlled = par[0]["i_u_gain"] != 0.0
+        # row 1's states are left out of a plant whose DC source ignores it
+        self.kept = np.array(
+            [i for i, row in enumerate(law.rows) if self.controlled or row != 0], dtype=int
+        )
+        self.size = N_X + 2 + len(self.kept)
+
+    def first(self, V_g: float, omega_g: float) -> Vector:
+        """Where to begin: at the references, with the law's states at zero.
+
+        Raises:
+            NoEquilibrium: the line cannot carry P_ref.
+        """
+        x, u = plant_equilibrium(self.par, self.ref[1], self.ref[4], V_g, omega_g)
+        return np.concatenate([x, [u[0], u[2]], np.zeros(len(self.kept))])
+
+    def residual(self, z: Vector, V_g: float, omega_g: float, theta: float = 0.0) -> Vector:
+        """What must vanish, at a voltage V_g of the line's far end that is ahead by theta, rad."""
+        law, ref = self.law, self.ref
+        if law.law.inner is not None and law.law.inner.f_pll > 0.0:
+            ref = np.array([*ref[:2], omega_g, *ref[3:]])  # the law sees what its PLL measures
+        x, u, y, x_law = _unpack(z, self.par, law, omega_g, self.kept)
+        x[DELTA] -= theta
         u_law, x_next = _law(law, x_law, ref, y)
-        dx = f(x, u, d, par)
-        dc = u_law[0] - u[0] if controlled else x[V_DC] - 1.0
+        dx = f(x, u, np.array([omega_g, V_g]), self.par)
+        dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = np.delete(dx, DELTA)  # delta rests by omega_u = omega_g
         u[2] = abs(_internal(law, x, u, limited=False))
-        rest = (x_next - x_law)[kept] / law.T_s
+        rest = (x_next - x_law)[self.kept] / law.T_s
         return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], rest])
 
+    def found(self, z: Vector, omega_g: float) -> OperatingPoint:
+        """The operating point at the unknowns z."""
+        x, u, y, x_law = _unpack(z, self.par, self.law, omega_g, self.kept)
+        x, u, e = _in_frame_of_law(self.law, x, u)
+        return OperatingPoint(x, u, y, x_law, e)
+
+    def no_rest(self, grid: str) -> str:
+        """The words for: there is no operating point on that grid."""
+        idle = self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any())
+        cause = "; nothing holds v_dc: row 1 answers to no measurement" if idle else ""
+        return (
+            f"{self.law.law.name} has no steady state at P_ref = {self.ref[1]:g} p.u., V_ref = "
+            f"{self.ref[4]:g} p.u., {grid}{cause}"
+        )
+
+
+def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
+    """A zero of ``residual`` near z, or None."""
     for _ in range(_ROUNDS):
         now = residual(z)
-        jacobian = np.empty((len(z), len(z)))
+        jacobian = np.empty((len(now), len(z)))
         for j in range(len(z)):
             nudge = np.zeros(len(z))
             nudge[j] = _NUDGE
@@ -104,19 +230,10 @@ def operating_point(
         largest = np.abs(step).max()
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
         if not np.isfinite(z).all():
-            break
+            return None
         if largest < 1e-10:
-            if np.abs(residual(z)).max() > 1e-5:
-                break
-            x, u, y, x_law = _unpack(z, par, law, omega_g, kept)
-            x, u, e = _in_frame_of_law(law, x, u)
-            return OperatingPoint(x, u, y, x_law, e)
-    idle = controlled and not (law.C[0].any() or law.D_y[0].any())
-    cause = "; nothing holds v_dc: row 1 answers to no measurement" if idle else ""
-    raise NoEquilibrium(
-        f"{law.law.name} has no steady state at P_ref = {ref[1]:g} p.u., V_ref = {ref[4]:g} p.u., "
-        f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u.{cause}"
-    )
+            return z if np.abs(residual(z)).max() <= 1e-5 else None
+    return None
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> complex:
@@ -146,7 +263,7 @@ def _in_frame_of_law(law: DiscreteLaw, x: Vector, u: Vector) -> tuple[Vector, Ve
 
 
 def _unpack(
-    z: Vector, par: PlantRecord, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
+    z: Vector, par: Record, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
 ) -> tuple[Vector, Vector, Vector, Vector]:
     x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
     y = g(x, u)

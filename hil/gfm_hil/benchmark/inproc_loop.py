@@ -19,7 +19,7 @@ from numba.core.runtime.nrt import rtsys
 
 from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, seconds, take_turns
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.inproc import run_ticks
+from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
@@ -39,25 +39,25 @@ RIG = "mimo-gfm, rig"
 
 
 @compiled
-def plant_alone(par, st, y, u, us):
+def plant_alone(plant, y, u, us):
     """The plant under the recorded commands ``us`` (ticks, 3)."""
     for k in range(len(us)):
         for i in range(NU):
             u[i] = us[k, i]
-        plant_sample(par, st, y)
-        plant_advance(par, st, u)
+        plant_sample(plant, 0, y)
+        plant_advance(plant, u)
 
 
 @compiled
-def plants_half(par, st, y, u, us, rows):
+def plants_half(plant, y, u, us, rows):
     """The tick of the plant's process without the link: the plant and its recording."""
     for k in range(len(us)):
         for i in range(NU):
             u[i] = us[k, i]
-        plant_sample(par, st, y)
-        record_sample(rows[k], y, par, st)
+        plant_sample(plant, 0, y)
+        record_sample(rows[k], y, plant, 0)
         record_command(rows[k], u)
-        plant_advance(par, st, u)
+        plant_advance(plant, u)
 
 
 @compiled
@@ -70,11 +70,11 @@ def controller_alone(ctl, laws, states, est, y, u, ys):
 
 
 @compiled
-def recording_alone(par, st, ctl, states, est, y, u, plant_rows, controller_rows):
+def recording_alone(plant, ctl, states, est, y, u, plant_rows, controller_rows):
     """Record the same tick into every row."""
     for k in range(len(plant_rows)):
         record_controller(controller_rows[k], ctl, states, est)
-        record_sample(plant_rows[k], y, par, st)
+        record_sample(plant_rows[k], y, plant, 0)
         record_command(plant_rows[k], u)
 
 
@@ -89,7 +89,7 @@ class Loop:
         self.plant = Part.create(folder, "plant", ticks).signals
         self.controller = Part.create(folder, "controller", ticks).signals
         c = bench.controller
-        self._kept = [bench.par, bench.st, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
+        self._kept = [*bench.plant.records, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
         self._start = [a.copy() for a in self._kept]
         self.whole()
         self._rows = itertools.cycle(
@@ -109,11 +109,13 @@ class Loop:
             UserError: the run ended early, so that there is nothing to time.
         """
         b, n = self.reset(), ticks or self.ticks
-        done = 0
+        done, controllers = 0, stack([b])
 
         def run() -> None:
             nonlocal done
-            done = run_ticks(b, self.plant, self.controller, 0, n)
+            done = run_ticks(
+                b.plant.records, controllers, self.plant[None], self.controller[None], 0, n
+            )
 
         time = seconds(run) / n * 1e9
         if done != n:
@@ -123,12 +125,12 @@ class Loop:
     def plant_part(self) -> float:
         """ns per tick of the plant alone."""
         b = self.reset()
-        return self._per_tick(lambda: plant_alone(b.par, b.st, b.y, b.u, self._u))
+        return self._per_tick(lambda: plant_alone(b.plant.records, b.y, b.u, self._u))
 
     def plants_half(self) -> float:
         """ns per tick of the plant and its recording, into rows not written lately, as in a run."""
         b, rows = self.reset(), next(self._rows)
-        return self._per_tick(lambda: plants_half(b.par, b.st, b.y, b.u, self._u, rows))
+        return self._per_tick(lambda: plants_half(b.plant.records, b.y, b.u, self._u, rows))
 
     def controller_part(self) -> float:
         """ns per tick of the controller alone."""
@@ -142,7 +144,7 @@ class Loop:
         b, c = self.reset(), self.bench.controller
         rows = (self.plant, self.controller)
         return self._per_tick(
-            lambda: recording_alone(b.par, b.st, c.ctl, c.states, c.est, b.y, b.u, *rows)
+            lambda: recording_alone(b.plant.records, c.ctl, c.states, c.est, b.y, b.u, *rows)
         )
 
     def allocations_per_tick(self) -> float:

@@ -1,4 +1,4 @@
-"""Time of one kernel step, compared with the same recursion in C on the same bytes.
+"""Time of one kernel step, compared with the C code of ``gfmhil firmware export``.
 
 Both run a closed chain of steps: the previous u slightly changes each tick's measurements, so that
 no step can be computed ahead or skipped. Before the timing, both process inputs that drive every
@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_hil.benchmark.c_code import FLAGS, Drive, NoCompiler, compile_twin
+from gfm_hil.benchmark.c_code import FLAGS, T_S, Drive, NoCompiler, Twin, compile_twin
 from gfm_hil.benchmark.rounds import Spread, quickest, ratio, seconds, take_turns
 from gfm_runtime import discretise, get_law
 from gfm_runtime.compiled import compiled
 from gfm_runtime.kernel import pack_law, state_dtype, step
 from gfm_runtime.signals import NU, NY, group
 
-T_S = 1e-4  # s
 ROWS = 256  # different measurements, used in turn
 FEEDBACK = 1e-6  # p.u. of y per p.u. of u
 REALS = ("float64", "float32")
@@ -56,8 +55,12 @@ def drive(law, state, io, inputs, outputs, steps, feedback):
 
 @dataclass
 class Chain:
-    """One law at its reference, with measurements that scatter around it, and its outputs."""
+    """One law at its reference, with measurements that scatter around it, and its outputs.
 
+    ``how`` is numba's or C's ``drive``, and ``state`` is the kernel's record or C's.
+    """
+
+    how: Drive
     law: NDArray[Any]
     state: NDArray[Any]
     io: NDArray[Any]
@@ -65,20 +68,24 @@ class Chain:
     outputs: NDArray[Any]
 
     @staticmethod
-    def make(name: str, real: DTypeLike, scatter: float) -> Chain:
-        """A new chain; ``scatter`` is the standard deviation of the measurements, p.u."""
+    def make(name: str, real: DTypeLike, scatter: float, twin: Twin | None = None) -> Chain:
+        """A new chain in numba, or in C with a twin.
+
+        ``scatter`` is the standard deviation of the measurements, p.u.
+        """
         ref = np.array([s.default for s in group("ref")])
         y = ref + scatter * np.random.default_rng(1).standard_normal((ROWS, NY))
         law = pack_law(discretise(get_law(name), T_S), real)
-        state = np.zeros(1, state_dtype(real))
+        state = twin.instance() if twin else np.zeros(1, state_dtype(real))
+        how = twin.drive(name) if twin else drive
         io = np.zeros(1, io_dtype(real))
         io["ref"], io["u"] = ref, 1.0
-        return Chain(law, state, io, y.astype(real), np.zeros((ROWS, NU), real))
+        return Chain(how, law, state, io, y.astype(real), np.zeros((ROWS, NU), real))
 
-    def run(self, drive: Drive, steps: int) -> None:
-        """Advance by ``steps`` steps with numba's or C's ``drive``."""
+    def run(self, steps: int) -> None:
+        """Advance by ``steps`` steps."""
         feedback = self.inputs.dtype.type(FEEDBACK)
-        drive(self.law, self.state, self.io, self.inputs, self.outputs, steps, feedback)
+        self.how(self.law, self.state, self.io, self.inputs, self.outputs, steps, feedback)
 
     def limited(self) -> NDArray[np.bool_]:
         """Which of the outputs (rows, 3) are at a limit."""
@@ -106,33 +113,35 @@ class Agreement:
     limited: tuple[int, ...]
 
 
-def compare(name: str, real: DTypeLike, rival: Drive, rounds: int) -> Agreement:
-    """Run numba and a rival on the same extreme inputs; ``rounds`` times all rows."""
-    ours, theirs = (Chain.make(name, real, scatter=0.5) for _ in range(2))
+def compare(name: str, real: DTypeLike, twin: Twin, rounds: int) -> Agreement:
+    """Run numba and C on the same extreme inputs; ``rounds`` times all rows."""
+    ours, theirs = (Chain.make(name, real, 0.5, of) for of in (None, twin))
+    n = int(ours.law["n"][0])
     worst, limited = 0, np.zeros(NU, int)
     for _ in range(rounds):
-        ours.run(drive, ROWS)
-        theirs.run(rival, ROWS)
+        ours.run(ROWS)
+        theirs.run(ROWS)
         worst = max(worst, ulps(ours.outputs, theirs.outputs))
-        for field in ours.state.dtype.names or ():
+        worst = max(worst, ulps(ours.state["x"][:, :n], theirs.state["x"][:, :n]))
+        for field in ("offset", "u", "trend"):
             worst = max(worst, ulps(ours.state[field], theirs.state[field]))
         limited += ours.limited().sum(axis=0)
     return Agreement(worst, tuple(int(n) for n in limited))
 
 
 def time_laws(
-    names: Sequence[str], real: DTypeLike, twin: Drive | None, steps: int, turns: int
+    names: Sequence[str], real: DTypeLike, twin: Twin | None, steps: int, turns: int
 ) -> dict[str, dict[str, Any]]:
     """ns per step of every law by numba and by C, and their ratio; None without a twin."""
 
-    def job(name: str, how: Drive) -> float:
-        chain = Chain.make(name, real, scatter=1e-3)
-        chain.run(how, ROWS)  # warm up
-        return quickest(lambda: seconds(lambda: chain.run(how, steps))) / steps * 1e9
+    def job(name: str, of: Twin | None) -> float:
+        chain = Chain.make(name, real, 1e-3, of)
+        chain.run(ROWS)  # warm up
+        return quickest(lambda: seconds(lambda: chain.run(steps))) / steps * 1e9
 
-    ways: dict[str, Drive] = {"numba": drive} | ({"c": twin} if twin else {})
+    ways: dict[str, Twin | None] = {"numba": None} | ({"c": twin} if twin else {})
     jobs = {
-        f"{n} {way}": (lambda n=n, how=how: job(n, how)) for n in names for way, how in ways.items()
+        f"{n} {way}": (lambda n=n, of=of: job(n, of)) for n in names for way, of in ways.items()
     }
     found = take_turns(jobs, turns)
     return {
@@ -166,9 +175,9 @@ def measure(
     for k, real in enumerate(REALS):
         tell(f"kernel, {real}", k / len(REALS))
         with tempfile.TemporaryDirectory() as place:
-            twin: Drive | None = None
+            twin: Twin | None = None
             try:
-                twin = compile_twin(Path(place), real, flags)
+                twin = compile_twin(Path(place), names, real, flags)
             except NoCompiler as problem:
                 remarks.append(f"kernel, {real}: {problem}; nothing to compare with")
             agreements = {n: compare(n, real, twin, rounds=40) for n in names} if twin else {}

@@ -70,7 +70,7 @@ _SECTIONS = {
     "kernel": (
         "Kernel",
         "One step of the controller for every law, each waiting for the previous one, and the "
-        "same algorithm in C on the same bytes, with the same bits as result.",
+        "same step in C, as gfmhil firmware export writes it, with the same bits as result.",
     ),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +22,9 @@ from gfm_runtime.firmware import (
     STYLES,
     TARGETS,
     Checked,
+    build_dll,
     check,
+    dll_sources,
     export,
     golden,
     make_modules,
@@ -40,6 +43,13 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     out.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
     out.set_defaults(call=call_export)
+    dll = kinds.add_parser(
+        "dll", help="build a law as a real-code model of the IEEE/CIGRE interface, for EMT programs"
+    )
+    dll.add_argument("law", metavar="LAW", help="a name, or a .toml file")
+    _add_how(dll)
+    dll.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
+    dll.set_defaults(call=call_dll)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
     _add_laws(vectors)
     vectors.add_argument(
@@ -65,13 +75,26 @@ def _add_laws(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
+    _add_how(command)
+
+
+def _add_how(command: argparse.ArgumentParser) -> None:
     command.add_argument("--real", choices=REALS, default=REALS[0], help="precision (float32)")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
+    command.add_argument(
+        "--inner", metavar="NAME",
+        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
+    )  # fmt: skip
+    command.add_argument(
+        "--f_n", type=float, default=50.0, metavar="HZ",
+        help="nominal frequency of the converter, for an inner stage (50)",
+    )  # fmt: skip
 
 
 def call_export(options: argparse.Namespace) -> int:
     """Write the folder; returns the exit code."""
-    files = export(_laws(options.laws), options.T_s, options.real, options.style)
+    laws, omega_b = _laws(options.laws, options.inner), _omega_b(options.f_n)
+    files = export(laws, options.T_s, options.real, options.style, omega_b)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         write_text(options.out / name, text)
@@ -79,9 +102,24 @@ def call_export(options: argparse.Namespace) -> int:
     return 0
 
 
+def call_dll(options: argparse.Namespace) -> int:
+    """Write the folder and build the library; returns the exit code."""
+    laws = _laws([options.law], options.inner)
+    if len(laws) != 1:
+        raise UserError(f"law {options.law!r}: has {len(laws)} stages; a model holds one law")
+    ((name, law),) = laws.items()
+    files = dll_sources(name, law, options.T_s, options.real, _omega_b(options.f_n))
+    options.out.mkdir(parents=True, exist_ok=True)
+    for file, text in files.items():
+        write_text(options.out / file, text)
+    print(build_dll(options.out, name, files))
+    return 0
+
+
 def call_golden(options: argparse.Namespace) -> int:
     """Write or print the vectors; returns the exit code."""
-    modules = make_modules(_laws(options.laws), options.T_s, options.real)
+    laws, omega_b = _laws(options.laws, options.inner), _omega_b(options.f_n)
+    modules = make_modules(laws, options.T_s, options.real, omega_b)
     text = golden(modules, _ticks(options.ticks)).csv()
     if options.out is None:
         print(text, end="")
@@ -100,17 +138,23 @@ def call_check(options: argparse.Namespace) -> int:
     return EXIT_OTHERWISE if any(result.differ for result in results) else 0
 
 
-def _laws(names: Sequence[str]) -> dict[str, Law]:
-    """Laws by name; the stages of a scheduled law one by one."""
+def _laws(names: Sequence[str], inner: str | None) -> dict[str, Law]:
+    """Laws by name, with an inner stage in place of their own; a scheduled law in its stages."""
     laws: dict[str, Law] = {}
     for name in law_names() if list(names) == [ALL] else names:
-        found = load_law(name)
+        found = load_law(name, inner)
         for k, law in enumerate(found.laws):
             label = found.name if len(found.laws) == 1 else f"{found.name}[{k}]"
             if label in laws:
                 raise UserError(f"law {label!r}: is named twice")
             laws[label] = law
     return laws
+
+
+def _omega_b(f_n: float) -> float:
+    if not (math.isfinite(f_n) and f_n > 0.0):
+        raise UserError(f"--f_n {f_n:g}: must be > 0 Hz")
+    return 2 * math.pi * f_n
 
 
 def _ticks(ticks: int) -> int:

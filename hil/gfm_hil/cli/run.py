@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import sys
+from pathlib import Path
 
 from gfm_hil.cli.common import (
     add_scenario_options,
@@ -20,8 +21,8 @@ from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.runner import run_scenario
-from gfm_hil.scenario.model import INPROC, find_scenario
+from gfm_hil.results.runner import run_network, run_scenario
+from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -48,6 +49,8 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     scenario = resolve(options, law=options.law)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
+    if scenario.network is not None:
+        return _run_network(scenario, folder, options)
     with contextlib.ExitStack() as stack:
         scope = None
         if options.scope is not None:
@@ -71,3 +74,20 @@ def call(options: argparse.Namespace) -> int:
             with contextlib.suppress(KeyboardInterrupt):
                 scope.wait()
     return exit_code(run.summary)
+
+
+def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:
+    """Run several converters, each of which gets a run folder of its own."""
+    for name in ("scope", "stream", "modbus"):
+        if getattr(options, name) is not None:
+            raise UserError(f"--{name}: looks at one converter; a network runs without it")
+    with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+        figures = not options.no_figures
+        runs = run_network(scenario, folder, progress, notice, figures=figures)
+    if options.json:
+        print(json.dumps(runs.summary, indent=2), flush=True)
+    else:
+        for name, run in runs.items():
+            print(f"\n{name}")
+            print_summary(run.summary, folder / name)
+    return max(exit_code(run.summary) for run in runs.values())

@@ -165,8 +165,7 @@ class CommandServer:
         if isinstance(event, Reset) and self._bench.scenario.after_trip == "end":
             raise ValueError("reset: this run ends at a trip; after_trip = 'wait' in its scenario")
         if ours == "plant":
-            par, st = self._bench.par.copy(), self._bench.st.copy()
-            apply_grid_event(event, par, st)
+            apply_grid_event(event, self._bench.plant.copy())
         return event
 
     def _carry_out(self, event: Any, by: Identity) -> dict[str, Any]:

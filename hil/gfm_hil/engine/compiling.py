@@ -14,7 +14,7 @@ from numba.core import event
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.inproc import buffers, compile_loop
 from gfm_hil.engine.process import compile_role
-from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
@@ -84,6 +84,26 @@ def compiled_bench(
     return found[0]
 
 
+def compiled_benches(scenario: Scenario, notice: Callable[[str], None]) -> list[Bench]:
+    """The benches of a network's converters, with everything compiled that a tick calls.
+
+    Args:
+        scenario, notice: as for ``compiled_bench``.
+
+    Raises:
+        UserError: as ``make_benches``.
+    """
+    found: list[Bench] = []
+    compile_sets(
+        [
+            ("the operating point", lambda: found.extend(make_benches(scenario))),
+            ("the loop of several converters", lambda: compile_loop(found)),
+        ],
+        notice,
+    )
+    return found
+
+
 def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
     """Compile what any run may call, over every link there is.
 
@@ -111,7 +131,7 @@ _IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)
 
 
 def _both(found: list[Bench]) -> Set:
-    return "the loop of both sides", lambda: compile_loop(found[0], *buffers(1, found[0].inner))
+    return "the loop of both sides", lambda: compile_loop(found[:1])
 
 
 def _role(role: Role, found: list[Bench], which: str = "") -> Set:

@@ -18,7 +18,6 @@ from gfm_hil.engine.loop_records import (
     FLAGS,
     ControllerRecords,
     LinkEnd,
-    PlantRecords,
     Records,
     Why,
     make_loop,
@@ -62,11 +61,7 @@ class _Loop:
         records = Records(
             self.loop, flags, bench.y, bench.u, part.signals, part.times, part.progress
         )
-        own = (
-            PlantRecords(bench.par, bench.st)
-            if plant
-            else ControllerRecords(c.ctl, c.laws, c.states, c.est)
-        )
+        own = bench.plant.records if plant else ControllerRecords(c.ctl, c.laws, c.states, c.est)
         self._arguments = end, records, own
         self._call = plant_ticks if plant else controller_ticks
 

@@ -7,13 +7,14 @@ each tick calls the same functions in the same order.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.engine.loop_records import ControllerRecords, PlantRecords, Why
+from gfm_hil.engine.loop_records import ControllerRecords, Why
 from gfm_hil.engine.setup import Bench
-from gfm_hil.engine.tick import advance, answer, obey, sample
+from gfm_hil.engine.tick import answer, obey, sample, take
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import (
     CONTROLLER_TIMES,
@@ -22,82 +23,156 @@ from gfm_hil.recording.columns import (
 )
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller
-from gfm_plant import plant_is_delayed, plant_step
+from gfm_plant import PlantRecords, plant_is_delayed, plant_step, take_out
 from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
 
 CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
 
 
+class Stack(NamedTuple):
+    """The controllers of a plant, one below the other.
+
+    Attributes:
+        controllers: their records: ctl and est of shape (N,), laws and states of shape (N, laws).
+        y: measurements of the current tick, (N, 5) or (N, 11), p.u.
+        u: inputs of the current tick, (N, 3) or (N, 4), p.u.
+    """
+
+    controllers: ControllerRecords
+    y: NDArray[np.float64]
+    u: NDArray[np.float64]
+
+
+def stack(benches: Sequence[Bench]) -> Stack:
+    """The records of all benches in common arrays, of which each bench then has its part."""
+    if len(benches) == 1:
+        (b,) = benches
+        c = b.controller
+        one = ControllerRecords(c.ctl, c.laws[None], c.states[None], c.est)
+        return Stack(one, b.y[None], b.u[None])
+    all_c = [b.controller for b in benches]
+    most = max(len(c.laws) for c in all_c)
+    ctl = np.concatenate([c.ctl for c in all_c])
+    est = np.concatenate([c.est for c in all_c])
+    laws = np.zeros((len(all_c), most), all_c[0].laws.dtype)
+    states = np.zeros((len(all_c), most), all_c[0].states.dtype)
+    y, u = np.stack([b.y for b in benches]), np.stack([b.u for b in benches])
+    for k, (b, c) in enumerate(zip(benches, all_c, strict=True)):
+        n = len(c.laws)
+        laws[k, :n], states[k, :n] = c.laws, c.states
+        c.ctl, c.est = ctl[k : k + 1], est[k : k + 1]
+        c.laws, c.states = laws[k, :n], states[k, :n]
+        b.y, b.u = y[k], u[k]
+    return Stack(ControllerRecords(ctl, laws, states, est), y, u)
+
+
 @compiled
-def _run_ticks(plant, controller, y, u, plant_rows, controller_rows, start, stop, waits):
+def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, waits):
     """The compiled part of ``run_ticks``."""
-    par, st = plant
-    ctl, laws, states, est = controller
-    changes, delayed = ctl[0].changes, plant_is_delayed(par)
+    ctl, laws, states, est = stack.controllers
+    y, u, st = stack.y, stack.u, plant.st
+    delayed, many = plant_is_delayed(plant), len(ctl) > 1
     for k in range(start, stop):
-        before = ctl[0].state
-        tripped = sample(par, st, y, plant_rows[k])
-        answer(ctl, laws, states, est, y, u, tripped != 0)
-        record_controller(controller_rows[k], ctl, states, est)
-        record_command(plant_rows[k], u)
+        changed, trips, tripped = False, 0, 0
+        for i in range(len(ctl)):
+            before, changes, row = ctl[i].state, ctl[i].changes, plant_rows[i, k - first]
+            tripped = sample(plant, i, y[i], row)
+            trips += tripped
+            mine, estimate = ctl[i : i + 1], est[i : i + 1]
+            answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
+            record_controller(controller_rows[i, k - first], mine, states[i], estimate)
+            record_command(row, u[i])
+            changed = changed or ctl[i].changes != changes or ctl[i].state != before
         if delayed:  # as over a link, where u[k] may come meanwhile
-            plant_step(par, st)
-        state = ctl[0].state
-        if obey(par, st, waits, state) != Why.GO_ON:
-            return k + 1
-        if advance(par, st, u, delayed, tripped, state, True) != Why.GO_ON:
-            return k + 1
-        if ctl[0].changes != changes or state != before or st[0].trip != tripped:
+            plant_step(plant)
+        for i in range(len(ctl)):
+            state = ctl[i].state
+            # a controller in SAFE ends the run of its converter, not that of a network
+            if obey(plant, i, waits or many, state) != Why.GO_ON:
+                return k + 1
+            if take(plant, i, u[i], 0 if many else tripped, state, True) != Why.GO_ON:
+                return k + 1
+        if not delayed:
+            plant_step(plant)
+        for i in range(len(ctl)):
+            trips -= st[i].trip
+        if changed or trips != 0:
             return k + 1
     return stop
 
 
 def run_ticks(
-    bench: Bench,
+    plant: PlantRecords,
+    controllers: Stack,
     plant_rows: NDArray[np.float64],
     controller_rows: NDArray[np.float64],
     start: int,
     stop: int,
+    first: int = 0,
+    waits: bool = False,
 ) -> int:
-    """Run ticks [start, stop) of a bench; returns the tick after the last one done.
+    """Run ticks [start, stop); returns the tick after the last one done.
 
-    Returns early, after recording the tick, when the law, the controller's state or the plant's
+    Returns early, after recording the tick, when a law, a controller's state or a converter's
     protection changed, and before the plant takes u[k] when it has to be put back to its start.
 
     Args:
-        bench: at tick ``start``.
-        plant_rows, controller_rows: of every tick, columns as ``signals_of`` says.
+        plant, controllers: at tick ``start``.
+        plant_rows, controller_rows: shape (N, ticks, columns), of every tick from ``first`` on,
+            columns as ``signals_of`` says.
+        waits: a tripped plant waits for a reset.
     """
-    c = bench.controller
-    return int(_run_ticks(
-        PlantRecords(bench.par, bench.st),
-        ControllerRecords(c.ctl, c.laws, c.states, c.est),
-        bench.y, bench.u, plant_rows, controller_rows, start, stop,
-        bench.scenario.after_trip == "wait",
-    ))  # fmt: skip
+    return int(
+        _run_ticks(
+            plant, controllers, plant_rows, controller_rows, start, stop, first, waits
+        )
+    )  # fmt: skip
 
 
 def run_inproc(
-    bench: Bench,
-    plant_part: Part,
-    controller_part: Part,
-    timeline: Timeline,
+    benches: Sequence[Bench],
+    plant_parts: Sequence[Part],
+    controller_parts: Sequence[Part],
+    timelines: Sequence[Timeline],
     go_on: Callable[[int], bool],
 ) -> None:
-    """Run a whole scenario; ``go_on`` gets the ticks done and returns whether to go on."""
-    ticks = bench.scenario.ticks
-    k = 0
-    while k < ticks and timeline.running:
-        timeline.carry_out(k)
-        stop = min(k + CHUNK, timeline.next_tick(), ticks)
-        k = run_ticks(bench, plant_part.signals, controller_part.signals, k, stop)
-        if int(bench.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
+    """Run a whole scenario: of each converter its bench, its parts of the recording, and its
+    timeline. ``go_on`` gets the ticks done and returns whether to go on."""
+    bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
+    waits, single = bench.scenario.after_trip == "wait", len(benches) == 1
+    controllers = stack(benches)
+    plant_rows, controller_rows = _rows(plant_parts, ticks), _rows(controller_parts, ticks)
+    while k < ticks and any(timeline.running for timeline in timelines):
+        for timeline in timelines:
+            timeline.carry_out(k)
+        stop = min(k + CHUNK, ticks, *(timeline.next_tick() for timeline in timelines))
+        begin = 0 if single else k
+        done = run_ticks(
+            bench.plant.records, controllers, plant_rows, controller_rows, k, stop, begin, waits
+        )
+        if not single:
+            take_out(bench.plant)
+            for parts, rows in ((plant_parts, plant_rows), (controller_parts, controller_rows)):
+                for part, own in zip(parts, rows, strict=True):
+                    part.signals[k:done] = own[: done - k]
+        k = done
+        if int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
             bench.restore_plant(k)
-        timeline.look(k - 1)
+        for timeline in timelines:
+            timeline.look(k - 1)
         if not go_on(k):
-            timeline.end("interrupted", "stopped by the operator", k)
-    timeline.finish(k)
+            for timeline in timelines:
+                timeline.end("interrupted", "stopped by the operator", k)
+    for timeline in timelines:
+        timeline.finish(k)
+
+
+def _rows(parts: Sequence[Part], ticks: int) -> NDArray[np.float64]:
+    """Where the loop records: of one converter its part itself, of several a piece at a time."""
+    if len(parts) == 1:
+        return parts[0].signals[None]
+    return np.empty((len(parts), min(CHUNK, ticks), parts[0].signals.shape[1]))
 
 
 def buffers(ticks: int, inner: bool = False) -> tuple[Part, Part]:
@@ -117,6 +192,8 @@ def buffers(ticks: int, inner: bool = False) -> tuple[Part, Part]:
     )
 
 
-def compile_loop(bench: Bench, plant_part: Part, controller_part: Part) -> None:
+def compile_loop(benches: Sequence[Bench]) -> None:
     """Compile (or load from cache) the loop without running a tick."""
-    run_ticks(bench, plant_part.signals, controller_part.signals, 0, 0)
+    parts = buffers(1, benches[0].inner)
+    rows = [np.repeat(part.signals[None], len(benches), 0) for part in parts]
+    run_ticks(benches[0].plant.records, stack(benches), rows[0], rows[1], 0, 0)

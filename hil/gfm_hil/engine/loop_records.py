@@ -104,13 +104,6 @@ class Records(NamedTuple):
     progress: NDArray[np.int64]
 
 
-class PlantRecords(NamedTuple):
-    """The plant's parameters and state, see ``gfm_plant``."""
-
-    par: NDArray[Any]
-    st: NDArray[Any]
-
-
 class ControllerRecords(NamedTuple):
     """The controller's records, see ``gfm_runtime.controller``."""
 

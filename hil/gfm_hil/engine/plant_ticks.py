@@ -9,7 +9,7 @@ A u[k] that is not there by then is a miss: the plant holds the last u, and afte
 from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, Why
-from gfm_hil.engine.tick import advance, obey, sample
+from gfm_hil.engine.tick import obey, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
@@ -38,14 +38,15 @@ def plant_ticks(end, records, plant, last):
 
     Args:
         end: ``gfm_hil.engine.loop_records.LinkEnd``.
-        records, plant: ``Records`` and ``PlantRecords`` from there.
+        records: ``Records`` from there.
+        plant: ``gfm_plant.PlantRecords`` of one converter.
         last: the tick before which it stops.
     """
     loop, flags, y, u, rows, times, progress = records
-    par, st = plant
+    st = plant.st
     reader, r = end.reader, loop[0]
     sequence, frame, message = end.out
-    delayed = plant_is_delayed(par)
+    delayed = plant_is_delayed(plant)
     # In lockstep a delayed plant sends its next frame right after an answer, so one reading of the
     # clock serves both. A reading stalls the processor: two of them took a tenth of the tick.
     hurried, unseen, why = delayed and not r.realtime, -1, Why.DONE
@@ -64,7 +65,7 @@ def plant_ticks(end, records, plant, last):
             r.unrested = 0 if due - now_ns() > AHEAD_NS else r.unrested + 1
             gap = wait_until(due, end.spins)
             times[k, 0], times[k, 1] = due, now_ns()
-        tripped = sample(par, st, y, rows[k])
+        tripped = sample(plant, 0, y, rows[k])
         state, reason = (SAFE, PLANT_TRIP) if tripped != 0 else (0, 0)
         pack(sequence, frame, message, k, state, reason, y)
         end.send(end.handle, message)
@@ -76,7 +77,7 @@ def plant_ticks(end, records, plant, last):
             times[unseen, 3] = sent
             unseen = -1
         if delayed:  # u[k] does not act in this period: it can come meanwhile
-            plant_step(par, st)
+            plant_step(plant)
         if r.unrested > _UNRESTED:  # else the kernel throttles the whole loop for 50 ms
             sleep_until(sent + _REST_NS)
             r.unrested = 0
@@ -104,7 +105,7 @@ def plant_ticks(end, records, plant, last):
                 u[j] = r.u_last[j] + (r.late + 1) * (r.u_last[j] - r.u_before[j])
         record_command(rows[k], u)
         progress[0] = k + 1
-        why = obey(par, st, r.waits, reader[0].state)
+        why = obey(plant, 0, r.waits, reader[0].state)
         if why != Why.GO_ON:
             break
         if came != FRESH:
@@ -118,11 +119,13 @@ def plant_ticks(end, records, plant, last):
         judge(reader, r.late > r.hold, tripped != 0)
         times[k, 4] = gap
         r.tick = k + 1
-        why = advance(par, st, u, delayed, tripped, reader[0].state, came == FRESH)
+        why = take(plant, 0, u, tripped, reader[0].state, came == FRESH)
         if why != Why.GO_ON:
             break
+        if not delayed:
+            plant_step(plant)
         if r.waits and reader[0].e2e == INVALID:
-            trip(par[0], st[0], CONTROLLER, NOT_HEARD)
+            trip(plant, 0, CONTROLLER, NOT_HEARD)
         if st[0].trip != tripped:
             why = Why.CHANGED
             break

@@ -146,10 +146,10 @@ def _meet_and_run(
 
 def compile_role(role: Role, bench: Bench, part: Part) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
-    par, st, y, u = bench.par.copy(), bench.st.copy(), bench.y.copy(), bench.u.copy()
-    plant_sample(par, st, y)
-    plant_step(par, st)
-    plant_command(par, st, u)
+    plant, y, u = bench.plant.copy().records, bench.y.copy(), bench.u.copy()
+    plant_sample(plant, 0, y)
+    plant_step(plant)
+    plant_command(plant, 0, u)
     warm_up(bench.controller)
     for group in DATA_IDS:
         values = np.zeros(len(carried(group, bench.inner)))
@@ -159,7 +159,7 @@ def compile_role(role: Role, bench: Bench, part: Part) -> None:
     compile_loops(role, bench, part)
     pump.warm_up()
     if role == "plant":
-        record_sample(part.signals[0].copy(), y, par, st)
+        record_sample(part.signals[0].copy(), y, plant, 0)
         record_command(part.signals[0].copy(), u)
     else:
         c = bench.controller

@@ -7,17 +7,16 @@ frames have to cross the link.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.operating_point import OperatingPoint, operating_point
+from gfm_design.model.operating_point import OperatingPoint, operating_point, operating_points
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.retune import retuned
 from gfm_hil.scenario.events import Gains, LawChange, Reset
-from gfm_hil.scenario.model import Scenario
-from gfm_plant import NoEquilibrium, make_plant, plant_init
+from gfm_hil.scenario.model import Scenario, plant_of
+from gfm_plant import Network, NoEquilibrium
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import NY, NY_INNER, carried
@@ -29,15 +28,16 @@ class Bench:
     """Everything that one run changes.
 
     Attributes:
-        par, st: the plant's records.
+        plant: the plant, in common with the other converters of a network.
+        place: the converter's index in it.
         controller: the controller, its first law at rest and RUNNING.
         y: measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
         u: inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
     """
 
     scenario: Scenario
-    par: NDArray[Any]
-    st: NDArray[Any]
+    plant: Network
+    place: int
     controller: Controller
     start: OperatingPoint
     y: NDArray[np.float64]
@@ -51,14 +51,14 @@ class Bench:
     def keep(self) -> None:
         """Remember this instant as the start, to which a reset goes back."""
         c = self.controller
-        self._plant = self.par.copy(), self.st.copy()
+        self._plant = self.plant.copy()
         self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
         self._asked = c.asked
 
     def restore_plant(self, tick: int) -> None:
         """Put the plant and its grid back to their start at a tick, and clear the trip."""
-        self.par[:], self.st[:] = self._plant
-        self.st["tick"], self.u[:] = tick, self.start.commands[: len(self.u)]
+        self.plant.restore(self._plant)
+        self.plant.st["tick"], self.u[:] = tick, self.start.commands[: len(self.u)]
 
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
@@ -77,49 +77,69 @@ class Bench:
 
 
 def make_bench(scenario: Scenario) -> Bench:
-    """Build both sides of a scenario at its operating point.
+    """Build both sides of a scenario of one converter at its operating point.
 
     Raises:
-        UserError: the law has no steady state on this grid.
+        UserError: the law has no steady state on this grid, or the scenario has a network.
     """
-    plant = scenario.plant
-    if scenario.seed:
-        plant = plant.model_copy(
-            update={"sensors": plant.sensors.model_copy(update={"seed": scenario.seed})}
+    if scenario.network is not None and scenario.converter is None:
+        raise UserError(
+            "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
         )
-    par, st = make_plant(plant, scenario.T_s)
-    references = scenario.references.vector()
+    benches = make_benches(scenario)
+    return next(b for b in benches if b.scenario.converter == scenario.converter)
+
+
+def make_benches(scenario: Scenario) -> list[Bench]:
+    """Build both sides of a scenario at its operating point: a bench for each converter, with a
+    controller of its own and one plant in common.
+
+    Raises:
+        UserError: the laws have no steady state on this grid.
+    """
+    each = [scenario.of(name) for name in scenario.converters] or [scenario]
+    plant = plant_of(scenario)
+    controllers = [_controller(one, plant) for one in each]
+    laws = [controller.active_law for controller in controllers]
+    refs = [np.asarray(one.references.vector()) for one in each]
+    try:
+        if scenario.network is None:
+            grid = scenario.plant.grid
+            starts = [operating_point(plant.par, laws[0], refs[0], grid.omega_g, grid.V_g)]
+        else:
+            starts = operating_points(plant, laws, refs)
+    except NoEquilibrium as problem:
+        where = "references, plant.grid" if scenario.network is None else "network"
+        raise UserError(f"{where}: {problem}") from None
+    plant.start(np.array([s.x for s in starts]), np.array([s.commands for s in starts]))
+    inner = scenario.has_inner
+    benches = []
+    for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):
+        controller.inner = inner
+        y = np.zeros(len(carried("y", inner)))
+        if inner:
+            y[:NY], y[NY:] = start.y, start.x[: NY_INNER - NY]
+            controller.start(start.x_law, start.u, y, start.e)
+        else:
+            controller.start(start.x_law, start.u)
+        u = start.commands[: len(carried("u", inner))].copy()
+        bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), u)
+        bench.keep()
+        _ready_gains(one)
+        benches.append(bench)
+    return benches
+
+
+def _controller(scenario: Scenario, plant: Network) -> Controller:
     # under the name that events use: the name inside a law file may differ
     sets = [replace(load_law(name, scenario.inner), name=name) for name in scenario.laws()]
-    controller = Controller(
+    return Controller(
         sets,
         scenario.T_s,
-        references,
+        scenario.references.vector(),
         hold=scenario.late_policy.hold,
-        omega_b=float(par[0]["omega_b"]),
+        omega_b=plant.wiring.omega_b,
     )
-    try:
-        start = operating_point(
-            par,
-            controller.active_law,
-            np.asarray(references),
-            scenario.plant.grid.omega_g,
-            scenario.plant.grid.V_g,
-        )
-    except NoEquilibrium as problem:
-        raise UserError(f"references, plant.grid: {problem}") from None
-    plant_init(par, st, start.x, start.commands)
-    y = np.zeros(len(carried("y", controller.inner)))
-    if controller.inner:
-        y[:NY], y[NY:] = start.y, start.x[: NY_INNER - NY]
-        controller.start(start.x_law, start.u, y, start.e)
-    else:
-        controller.start(start.x_law, start.u)
-    u = start.commands[: len(carried("u", controller.inner))].copy()
-    bench = Bench(scenario, par, st, controller, start, np.zeros(len(y)), u)
-    bench.keep()
-    _ready_gains(scenario)
-    return bench
 
 
 def _ready_gains(scenario: Scenario) -> None:

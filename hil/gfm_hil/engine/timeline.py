@@ -85,7 +85,7 @@ class Timeline:
             if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in roles
         ]
         for begin, e in [(k, e) for k, e in ours if isinstance(e, GridProfile)]:
-            profile = read_profile(e.file, nominal_hz(bench.par))
+            profile = read_profile(e.file, nominal_hz(bench.plant))
             ours += [(begin + k, point) for k, point in profile.points(scenario.T_s)]
         self._todo = deque[tuple[int, Any]](sorted(ours, key=lambda entry: entry[0]))
         self._inbox: deque[tuple[Any, Ticket]] = deque()
@@ -121,7 +121,8 @@ class Timeline:
         while self._todo and self._todo[0][0] <= tick:
             event = self._todo.popleft()[1]
             if isinstance(event, Point):
-                event.apply(self._bench.par, self._bench.st)
+                if self._bench.place == 0:
+                    event.apply(self._bench.plant)
                 continue
             try:
                 self._carry_out(event, tick)
@@ -151,13 +152,15 @@ class Timeline:
                 self._bench.reset_controller()
             case GridProfile() if "operator" not in more:
                 pass  # its points follow
+            case _ if self._bench.place > 0:
+                pass  # what happens to a network, the timeline of its first converter carries out
             case _:
-                apply_grid_event(event, self._bench.par, self._bench.st)
+                apply_grid_event(event, self._bench.plant)
         self.write(tick, event.type, label=event.label(), **more)
 
     def look(self, tick: int) -> None:
         """Log what the last tick brought: a change of law, a safe state, a trip."""
-        ctl, st = self._bench.controller.ctl, self._bench.st
+        ctl, st = self._bench.controller.ctl, self._bench.plant.st
         if "controller" in self._roles and int(ctl["changes"][0]) != self._changes:
             self._changes = int(ctl["changes"][0])
             self.write(
@@ -178,13 +181,13 @@ class Timeline:
 
     def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
         """The fault that keeps our side from running, if any; the cause before its consequences."""
-        trip = int(st["trip"][0]) if "plant" in self._roles else 0
+        trip = int(st["trip"][self._bench.place]) if "plant" in self._roles else 0
         if trip not in (0, CONTROLLER):
-            return "tripped", trip_reason(st, self._bench.par)
+            return "tripped", trip_reason(self._bench.plant.records, self._bench.place)
         if "controller" in self._roles and int(ctl["state"][0]) == SAFE:
             heard = int(ctl["reason"][0]) == PLANT_TRIP
             return "tripped" if heard else "safe", safe_reason(ctl)
-        return ("safe", trip_reason(st, self._bench.par)) if trip else None
+        return ("safe", trip_reason(self._bench.plant.records, self._bench.place)) if trip else None
 
     def finish(self, tick: int) -> None:
         """The scenario is over: the run is complete unless it still waits for a reset."""

@@ -13,12 +13,12 @@ _SOON = 8  # rows; a page that is new to the processor would hold up the tick th
 
 
 @compiled
-def record_sample(row, y, par, st):
-    """Fill the part of a row of PLANT_COLUMNS that is known when the plant is sampled."""
+def record_sample(row, y, plant, i):
+    """Fill the part of a row of PLANT_COLUMNS that is known when converter i is sampled."""
     prefetch(row.ctypes.data + _SOON * row.nbytes)
     for j in range(NY):
         row[j] = y[j]
-    plant_truth(par, st, row[_TRUE:])
+    plant_truth(plant, i, row[_TRUE:])
     for j in range(NY, len(y)):
         row[_Y_INNER + j - NY] = y[j]
 

@@ -13,8 +13,8 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
 from numpy.typing import NDArray
-from scipy.signal import firwin, minimum_phase, oaconvolve
 
 from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
 
@@ -103,14 +103,16 @@ def _thinned(x: Vector, stride: int) -> Vector:
     """
     if stride == 1 or len(x) <= _TAPS * stride:
         return x
-    return oaconvolve(x, _filter(stride), "valid")[::stride]
+    return scipy.signal.oaconvolve(x, _filter(stride), "valid")[::stride]
 
 
 @cache
 def _filter(stride: int) -> Vector:
     """Coefficients, latest tick of a window first as a convolution takes them."""
     taps = _TAPS * stride + 1
-    least = minimum_phase(firwin(taps, 0.8 / stride), n_fft=32 * taps, half=False)
+    least = scipy.signal.minimum_phase(
+        scipy.signal.firwin(taps, 0.8 / stride), n_fft=32 * taps, half=False
+    )
     return np.asarray(least[::-1] / least.sum())
 
 

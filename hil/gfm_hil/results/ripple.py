@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
-from scipy.signal import detrend
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
@@ -87,7 +87,7 @@ def remaining_ripple(
         size[name], hertz[name] = _sinusoid(np.asarray(column[done - n : done]), T_s, explained)
         if size[name] <= max(limit, size.get(worst, 0.0)):
             continue
-        if np.ptp(detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
+        if np.ptp(scipy.signal.detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
             continue
         if done >= 2 * n:
             before, _ = _sinusoid(np.asarray(column[done - 2 * n : done - n]), T_s, explained)
@@ -126,7 +126,7 @@ def _sinusoid(x: NDArray[Any], T_s: float, explained: Sequence[float]) -> tuple[
     n = len(x)
     window = np.hanning(n)
     length = next_fast_len(2 * n, real=True)  # lines half as far apart: it falls on none by 4 %
-    spectrum = np.abs(np.fft.rfft(detrend(x) * window, length))
+    spectrum = np.abs(np.fft.rfft(scipy.signal.detrend(x) * window, length))
     lines = np.fft.rfftfreq(length, T_s)
     apart = 1.0 / (n * T_s)
     spectrum[lines < _SLOWEST * apart] = 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,16 @@ import numpy as np
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.compiling import compiled_bench
+from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.inproc import buffers, run_inproc
 from gfm_hil.engine.processes import Processes, Progress
-from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
 from gfm_hil.recording.columns import Rows, named
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
 from gfm_hil.recording.parts import Part, remove_parts
+from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.results.summary import origin, stages, summarise
@@ -91,9 +93,60 @@ def _run_here(bench: Bench, folder: Path, progress: Progress, interrupt: Interru
         progress(ticks, 0)
         return not interrupt.came
 
-    run_inproc(bench, parts["plant"], parts["controller"], timeline, go_on)
+    run_inproc([bench], [parts["plant"]], [parts["controller"]], [timeline], go_on)
     timeline.close()
     return began
+
+
+def run_network(
+    scenario: Scenario,
+    folder: Path,
+    progress: Progress = lambda ticks, misses: None,
+    notice: Notice = lambda text: None,
+    figures: bool = True,
+) -> NetworkRun:
+    """Run a scenario with a network and leave a folder with a run folder for each converter.
+
+    Args:
+        scenario, folder, progress, notice, figures: as for ``run_scenario``.
+
+    Raises:
+        UserError: the folder is in use, or there is no operating point.
+    """
+    names = scenario.converters
+    for name in names:
+        check_free(folder / name, scenario.ticks * len(names), scenario.has_inner)
+    benches = compiled_benches(scenario, notice)
+    runs: dict[str, Run] = {}
+    with ExitStack() as stack:
+        places = [folder / name for name in names]
+        for place, bench in zip(places, benches, strict=True):
+            place.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(in_use(place))
+            write_scenario(place, bench.scenario)
+        interrupt = stack.enter_context(Interrupt())
+        ticks, inner = scenario.ticks, scenario.has_inner
+        plant_parts = [Part.create(place, "plant", ticks, inner) for place in places]
+        controller_parts = [Part.create(place, "controller", ticks, inner) for place in places]
+        timelines = [
+            Timeline(bench, place / "events_both.jsonl", ROLES)
+            for bench, place in zip(benches, places, strict=True)
+        ]
+        began = time.monotonic()
+
+        def go_on(ticks: int) -> bool:
+            progress(ticks, 0)
+            return not interrupt.came
+
+        run_inproc(benches, plant_parts, controller_parts, timelines, go_on)
+        wall_s = time.monotonic() - began
+        for name, place, bench, timeline in zip(names, places, benches, timelines, strict=True):
+            timeline.close()
+            labels = bench.controller.labels
+            runs[name] = finish(bench.scenario, place, labels, wall_s, figures)
+        whole = NetworkRun(scenario, runs, folder)
+        whole.conclude(folder, figures)
+    return whole
 
 
 def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) -> Run:
@@ -108,20 +161,47 @@ def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) ->
     """
     bench = make_bench(scenario)
     plant, controller = parts or buffers(scenario.ticks, bench.inner)
-    plant.signals[:] = np.nan
-    timeline = TimelineInMemory(bench)
+    (run,) = _in_memory([bench], [plant], [controller])
+    return run
+
+
+def run_network_in_memory(scenario: Scenario) -> NetworkRun:
+    """Run a scenario with a network in this process and leave nothing on the disk.
+
+    Raises:
+        UserError: the scenario has no operating point.
+    """
+    benches = make_benches(scenario)
+    parts = [buffers(scenario.ticks, scenario.has_inner) for _ in benches]
+    runs = _in_memory(benches, [plant for plant, _ in parts], [own for _, own in parts])
+    return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
+
+
+def _in_memory(
+    benches: Sequence[Bench], plants: Sequence[Part], controllers: Sequence[Part]
+) -> list[Run]:
+    """Run benches; the runs' columns are copies of the parts."""
+    for plant in plants:
+        plant.signals[:] = np.nan
+    timelines = [TimelineInMemory(bench) for bench in benches]
     began, date = time.monotonic(), time.time()
     with np.errstate(all="ignore"):  # a diverging run is a result
-        run_inproc(bench, plant, controller, timeline, lambda ticks: True)
-    timeline.close()
+        run_inproc(benches, plants, controllers, timelines, lambda ticks: True)
     wall_s = time.monotonic() - began
-    recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
-    done = int(recorded[-1]) + 1 if len(recorded) else 0
-    columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
-    columns |= named("plant", plant.signals[:done].copy("F"))
-    columns |= named("controller", controller.signals[:done].copy("F"))
-    outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
-    summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
-    summary |= stages(scenario) | origin(scenario, date)
-    laws = known_laws(bench.controller.labels, laws_used(columns["law"][:]))
-    return Run(scenario, summary, columns, laws, timeline.lines)
+    runs = []
+    for bench, plant, controller, timeline in zip(
+        benches, plants, controllers, timelines, strict=True
+    ):
+        timeline.close()
+        scenario = bench.scenario
+        recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
+        done = int(recorded[-1]) + 1 if len(recorded) else 0
+        columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
+        columns |= named("plant", plant.signals[:done].copy("F"))
+        columns |= named("controller", controller.signals[:done].copy("F"))
+        outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
+        summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
+        summary |= stages(scenario) | origin(scenario, date)
+        laws = known_laws(bench.controller.labels, laws_used(columns["law"][:]))
+        runs.append(Run(scenario, summary, columns, laws, timeline.lines))
+    return runs

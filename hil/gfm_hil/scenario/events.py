@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from gfm_plant import Network
 from gfm_runtime.signals import SIGNALS
 
 _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
@@ -50,6 +51,9 @@ def reference_field(name: str, default: float | None) -> Any:
     return Field(default, description=f"{s.description}, {s.low:g} to {s.high:g} {s.unit}")
 
 
+_WHOSE = "in a network: which converter it is for; all of them if none"
+
+
 class Reference(_Event):
     """New references; ``ramp_s`` spreads the change over a time instead of one tick."""
 
@@ -59,6 +63,7 @@ class Reference(_Event):
     omega_g: float | None = reference_field("omega_g", None)
     Q_ref: float | None = reference_field("Q_ref", None)
     V_ref: float | None = reference_field("V_ref", None)
+    converter: str | None = Field(None, description=_WHOSE)
     ramp_s: float = Field(0.0, ge=0, description="spreads the change evenly over so many seconds")
 
     @model_validator(mode="after")
@@ -89,6 +94,7 @@ class LawChange(_Event):
 
     type: Literal["law"] = Field(description="kind of event")
     law: str = Field(description="catalogue name or law file")
+    converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
         return f"law {self.law}"
@@ -102,6 +108,7 @@ class Gains(_Event):
     values: dict[str, float] = Field(
         min_length=1, description="a table of names and numbers, e.g. { D_p = 0.02 }"
     )
+    converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
         return ", ".join(f"{name} = {value:g}" for name, value in self.values.items())
@@ -174,13 +181,52 @@ class PhaseJump(_Event):
 
 
 class GridImpedance(_Event):
-    """The line becomes ``L_g`` and ``R_g`` times its nominal elements."""
+    """The line becomes ``L_g`` and ``R_g`` times its nominal elements, or one of a short-circuit
+    ratio ``scr`` with ``x_over_r``, as ``plant.grid`` has them."""
 
     type: Literal["grid-impedance"] = Field(description="kind of event")
-    L_g: float = Field(gt=0, le=1e12, description="factor on the converter file's line inductor")
-    R_g: float = Field(ge=0, le=1e12, description="factor on the converter file's line resistor")
+    L_g: float | None = Field(
+        None, gt=0, le=1e12, description="factor on the converter file's line inductor"
+    )
+    R_g: float | None = Field(
+        None, ge=0, le=1e12, description="factor on the converter file's line resistor"
+    )
+    scr: float | None = Field(
+        None, gt=0, le=1e6, description="short-circuit ratio at the point of connection"
+    )
+    x_over_r: float | None = Field(
+        None, gt=0, le=1e6, description="X/R of the line at nominal frequency; goes with scr"
+    )
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> GridImpedance:
+        names = ("L_g", "R_g", "scr", "x_over_r")
+        given = [name for name in names if getattr(self, name) is not None]
+        if given not in (["L_g", "R_g"], ["scr", "x_over_r"]):
+            raise ValueError(
+                f"{', '.join(given) or 'nothing'} given: give L_g and R_g, or scr and x_over_r"
+            )
+        return self
+
+    def factors(self, plant: Network) -> tuple[float, float]:
+        """Of the line's nominal L and R.
+
+        Raises:
+            ValueError: the converter's line has no resistance that a factor could change.
+        """
+        if self.L_g is not None and self.R_g is not None:
+            return self.L_g, self.R_g
+        from gfm_plant.options import Grid
+
+        line, r = Grid(scr=self.scr, x_over_r=self.x_over_r).line(), plant.par[0]
+        assert line is not None
+        if r["R_line_n"] == 0.0:
+            raise ValueError(f"x_over_r = {self.x_over_r}: needs a converter file with R_g > 0")
+        return line["L_g"] / float(r["L_line_n"]), line["R_g"] / float(r["R_line_n"])
 
     def label(self) -> str:
+        if self.scr is not None:
+            return f"SCR {self.scr:g}, X/R {self.x_over_r:g}"
         return f"line L × {self.L_g:g}, R × {self.R_g:g}"
 
 
@@ -233,21 +279,40 @@ class GridUnbalance(_Event):
 
 
 class Fault(_Event):
-    """A three-phase fault to ground on the line, through ``R`` [p.u.]."""
+    """A three-phase fault to ground on a line, or at a node of a network, through ``R`` [p.u.]."""
 
     type: Literal["fault"] = Field(description="kind of event")
-    position: float = Field(
-        ge=0, lt=1, description="place on the line: 0 at the filter capacitor, 1 at the grid"
+    position: float | None = Field(
+        None,
+        ge=0,
+        lt=1,
+        description="place on the line: 0 at its start, which for a converter's line is the filter "
+        "capacitor, 1 at its end",
     )
-    R: float = Field(
-        ge=0, le=1e6, description="resistance, p.u.; at least 1e-4 at the filter capacitor"
+    line: str | None = Field(
+        None, description="in a network: name of the line, or of the converter whose line it is"
     )
+    node: str | None = Field(None, description="in a network: the node, in place of a position")
+    R: float = Field(ge=0, le=1e6, description="resistance, p.u.; at least 1e-4 at a capacitor")
     duration: float | None = Field(
         None, gt=0, description="s until it is cleared; none: fault-clear clears it"
     )
 
+    @model_validator(mode="after")
+    def _has_one_place(self) -> Fault:
+        if (self.position is None) == (self.node is None):
+            raise ValueError(f"position = {self.position}, node = {self.node}: give one of them")
+        if self.line is not None and self.position is None:
+            raise ValueError(f"line = {self.line!r}: goes with a position")
+        return self
+
     def label(self) -> str:
-        where = f"{self.position:g} of the line" if self.position else "the filter"
+        line = "the line" if self.line is None else f"line {self.line}"
+        where = f"{self.position:g} of {line}" if self.position else "the filter"
+        if self.position == 0 and self.line is not None:
+            where = f"the start of {line}"
+        if self.node is not None:
+            where = f"node {self.node}"
         return f"fault at {where}" + (f" for {self.duration:g} s" if self.duration else "")
 
 
@@ -270,6 +335,19 @@ class Breaker(_Event):
         return "grid breaker " + ("closes" if self.closed else "opens")
 
 
+class LineBreaker(_Event):
+    """The breaker of a line or load of a network opens or closes."""
+
+    type: Literal["breaker"] = Field(description="kind of event")
+    name: str = Field(
+        min_length=1, description="of the line or load, or of the converter whose line it is"
+    )
+    closed: bool = Field(description="false opens it")
+
+    def label(self) -> str:
+        return f"{self.name} " + ("on" if self.closed else "off")
+
+
 Event = Annotated[
     Reference
     | LawChange
@@ -284,42 +362,47 @@ Event = Annotated[
     | GridUnbalance
     | Fault
     | FaultClear
-    | Breaker,
+    | Breaker
+    | LineBreaker,
     Field(discriminator="type"),
 ]
 
 CONTROLLER_EVENTS = (Reference, LawChange, Gains, Reset)
 
 
-def nominal_hz(par: Any) -> float:
-    """Nominal frequency of a plant, Hz, from its record."""
-    return float(par[0]["omega_b"]) / (2 * math.pi)
+def nominal_hz(plant: Network) -> float:
+    """Nominal frequency of a plant, Hz."""
+    return plant.wiring.omega_b / (2 * math.pi)
 
 
-def apply_grid_event(event: Any, par: Any, st: Any) -> None:
-    """Apply one of the plant's events to its records, between two ticks."""
+def apply_grid_event(event: Any, plant: Network) -> None:
+    """Apply one of the plant's events, between two ticks."""
     from gfm_plant import grid
 
-    f_b = nominal_hz(par)
+    f_b = nominal_hz(plant)
     match event:
         case GridFrequency():
             rate = event.rate / f_b if event.rate else None
-            grid.grid_frequency(par, st, event.f_hz / f_b, rate)
+            grid.grid_frequency(plant, event.f_hz / f_b, rate)
         case GridVoltage():
-            grid.grid_voltage(st, event.V_g, event.rate, event.duration)
+            grid.grid_voltage(plant, event.V_g, event.rate, event.duration)
         case GridProfile():
             raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
         case PhaseJump():
-            grid.phase_jump(st, event.degrees)
+            grid.phase_jump(plant, event.degrees)
         case GridImpedance():
-            grid.grid_impedance(par, st, event.L_g, event.R_g)
+            grid.grid_impedance(plant, *event.factors(plant))
         case GridLoad():
-            grid.grid_load(par, st, event.change)
+            grid.grid_load(plant, event.change)
         case GridUnbalance():
-            grid.grid_unbalance(par, st, event.factors(), event.duration)
+            grid.grid_unbalance(plant, event.factors(), event.duration)
         case Fault():
-            grid.fault(par, st, event.position, event.R, event.duration)
+            grid.fault(
+                plant, event.position, event.R, event.duration, line=event.line, node=event.node
+            )
         case FaultClear():
-            grid.clear_fault(par, st)
+            grid.clear_fault(plant)
         case Breaker():
-            grid.breaker(par, st, event.closed)
+            grid.breaker(plant, event.closed)
+        case LineBreaker():
+            grid.line_breaker(plant, event.name, event.closed)

@@ -25,6 +25,7 @@ from gfm_hil.scenario.events import (
     GridLoad,
     GridProfile,
     LawChange,
+    LineBreaker,
     Reset,
     apply_grid_event,
     check_reference,
@@ -33,7 +34,16 @@ from gfm_hil.scenario.events import (
 )
 from gfm_hil.scenario.expectation import check_expectation
 from gfm_hil.scenario.profiles import content_hash, look_beside, read_profile
-from gfm_plant import ConverterParameters, Plant, load_converter, make_plant
+from gfm_plant import (
+    ConverterParameters,
+    Network,
+    NetworkParts,
+    Plant,
+    load_converter,
+    make_network,
+    make_plant,
+)
+from gfm_plant.records import SIZES
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
 from gfm_runtime.errors import meant, printable
 from gfm_runtime.inner_file import named_inner
@@ -45,6 +55,9 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+_CAN_BE_IMPOSSIBLE = (
+    Breaker, Fault, GridFrequency, GridImpedance, GridLoad, GridProfile, LineBreaker
+)  # fmt: skip
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
 
@@ -127,6 +140,33 @@ class LatePolicy(_Model):
         return self
 
 
+class Member(_Model):
+    """One converter of a network; what it does not give is that of the scenario."""
+
+    node: str = Field(min_length=1, description="where its line ends")
+    law: str | None = Field(None, description="catalogue name or path of a law file")
+    inner: str | None = Field(None, description="inner stage of its laws")
+    references: References | None = Field(None, description="references Y_ref at the start")
+    plant: Plant | None = Field(None, description="converter and instruments, without a grid")
+    expect: Literal["completed", "oscillating", "tripped", "safe"] | None = Field(
+        None, description="status with which its part of the run counts as passed"
+    )
+
+    @model_validator(mode="after")
+    def _has_no_grid(self) -> Member:
+        if self.plant is not None and self.plant.grid != Plant().grid:
+            raise ValueError("plant.grid: is the scenario's own; its node is network.grid")
+        return self
+
+
+class Members(NetworkParts):
+    """Several converters and what connects them."""
+
+    converters: dict[str, Member] = Field(
+        min_length=1, max_length=max(SIZES), description="by name"
+    )
+
+
 class Scenario(_Model):
     """One experiment."""
 
@@ -183,6 +223,12 @@ class Scenario(_Model):
         LatePolicy(), description="real time: what happens to late frames"
     )
     plant: Plant = Field(Plant(), description="converter, grid and instruments")
+    network: Members | None = Field(
+        None, description="several converters in one network; one on its line to the grid if none"
+    )
+    converter: str | None = Field(
+        None, description="in the folder of a converter of a network: which one it is"
+    )
     events: list[Event] = Field(
         default_factory=list,
         max_length=10_000,
@@ -193,6 +239,32 @@ class Scenario(_Model):
     def ticks(self) -> int:
         """Number of ticks of the run."""
         return round(self.duration / self.T_s)
+
+    @property
+    def converters(self) -> list[str]:
+        """Names of the converters of the network; none without one."""
+        return [] if self.network is None else list(self.network.converters)
+
+    def of(self, name: str) -> Scenario:
+        """The scenario as one converter of the network sees it: with its law, references and plant,
+        and the events of the network and of itself."""
+        assert self.network is not None
+        given = ("law", "inner", "references", "plant", "expect")
+
+        def whole(member: Member) -> Member:
+            own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
+            if "plant" in own:
+                own["plant"] = self.plant.model_copy(update={"grid": Plant().grid})
+            return member.model_copy(update=own)
+
+        members = {key: whole(member) for key, member in self.network.converters.items()}
+        own = {key: getattr(members[name], key) for key in given}
+        own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
+        own["network"] = self.network.model_copy(update={"converters": members})
+        events = [e for e in self.events if getattr(e, "converter", None) in (None, name)]
+        copy = self.model_copy(update={**own, "events": events, "converter": name})
+        copy.__dict__.pop("has_inner", None)
+        return copy
 
     def laws(self) -> list[str]:
         """Names of all laws that the run uses, each once, the initial law first."""
@@ -228,7 +300,8 @@ class Scenario(_Model):
     def has_inner(self) -> bool:
         """Whether a law of the run has an inner stage: frames and recording then carry its
         signals."""
-        found = (load_law(name, self.inner) for name in self.laws())
+        each = [self.of(name) for name in self.converters] or [self]
+        found = (load_law(name, one.inner) for one in each for name in one.laws())
         return any(law.inner is not None for one in found for law in one.laws)
 
     @model_validator(mode="after")
@@ -244,8 +317,27 @@ class Scenario(_Model):
                 )
             if isinstance(event, Reset) and self.after_trip == "end":
                 problems.append(f"events.{k}: nothing to reset with after_trip = 'end'; use 'wait'")
-            if isinstance(event, Breaker) and self.plant.grid.load_R is None:
+            if isinstance(event, Breaker) and self.plant.grid.load_R is None and not self.network:
                 problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
+            if isinstance(event, GridImpedance) and self.network is not None:
+                problems.append(
+                    f"events.{k}: grid-impedance is for the line of one converter alone; a"
+                    " network's lines have breakers"
+                )
+            asked = getattr(event, "converter", None)
+            if asked is not None and asked not in self.converters:
+                problems.append(
+                    f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
+                    f"{meant(asked, self.converters)}"
+                )
+        if self.network is not None and self.link.type != INPROC:
+            problems.append(
+                f"link.type = {self.link.type!r}: a network runs in one process; use {INPROC!r}"
+            )
+        if self.network is not None and self.after_trip == "wait":
+            problems.append("after_trip = 'wait': a network has no reset yet; use 'end'")
+        if self.network is not None and self.plant.grid.load_R is not None:
+            problems.append("plant.grid.load_R: a load of a network is one of network.loads")
         if self.link.type == INPROC:
             if self.mode == "realtime":
                 problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
@@ -411,6 +503,14 @@ def check_scenario(
         except LawError as problem:
             ours = "" if ("inner",) in overrides else f"{where}: "
             raise UserError("\n".join(ours + line for line in problem.lines)) from None
+    for member in [scenario.of(name) for name in scenario.converters]:
+        for law in member.laws():
+            try:
+                for stage in load_law(law, member.inner).laws:
+                    _try_law(law, stage, scenario.T_s)
+            except LawError as problem:
+                at = f"network.converters.{member.converter}.law: "
+                wrong += [f"{where}: {at}{line}" for line in problem.lines]
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
         try:
@@ -434,6 +534,25 @@ def _try_law(name: str, stage: Law, T_s: float) -> None:
         raise problem.within(f"law {name}") from None
 
 
+def plant_of(scenario: Scenario) -> Network:
+    """The plant of a scenario: one converter, or those of its network.
+
+    Raises:
+        ValueError: as ``make_plant`` and ``make_network``.
+    """
+    if scenario.network is None:
+        options = scenario.plant
+        options = options.with_seed(scenario.seed) if scenario.seed else options
+        return make_plant(options, scenario.T_s)
+    converters = {}
+    for name, member in scenario.network.converters.items():
+        options = scenario.of(name).plant
+        if scenario.seed:
+            options = options.with_seed(scenario.seed)
+        converters[name] = (options, member.node)
+    return make_network(converters, scenario.T_s, scenario.plant.grid, scenario.network)
+
+
 def _try_plant(scenario: Scenario) -> None:
     """Build the plant and try those of its events that not every plant can carry out."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
@@ -443,19 +562,19 @@ def _try_plant(scenario: Scenario) -> None:
         except ValueError as problem:
             raise UserError(f"{converter}: {problem}") from None
     try:
-        par, st = make_plant(scenario.plant, scenario.T_s)
+        plant = plant_of(scenario)
     except ValidationError as problem:
         wrong = lines(problem, ConverterParameters)
         raise UserError("; ".join(f"{converter}: {line}" for line in wrong)) from None
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):
-        if isinstance(event, Fault | GridFrequency | GridImpedance | GridLoad | GridProfile):
+        if isinstance(event, _CAN_BE_IMPOSSIBLE):
             try:
                 if isinstance(event, GridProfile):
-                    profile = read_profile(event.file, nominal_hz(par))
-                    next(profile.points(scenario.T_s))[1].apply(par, st)
+                    profile = read_profile(event.file, nominal_hz(plant))
+                    next(profile.points(scenario.T_s))[1].apply(plant)
                 else:
-                    apply_grid_event(event, par, st)
+                    apply_grid_event(event, plant)
             except (UserError, ValueError) as problem:
                 raise UserError(f"events.{k}: {problem}") from None

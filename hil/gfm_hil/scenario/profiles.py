@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gfm_hil.core.errors import UserError
+from gfm_plant import Network
 from gfm_runtime.errors import printable
 from gfm_runtime.signals import SIGNALS
 
@@ -36,7 +37,7 @@ class Point(NamedTuple):
     V_g: float | None
     ticks: int
 
-    def apply(self, par: Any, st: Any) -> None:
+    def apply(self, plant: Network) -> None:
         """Carry it out on the plant's records, between two ticks.
 
         Raises:
@@ -45,14 +46,14 @@ class Point(NamedTuple):
         from gfm_plant.grid import grid_frequency, grid_voltage
 
         if self.omega_g is not None:
-            grid_frequency(par, st, self.omega_g, self._rate(self.omega_g, par, st, "omega_g"))
+            grid_frequency(plant, self.omega_g, self._rate(self.omega_g, plant, "omega_g"))
         if self.V_g is not None:
-            grid_voltage(st, self.V_g, self._rate(self.V_g, par, st, "V_g"))
+            grid_voltage(plant, self.V_g, self._rate(self.V_g, plant, "V_g"))
 
-    def _rate(self, value: float, par: Any, st: Any, name: str) -> float | None:
+    def _rate(self, value: float, plant: Network, name: str) -> float | None:
         """p.u./s from where the grid is now; None for a step."""
-        way = abs(value - float(st[0][name]))
-        return way / (self.ticks * float(par[0]["T_s"])) if self.ticks and way else None
+        way = abs(value - float(plant.now[0][name]))
+        return way / (self.ticks * float(plant.net[0]["T_s"])) if self.ticks and way else None
 
 
 @dataclass(frozen=True)

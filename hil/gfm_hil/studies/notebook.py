@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory
+from gfm_hil.results.runner import run_in_memory, run_network_in_memory
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import execute, processes
@@ -52,6 +53,21 @@ def run(
             changes = {**changes, "law": file}
         made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
     return _named(made, law) if isinstance(law, Law) else made
+
+
+def run_network(scenario: str | Path | Scenario | dict[str, Any], **changes: Any) -> NetworkRun:
+    """Run a scenario with several converters in this process, and keep the result in memory.
+
+    Args:
+        scenario, changes: as for ``run``.
+
+    Raises:
+        UserError: one line a mistake; it has no network; or no operating point.
+    """
+    checked = load_scenario(scenario, in_process=True, **changes)
+    if checked.network is None:
+        raise UserError("network: the scenario has none; use gfmhil.run")
+    return run_network_in_memory(checked)
 
 
 def _named(made: Run, law: Law) -> Run:

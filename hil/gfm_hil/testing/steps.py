@@ -166,6 +166,10 @@ class Steps:
         the factor ``L_g``: the same line, longer or shorter."""
         self._planned.step("grid-impedance", L_g=L_g, R_g=L_g if R_g is None else R_g)
 
+    def scr(self, scr: float, x_over_r: float) -> None:
+        """The line becomes one of that short-circuit ratio, with that X/R."""
+        self._planned.step("grid-impedance", scr=scr, x_over_r=x_over_r)
+
     def grid_load(self, change: float) -> None:
         """The load of a finite grid changes, p.u. of the grid's rating."""
         self._planned.step("grid-load", change=change)

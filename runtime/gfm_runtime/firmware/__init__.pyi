@@ -1,7 +1,8 @@
 from .check import OPTIMISED, TARGETS, Checked, check
+from .dll import build_dll, dll_sources
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
-from .module import REALS, STYLES, Module, Style, make_modules
+from .module import REALS, STYLES, Module, Style, make_modules, sources
 
 __all__ = [
     "CHECKED",
@@ -14,8 +15,11 @@ __all__ = [
     "Golden",
     "Module",
     "Style",
+    "build_dll",
     "check",
+    "dll_sources",
     "export",
     "golden",
     "make_modules",
+    "sources",
 ]

@@ -1,4 +1,16 @@
-"""How numbers, names and remarks look in C99, and the templates they go into."""
+"""How numbers, names and remarks look in C99, and the templates they go into.
+
+A template holds keys, ``@KEY@``, and choices, each mark on a line of its own::
+
+    /* @if NAME@ */
+        a();
+    /* @else@ */
+        b();
+    /* @end@ */
+
+A choice is made when the C code is written, or left to the C code as ``if (...) {``; ``@elif
+NAME@`` is possible too. A choice that begins in the first column is about whole functions.
+"""
 
 from __future__ import annotations
 
@@ -51,3 +63,56 @@ def filled(text: str, values: Mapping[str, str]) -> str:
         KeyError: the text holds a key that ``values`` does not.
     """
     return re.sub(r"@([\w.-]+)@", lambda found: values[found[1]], text)
+
+
+#: by its name, whether a choice holds, or the C expression that says so at run time
+Choices = Mapping[str, bool | str]
+_MARK = re.compile(r"( *)/\* @(if|elif|else|end)(?: (\w+))?@ \*/\n")
+
+
+def chosen(text: str, choices: Choices) -> str:
+    """The text with its choices made, or written out in C.
+
+    Raises:
+        KeyError: the text asks for a choice that ``choices`` does not hold.
+    """
+    out: list[str] = []
+    open_choices: list[_Choice] = []
+    for line in text.splitlines(keepends=True):
+        mark = _MARK.fullmatch(line)
+        if mark is None:
+            if all(choice.taken for choice in open_choices):
+                moved = sum(4 for choice in open_choices if choice.dedents)
+                out.append(line[moved:] if line[:moved].isspace() else line)
+            continue
+        indent, word, name = mark.groups()
+        if word == "if":
+            open_choices.append(_Choice(indent, choices[name]))
+        elif word == "elif":
+            open_choices[-1].next(choices[name])
+        elif word == "else":
+            open_choices[-1].next(True)
+        *outer, now = open_choices
+        if now.in_c and all(choice.taken for choice in outer):
+            expression = f"({choices[name]}) " if name else ""
+            moved = sum(4 for choice in outer if choice.dedents)
+            opens = {"if": f"if {expression}{{", "elif": f"}} else if {expression}{{",
+                     "else": "} else {", "end": "}"}  # fmt: skip
+            out.append(f"{indent[moved:]}{opens[word]}\n")
+        if word == "end":
+            open_choices.pop()
+    return "".join(out)
+
+
+class _Choice:
+    """A choice that is open while its lines are read."""
+
+    def __init__(self, indent: str, holds: bool | str) -> None:
+        self.in_c = isinstance(holds, str) and indent != ""
+        self.dedents = indent != "" and not self.in_c
+        self.taken = self._done = bool(holds)
+
+    def next(self, holds: bool | str) -> None:
+        """``@elif@`` or ``@else@``."""
+        self.taken = self.in_c or (bool(holds) and not self._done)
+        self._done = self._done or self.taken

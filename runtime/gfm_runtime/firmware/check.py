@@ -172,20 +172,20 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
 def _build(folder: Path, at: Path, where: Target, names: Sequence[str], flags: str) -> None:
     compiler = [where.prefix + where.compiler, *FLAGS, *where.flags, *shlex.split(flags)]
     own = [str(folder / f"{name}.c") for name in names]
-    _call([*compiler, "-fstack-usage", f"-I{folder}", "-c", *own], at)
+    called([*compiler, "-fstack-usage", f"-I{folder}", "-c", *own], at)
     rest = [str(folder / "selftest.c"), str(_HARNESS.joinpath("harness.c"))]
     hooks = ["-DGOLDEN_NO_MAIN", "-DGOLDEN_CLOCK=clock_now"]
-    _call([*compiler, "-std=gnu99", *hooks, f"-I{folder}", "-c", *rest], at)
+    called([*compiler, "-std=gnu99", *hooks, f"-I{folder}", "-c", *rest], at)
     objects = [f"{name}.o" for name in (*names, "selftest", "harness")]
-    _call([*compiler, *objects, "-o", "check.elf", *where.link], at)
+    called([*compiler, *objects, "-o", "check.elf", *where.link], at)
 
 
 def _run(machine: Sequence[str], at: Path, bare: bool) -> str:
     command = [*machine, "-kernel", "check.elf"] if bare else ["./check.elf"]
-    return _call(command, at)
+    return called(command, at)
 
 
-def _call(command: Sequence[str], at: Path) -> str:
+def called(command: Sequence[str], at: Path) -> str:
     """Run a program in a folder; what it says.
 
     Raises:
@@ -207,7 +207,7 @@ def _call(command: Sequence[str], at: Path) -> str:
 
 def _sections(at: Path, where: Target, names: set[str]) -> tuple[int, int]:
     """Bytes of code and of constants of object files."""
-    said = _call([where.prefix + "size", "-A", *(f"{name}.o" for name in sorted(names))], at)
+    said = called([where.prefix + "size", "-A", *(f"{name}.o" for name in sorted(names))], at)
     code = constants = 0
     for section, size in re.findall(r"^(\.\S+)\s+(\d+)\s", said, re.MULTILINE):
         if section.startswith(".text"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,14 +10,18 @@ from typing import Any
 import numpy as np
 
 from gfm_runtime.error_maps import HYBRID_ANGLE
-from gfm_runtime.firmware.c_text import filled, template
+from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
 from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
 from gfm_runtime.firmware.report import reports
+from gfm_runtime.firmware.stage import SIZE
 from gfm_runtime.law import Law
+from gfm_runtime.signals import carried
 
 
-def export(laws: Mapping[str, Law], T_s: float, real: str, style: Style) -> dict[str, str]:
+def export(
+    laws: Mapping[str, Law], T_s: float, real: str, style: Style, omega_b: float = 100 * math.pi
+) -> dict[str, str]:
     """The files of a firmware folder by name.
 
     Args:
@@ -24,11 +29,12 @@ def export(laws: Mapping[str, Law], T_s: float, real: str, style: Style) -> dict
         T_s: sampling time, s.
         real: float32 or float64.
         style: see ``gfm_runtime.firmware.module``.
+        omega_b: base frequency of the converter, rad/s, for an inner stage.
 
     Raises:
         LawError: as ``make_modules``.
     """
-    modules = make_modules(laws, T_s, real)
+    modules = make_modules(laws, T_s, real, omega_b)
     rows = golden(modules, SHIPPED)
     return {
         **sources(modules, T_s, style),
@@ -44,6 +50,9 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
     adapters, table, names, sizes = [], [], [], []
     parts = ("init", "reset", "step", "look", "settle", "change", "view")
+    stages = modules[0].stages
+    choices = {"stages": stages}
+    e = {"E": ", const golden_real *e" * stages, "e": ", e" * stages, "NOW_E": ", now.e" * stages}
     for m in modules:
         own = style == "unrolled"
         keys = {
@@ -51,8 +60,9 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
             "T": m.prefix if own else "gfm",
             "ARGUMENT": "" if own else f"&{m.prefix}_law, ",
             "N": str(m.n),
+            **e,
         }
-        adapters.append(filled(template("adapter.c"), keys))
+        adapters.append(filled(chosen(template("adapter.c"), choices), keys))
         table.append("    {" + ", ".join(f"{m.prefix}_do_{part}" for part in parts) + "},")
         names.append(f'    "{m.prefix}",')
         sizes.append(f"    sizeof({keys['T']}_t),")
@@ -62,14 +72,20 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         **C_TYPES[str(modules[0].real)],
         "LAWS": str(len(modules)),
         "NX": str(states),
-        "WORDS": str(len(columns(states))),
+        "NY": str(len(carried("y", stages))),
+        "NU": str(len(carried("u", stages))),
+        "STAGE": str(SIZE),
+        "WORDS": str(len(columns(states, stages))),
+        **e,
         "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),
         "ADAPTERS": "".join(adapters).rstrip("\n") + "\n",
         "TABLE": "\n".join(table),
         "NAMES": "\n".join(names),
         "SIZES": "\n".join(sizes),
     }
-    return {name: filled(template(name), keys) for name in ("selftest.h", "selftest.c")}
+    return {
+        name: filled(chosen(template(name), choices), keys) for name in ("selftest.h", "selftest.c")
+    }
 
 
 def _golden_header(rows: Golden, real: np.dtype[Any]) -> str:
@@ -107,4 +123,4 @@ def _cmake(modules: Sequence[Module], style: Style) -> str:
 
 def needs_sqrt(m: Module) -> bool:
     """Whether a law's unrolled step takes a square root."""
-    return int(m.record["error_map"]) == HYBRID_ANGLE
+    return m.stages or int(m.record["error_map"]) == HYBRID_ANGLE

@@ -6,14 +6,14 @@ of its size. The inputs are 30 ticks each of: noise about the operating point; r
 references; the whole ranges of the signal table at random; the same extreme for long, so that u is
 limited; powers that are subnormal or zeros of both signs; measurements that are not finite or out
 of range, the safe state and its end; changes of law. They come from integers of PCG64, so they are
-the same on every machine.
+the same on every machine. With an inner stage the filter's currents and voltages go with them.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,9 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
+from gfm_runtime.controller import step_with_inner
 from gfm_runtime.firmware.module import BAD_REF, Module
-from gfm_runtime.kernel import N_MAX, state_dtype, step
-from gfm_runtime.signals import NU, NY, group
+from gfm_runtime.firmware.stage import VARIABLES
+from gfm_runtime.inner import settle_inner, take_measurements
+from gfm_runtime.kernel import state_dtype, step
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, carried, carried_rows, group, names
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into
 
@@ -32,6 +35,7 @@ from gfm_runtime.switchover import change_law, settle_into
 STEP, INIT, SWITCH, RESET = range(4)
 SEGMENT = 30  # ticks of one kind
 KINDS = 7
+INSIDE = 1e-3  # of a range; stays off its ends, which differ in float32
 SHIPPED, CHECKED = KINDS * SEGMENT, 48 * KINDS * SEGMENT  # ticks a law: 210 and 10,080
 
 Inputs = tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]
@@ -43,8 +47,8 @@ class Golden:
 
     Attributes:
         words: shape (rows, columns), uint32 or uint64.
-        columns: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (u of
-            the last tick), trend_*.
+        columns: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the
+            law's u of the last tick), trend_*; with an inner stage its variables, and limited.
     """
 
     words: NDArray[Any]
@@ -59,15 +63,22 @@ class Golden:
         )
 
 
-def columns(states: int) -> tuple[str, ...]:
-    """The columns of golden rows whose laws have up to ``states`` states."""
-    y, u, ref = (tuple(s.name for s in group(name)) for name in ("y", "u", "ref"))
+def columns(states: int, stages: bool) -> tuple[str, ...]:
+    """The columns of golden rows whose laws have up to ``states`` states, and inner stages."""
+    y, u, ref = carried("y", stages), carried("u", stages), names("ref")
+    own = names("u")
+    variables = [
+        f"{name}{end}"
+        for name, size, _ in VARIABLES
+        for end in (("_d", "_q") if size > 1 else ("",))
+    ]
     return (
         "op", "law", "result",
         *(f"ref_{name}" for name in ref), *(f"y_{name}" for name in y),
         *(f"u_{name}" for name in u), "bump",
-        *(f"x_{i}" for i in range(states)), *(f"offset_{name}" for name in u),
-        *(f"last_{name}" for name in u), *(f"trend_{name}" for name in u),
+        *(f"x_{i}" for i in range(states)), *(f"offset_{name}" for name in own),
+        *(f"last_{name}" for name in own), *(f"trend_{name}" for name in own),
+        *([*variables, "limited"] if stages else ()),
     )  # fmt: skip
 
 
@@ -76,112 +87,135 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
 
     The first law starts by init, each of the others by a change from the law before it.
     """
-    real = modules[0].real
+    real, stages = modules[0].real, modules[0].stages
     states = max([1, *(m.n for m in modules)])
-    names = columns(states)
     word = np.dtype(f"u{real.itemsize}")
     laws = np.array([m.record for m in modules])
     instances = np.zeros((len(modules), 2), state_dtype(real))
-    ends = [[getattr(s, e) for s in group(v)] for v in ("y", "ref") for e in ("low", "high")]
-    ranges = np.array(ends, real)
-    start = np.array([s.default for s in group("u")], real)
-    now, bump = np.zeros(3, np.int64), np.zeros(1, real)
-    u, new_u, zero = np.zeros(NU, real), np.zeros(NU, real), np.zeros(NU, real)
+    signals = (*carried_rows("y", stages), *group("ref"))
+    ranges = np.array([[getattr(s, e) for s in signals] for e in ("low", "high")], real)
+    now, io = np.zeros(3, np.int64), np.zeros(1, _io_dtype(real))
     parts = []
     for k, module in enumerate(modules):
-        op, refs, ys = inputs(zlib.crc32(module.prefix.encode()), ticks, real)
+        op, refs, ys = inputs(zlib.crc32(module.prefix.encode()), ticks, real, stages)
         op[0] = INIT if k == 0 else SWITCH
-        result, out = np.zeros(ticks, np.int64), np.zeros((ticks, len(names) - 3), real)
+        result, u = np.zeros(ticks, np.int64), np.zeros((ticks, len(carried("u", stages))), real)
+        bump = np.zeros(ticks, real)
+        after: NDArray[Any] = np.zeros(ticks, instances.dtype)
         _drive(
-            laws, instances, ranges, start, op, k, refs, ys, now, u, new_u, zero, bump, result, out
-        )
-        integers = np.stack([op, np.full(ticks, k), result], axis=1).astype(word)
-        parts.append(np.hstack([integers, out.view(word)]))
-    return Golden(np.vstack(parts), names)
+            laws, instances, _started(real), ranges, op, k, refs, ys, now, io, result, u, bump,
+            after,
+        )  # fmt: skip
+        integers = [op, np.full(ticks, k), result]
+        numbers = [refs, ys, u, bump, after["x"][:, :states]]
+        numbers += [after[name] for name in ("offset", "u", "trend")]
+        if stages:
+            numbers += [after[name] for name, *_ in VARIABLES]
+        columns_of = [np.column_stack(integers).astype(word), np.column_stack(numbers).view(word)]
+        if stages:
+            columns_of.append(after["limited"][:, None].astype(word))
+        parts.append(np.hstack(columns_of))
+    return Golden(np.vstack(parts), columns(states, stages))
+
+
+def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:
+    """What goes into and out of a step, as ``gfm_runtime.controller`` has it; and the u in use."""
+    return np.dtype(
+        [
+            ("ref", real, (NY,)), ("ref_seen", real, (NY,)), ("y", real, (NY_INNER,)),
+            ("u", real, (NU,)), ("out", real, (NU_INNER,)), ("held", real, (NU_INNER,)),
+            ("zero", real, (NU,)), ("bump", real),
+        ],
+        align=True,
+    )  # fmt: skip
+
+
+def _started(real: np.dtype[Any]) -> NDArray[Any]:
+    """An instance after its init, one element."""
+    start = np.zeros(1, state_dtype(real))
+    start["u"] = _, omega, E = [s.default for s in group("u")]
+    start["omega_pll"], start["pll"], start["e"] = omega, (1.0, 0.0), (E, 0.0)
+    return start
 
 
 @compiled
-def _drive(laws, instances, ranges, start, op, k, refs, ys, now, u, new_u, zero, bump, result, out):
+def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, bump, after):
     """The rows of law k, as the self-test has them: two instances of each law, one in use.
 
-    ``now`` is the law and the instance in use and the result that is latched, ``u`` and ``bump``
-    are the newest; they go on from call to call. ``result`` and ``out`` are what the rows say.
+    ``now`` is the law and the instance in use and the result that is latched; ``now`` and ``io``
+    go on from call to call. ``result``, ``u``, ``bump`` and ``after`` are what the rows say.
     """
+    c = io[0]
+    n_y, n_u = ys.shape[1], u.shape[1]
+    inner = n_y > NY
     for i in range(len(op)):
-        ref, y = refs[i], ys[i]
+        for j in range(NY):
+            c.ref[j] = refs[i, j]
+        for j in range(n_y):
+            c.y[j] = ys[i, j]
         if op[i] == INIT:
             now[0], now[1], now[2] = k, 0, OK
-            state = instances[k, 0]
-            for j in range(N_MAX):
-                state.x[j] = 0
-            for j in range(NU):
-                state.offset[j] = state.trend[j] = 0
-                state.u[j] = start[j]
+            instances[k, 0] = fresh[0]
+            c.bump = 0
+            for j in range(n_u):
+                c.held[j] = 0
         elif op[i] == SWITCH:
             old = now[0]
             old_state, new_state = instances[old, now[1]], instances[k, 1 - now[1]]
-            bump[0] = change_law(laws[old], old_state, laws[k], new_state, ref, y, u)
+            c.bump = change_law(laws[old], old_state, laws[k], new_state, c.ref, c.y, c.u)
+            if inner:
+                take_measurements(new_state, c.y)
+                settle_inner(laws[k], new_state, c.u, old_state.e[0], old_state.e[1])
             now[0], now[1] = k, 1 - now[1]
         elif op[i] == RESET:
             now[2] = OK
+            old_state = instances[now[0], now[1]]
             for j in range(NU):
-                u[j] = instances[now[0], now[1]].u[j]
-            settle_into(laws[now[0]], instances[now[0], now[1]], ref, y, u, zero)
+                c.u[j] = old_state.u[j]
+            settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
+            if inner:
+                take_measurements(old_state, c.y)
+                settle_inner(laws[now[0]], old_state, c.u, old_state.e[0], old_state.e[1])
         law, state = laws[now[0]], instances[now[0], now[1]]
         if now[2] == OK:
-            now[2] = _refusal(ranges, ref, y)
+            now[2] = _refusal(ranges, c.ref, c.y, n_y)
         if now[2] == OK:
-            step(law, state, ref, y, new_u)
-            for j in range(NU):
-                if not math.isfinite(new_u[j]):
+            if inner:
+                step_with_inner(law, state, c)
+            else:
+                step(law, state, c.ref, c.y, c.u)
+                for j in range(NU):
+                    c.out[j] = c.u[j]
+            for j in range(n_u):
+                if not math.isfinite(c.out[j]):
                     now[2] = BAD_U
         if now[2] == OK:
-            for j in range(NU):
-                u[j] = new_u[j]
-        result[i] = now[2]
-        _write(out[i], state, ref, y, u, bump[0])
+            for j in range(n_u):
+                c.held[j] = c.out[j]
+        result[i], bump[i] = now[2], c.bump
+        for j in range(n_u):
+            u[i, j] = c.held[j]
+        after[i] = state
 
 
 @compiled
-def _refusal(ranges, ref, y):
-    """OK, or why a step refuses references and measurements (each (5,), p.u.)."""
-    for j in range(NY):
+def _refusal(ranges, ref, y, n_y):
+    """OK, or why a step refuses references (5,) and the first n_y measurements, p.u."""
+    for j in range(n_y):
         if not (ranges[0, j] <= y[j] <= ranges[1, j]):
             return BAD_Y
     for j in range(NY):
-        if not (ranges[2, j] <= ref[j] <= ranges[3, j]):
+        if not (ranges[0, n_y + j] <= ref[j] <= ranges[1, n_y + j]):
             return BAD_REF
     return OK
 
 
-@compiled
-def _write(out, state, ref, y, u, bump):
-    """The numbers of a row, in the order of the columns."""
-    n = len(out) - 2 * NY - 4 * NU - 1
-    for j in range(NY):
-        out[j], out[NY + j] = ref[j], y[j]
-    at = 2 * NY
-    for j in range(NU):
-        out[at + j] = u[j]
-    out[at + NU] = bump
-    at += NU + 1
-    for j in range(n):
-        out[at + j] = state.x[j]
-    at += n
-    for j in range(NU):
-        out[at + j] = state.offset[j]
-        out[at + NU + j] = state.u[j]
-        out[at + 2 * NU + j] = state.trend[j]
+def inputs(seed: int, ticks: int, real: np.dtype[Any], stages: bool = False) -> Inputs:
+    """What is done before each step, references (ticks, 5) and measurements, p.u.
 
-
-def inputs(seed: int, ticks: int, real: np.dtype[Any]) -> Inputs:
-    """What is done before each step, references and measurements (ticks, 5), p.u."""
-    source = np.random.PCG64(seed)
-
-    def uniform(*shape: int) -> NDArray[np.float64]:
-        bits = source.random_raw(int(np.prod(shape)))  # integers: the same with every numpy
-        return np.asarray((bits >> np.uint64(11)).reshape(shape) * 2.0**-53, np.float64)
-
+    The measurements are (ticks, 5), or (ticks, 11) with an inner stage.
+    """
+    uniform = _uniform(seed)
     ref_group, y_group = group("ref"), group("y")
     rest = np.array([s.default for s in ref_group])
     ref_low, ref_high, y_low, y_high = (
@@ -189,7 +223,6 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any]) -> Inputs:
         for signals in (ref_group, y_group)
         for end in ("low", "high")
     )
-    inner = 1e-3  # stays off the ends of the ranges, which differ in float32
     op = np.zeros(ticks, np.int64)
     refs, ys = np.tile(rest, (ticks, 1)), np.tile(rest, (ticks, 1))
     for k, start in enumerate(range(0, ticks, SEGMENT)):
@@ -198,9 +231,9 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any]) -> Inputs:
         kind = k % KINDS
         ys[at] += 0.02 * (uniform(n, NY) - 0.5)
         refs[at] += 0.02 * (uniform(NY) - 0.5)
-        whole = y_low + (inner + (1 - 2 * inner) * uniform(n, NY)) * (y_high - y_low)
+        whole = y_low + (INSIDE + (1 - 2 * INSIDE) * uniform(n, NY)) * (y_high - y_low)
         if kind == 1:
-            target = ref_low + (inner + (1 - 2 * inner) * uniform(NY)) * (ref_high - ref_low)
+            target = ref_low + (INSIDE + (1 - 2 * INSIDE) * uniform(NY)) * (ref_high - ref_low)
             along = (np.arange(1, n + 1) / SEGMENT)[:, None]
             refs[at] = rest + along * (target - rest)
         elif kind == 2:
@@ -223,4 +256,55 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any]) -> Inputs:
             op[start + 10] = RESET
         elif kind == 6:
             op[start : at.stop : 10] = SWITCH
+    if stages:
+        ys = np.hstack([ys, _filter_signals(ys, seed, float(np.finfo(real).tiny))])
     return op, refs.astype(real), ys.astype(real)
+
+
+def _filter_signals(ys: NDArray[Any], seed: int, tiny: float) -> NDArray[np.float64]:
+    """Currents and voltages of the filter (ticks, 6), p.u., for measurements (ticks, 5).
+
+    They go with the kinds of inputs: noise; a dip to less than the PLL can follow, while p passes
+    the power limiter's ends (p is changed in place); whole ranges, and their extremes for long;
+    subnormal numbers and zeros of both signs; a voltage that turns, and a current that passes the
+    threshold but not the limit.
+    """
+    uniform = _uniform(seed + 1)
+    signals = group("y_inner")
+    low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
+    out = np.tile([0.5, 0.0, 1.0, 0.0, 0.5, 0.0], (len(ys), 1))
+    for k, start in enumerate(range(0, len(ys), SEGMENT)):
+        at = slice(start, min(start + SEGMENT, len(ys)))
+        n = at.stop - at.start
+        along = np.arange(1, n + 1) / SEGMENT
+        out[at] += 0.02 * (uniform(n, 6) - 0.5)
+        whole = low + (INSIDE + (1 - 2 * INSIDE) * uniform(n, 6)) * (high - low)
+        kind = k % KINDS
+        if kind == 1:
+            out[at] *= np.maximum(1.0 - 1.5 * along, 0.01)[:, None]
+            ys[at, 1] += np.where(along < 0.5, 1.0, -2.0) * uniform(n)
+        elif kind == 2:
+            out[at] = whole
+        elif kind == 3:
+            out[at] = whole[0]
+        elif kind == 4:
+            signs = np.resize([1.0, -1.0, 0.0, -0.0], n)
+            out[at] = tiny * uniform(n, 6) * np.stack([np.roll(signs, j) for j in range(6)], 1)
+        elif kind == 5 and k // KINDS % 2:
+            out[start + 4, k % 6] = (np.nan, np.inf, -np.inf, 7.0)[k // KINDS // 2 % 4]
+        elif kind == 6:
+            turned = out[at, 2] * np.exp(0.3j * along)
+            out[at, 2], out[at, 3] = turned.real, turned.imag
+            out[at, :2] *= 2.0 + uniform(1)
+    return out
+
+
+def _uniform(seed: int) -> Callable[..., NDArray[np.float64]]:
+    """Numbers from 0 to 1 in any shape, from integers: the same with every numpy."""
+    source = np.random.PCG64(seed)
+
+    def uniform(*shape: int) -> NDArray[np.float64]:
+        bits = source.random_raw(int(np.prod(shape)))
+        return np.asarray((bits >> np.uint64(11)).reshape(shape) * 2.0**-53, np.float64)
+
+    return uniform

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,12 +18,35 @@ from numpy.typing import DTypeLike, NDArray
 
 from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, HYBRID_ANGLE, R_MIN, V_MIN
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import filled, identifier, literal, literals, plain, template
+from gfm_runtime.firmware.c_text import (
+    Choices,
+    chosen,
+    filled,
+    identifier,
+    literal,
+    literals,
+    plain,
+    template,
+)
+from gfm_runtime.firmware.stage import (
+    AT_RUN_TIME,
+    CONSTANTS,
+    SHARED,
+    STAGE_PARTS,
+    WITHOUT,
+    check_stage,
+    choices_of,
+    kinds_text,
+    numbers_of,
+    stage_text,
+    variables_text,
+)
 from gfm_runtime.firmware.unrolled import Unrolled
-from gfm_runtime.inner import NEGLIGIBLE
+from gfm_runtime.inner import INNER_CONSTANTS, NEGLIGIBLE
+from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
-from gfm_runtime.signals import TABLE_VERSION, Signal, group, table_hash
+from gfm_runtime.signals import NU, NY, TABLE_VERSION, Signal, carried_rows, group, table_hash
 from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
 from gfm_runtime.tustin import discretise
 
@@ -51,6 +75,15 @@ NUMBERS = (
     "error_parameters", "A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "loop", "low", "high",
     "W", "decay", "follow", "E_r", "E_y", "F", "G",
 )  # fmt: skip
+#: of the inner stage, in a folder with a law that has one
+STAGE_INTEGERS = ("inner", "priority", "freeze", "row")
+
+
+def fields(stages: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The fields of a law's record that are integers, and those in its precision."""
+    if not stages:
+        return INTEGERS, NUMBERS
+    return INTEGERS + STAGE_INTEGERS, NUMBERS + INNER_CONSTANTS
 
 
 @dataclass(frozen=True)
@@ -61,11 +94,13 @@ class Module:
         name: the law's name, with its stage if it has several.
         law: the law itself; None for one that was read back from a report.
         record: the law as ``pack_law`` gives it.
+        stages: whether a law of its folder has an inner stage: y has 11 signals then, and u 4.
     """
 
     name: str
     law: Law | None
     record: np.void
+    stages: bool = False
 
     @property
     def prefix(self) -> str:
@@ -78,22 +113,34 @@ class Module:
         return int(self.record["n"])
 
     @property
+    def choices(self) -> Choices:
+        """The choices of the templates for its unrolled step."""
+        return choices_of(self.record) if self.stages else WITHOUT
+
+    @property
     def real(self) -> np.dtype[Any]:
         """float32 or float64."""
         return np.dtype(self.record["u_0"].dtype)
 
 
-def make_modules(laws: Mapping[str, Law], T_s: float, real: DTypeLike) -> list[Module]:
+def make_modules(
+    laws: Mapping[str, Law], T_s: float, real: DTypeLike, omega_b: float = 100 * math.pi
+) -> list[Module]:
     """The laws by name, discretised at T_s [s] and packed in float32 or float64.
 
+    Args:
+        laws: if one has an inner stage, all are made for y and u with its signals.
+        T_s: sampling time, s.
+        real: float32 or float64.
+        omega_b: base frequency of the converter, rad/s, for the inner stage.
+
     Raises:
-        LawError: a law that does not discretise, one with an inner stage, and as ``check_modules``.
+        LawError: a law that does not discretise, and as ``check_modules``.
     """
-    for name, law in laws.items():
-        if law.inner is not None:
-            raise LawError(f"law {name!r}", "has an inner stage, which has no C code yet")
+    stages = any(law.inner is not None for law in laws.values())
     modules = [
-        Module(name, law, pack_law(discretise(law, T_s), real)[0]) for name, law in laws.items()
+        Module(name, law, pack_law(discretise(law, T_s), real, omega_b)[0], stages)
+        for name, law in laws.items()
     ]
     check_modules(modules)
     return modules
@@ -103,8 +150,9 @@ def check_modules(modules: Sequence[Module]) -> None:
     """Refuse what C cannot hold.
 
     Raises:
-        LawError: a number of states or an error map that the kernel does not know, a constant that
-            is not finite, a name without a letter, or two names that are the same in C.
+        LawError: a number of states, an error map or a stage that the kernel does not know, a
+            constant that is not finite, a name without a letter, or two names that are the same
+            in C.
     """
     taken: dict[str, str] = {}
     for module in modules:
@@ -113,7 +161,10 @@ def check_modules(modules: Sequence[Module]) -> None:
             raise LawError(where, f"{module.n} states must be 0 to {N_MAX}")
         if int(module.record["error_map"]) not in ERROR_MAPS.values():
             raise LawError(where, f"error map {module.record['error_map']} is not known")
-        for field in NUMBERS:
+        wrong = check_stage(module.record) if module.stages else ""
+        if wrong:
+            raise LawError(where, wrong)
+        for field in fields(module.stages)[1]:
             if not np.isfinite(module.record[field]).all():
                 raise LawError(where, f"{field} must be finite in {module.real}")
         if module.prefix == "gfm_":
@@ -132,25 +183,32 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             for end, text in ((".h", _header(m, T_s)), (".c", _unrolled(m)))
         }
     states = max([1, *(m.n for m in modules)])
-    real = modules[0].real
-    common = _keys("gfm", real, states) | {"TYPES": filled(template("records.h"), {})}
+    real, stages = modules[0].real, modules[0].stages
+    choices = AT_RUN_TIME if stages else WITHOUT
+    common = _keys("gfm", real, states, stages)
     common |= {"LAW": "const gfm_law_t *law, ", "law": "law, ", "LOOP": "law->loop"}
+    constants = "\n        ".join(textwrap.wrap(", ".join(CONSTANTS), 80))
+    types = common | {"KINDS": kinds_text(), "CONSTANTS": constants}
+    common["TYPES"] = filled(chosen(template("records.h"), choices), types).rstrip("\n")
+    columns = common["N_COLUMNS"]
     common["TICK"] = "".join(
         f"    real {name}[{size}]; /* {text} */\n"
         for name, size, text in (
             ("ref", "GFM_NREF", "references as given"),
             ("r", "GFM_NREF", "references after the error map"),
-            ("y", "GFM_NY", "measurements after the error map; omega_u is the law's own"),
+            ("y", columns, "measurements after the error map; omega_u is the law's own"),
         )
     )
     maps = [name for name, code in ERROR_MAPS.items() if code]
-    body = _maps(maps, real) + filled(template("records.c"), _codes())
+    body = _maps(maps, real) + filled(chosen(template("records.c"), choices), _codes() | common)
+    if stages:
+        body += "".join(stage_text(part, choices, common) for part in STAGE_PARTS)
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
-        + filled(template("interface.h"), common),
-        "gfm.c": filled(template("shell_top.c"), common)
+        + filled(chosen(template("interface.h"), choices), common),
+        "gfm.c": filled(chosen(template("shell_top.c"), choices), common)
         + body
-        + filled(template("shell_end.c"), common),
+        + filled(chosen(template("shell_end.c"), choices), common),
     }
     for m in modules:
         guard = f"{m.prefix.upper()}_H"
@@ -175,21 +233,27 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
 
 
 def _header(m: Module, T_s: float) -> str:
-    keys = _keys(m.prefix, m.real, m.n) | {"TYPES": "", "LAW": "", "law": ""}
-    return _about(m, T_s) + "\n" + filled(template("interface.h"), keys).replace("\n\n\n", "\n")
+    keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
+    text = filled(chosen(template("interface.h"), m.choices), keys)
+    return _about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
 
 
 def _unrolled(m: Module) -> str:
     loop = literal(m.record["loop"], m.real)
-    keys = _keys(m.prefix, m.real, m.n) | {"LAW": "", "law": "", "LOOP": loop}
+    keys = keys_of(m) | {"LAW": "", "law": "", "LOOP": loop}
+    stage = ""
+    if m.stages:
+        keys |= numbers_of(m.record)
+        stage = "".join(stage_text(part, m.choices, keys) for part in STAGE_PARTS)
     used = [name for name, code in ERROR_MAPS.items() if code and code == m.record["error_map"]]
-    keys["TICK"] = Unrolled(m.record).tick()
+    keys["TICK"] = Unrolled(m.record, m.stages).tick()
     return (
-        filled(template("shell_top.c"), keys)
+        filled(chosen(template("shell_top.c"), m.choices), keys)
         + _maps(used, m.real)
-        + Unrolled(m.record).text(m.prefix)
+        + Unrolled(m.record, m.stages).text(m.prefix)
         + "\n"
-        + filled(template("shell_end.c"), keys)
+        + stage
+        + filled(chosen(template("shell_end.c"), m.choices), keys)
     )
 
 
@@ -207,6 +271,10 @@ def _about(m: Module, T_s: float) -> str:
             f"anti-windup T_t = {m.law.limits.T_t:g} s, bumpless change T_off = "
             f"{m.law.limits.T_off:g} s"
         ]
+        if m.law.inner is not None:
+            f_n = float(m.record["half_turn"]) / (math.pi * T_s)
+            numbers = ", ".join(f"{name} = {value}" for name, value in acting(m.law.inner).items())
+            lines += [f"Inner stage at f_n = {f_n:g} Hz: {m.law.inner.kind}, {numbers}"]
     lines += [
         f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.real}.",
         "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
@@ -224,9 +292,9 @@ def _wrapped(lines: Sequence[str], width: int = 96) -> list[str]:
     return [line.rstrip() for line in out]
 
 
-def _keys(prefix: str, real: np.dtype[Any], n: int) -> dict[str, str]:
+def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, str]:
     """What the templates of a module ask for."""
-    y, u, ref = group("y"), group("u"), group("ref")
+    y, u, ref = carried_rows("y", stages), carried_rows("u", stages), group("ref")
     guard = prefix.upper()
     rows = []
     for letter, signals in (("REF", ref), ("Y", y), ("U", u)):
@@ -236,7 +304,10 @@ def _keys(prefix: str, real: np.dtype[Any], n: int) -> dict[str, str]:
             for s in signals
         ]
         rows += ["enum {", *members, f"    {guard}_N{letter}", "};", ""]
-    rows.append(f"enum {{ {guard}_NX = {max(1, n)} }};")
+    phi = (f"{guard}_NROWS", f"{guard}_NCOLUMNS") if stages else (f"{guard}_NU", f"{guard}_NY")
+    of_phi = f", {phi[0]} = {NU}, {phi[1]} = {NY}" * stages
+    rows.append(f"enum {{ {guard}_NX = {max(1, n)}{of_phi} }};")
+    root = "sqrtf" if real == np.float32 else "sqrt"
     where = f"/* The signal table of gfmhil, version {TABLE_VERSION} ({table_hash()}): the order of"
     return {
         "P": prefix,
@@ -247,9 +318,22 @@ def _keys(prefix: str, real: np.dtype[Any], n: int) -> dict[str, str]:
         "Y_CHECKS": _checks("y", y, real),
         "REF_CHECKS": _checks("ref", ref, real),
         "fabs": "fabsf" if real == np.float32 else "fabs",
-        "U_DEFAULT": literals([s.default for s in u], real),
+        "U_DEFAULT": literals([s.default for s in group("u")], real),
+        "OMEGA_DEFAULT": literal(u[1].default, real),
+        "N_ROWS": phi[0],
+        "N_COLUMNS": phi[1],
+        "STAGE": variables_text(prefix) if stages else "",
+        "E": ", const real e[]" * stages,
+        "e": ", e" * stages,
+        "E_OF": f", const {prefix}_real e[]" * stages,
+        "sqrt": root,
         "NEGLIGIBLE": literal(NEGLIGIBLE, real),
     }
+
+
+def keys_of(m: Module) -> dict[str, str]:
+    """What the templates of an unrolled law ask for."""
+    return _keys(m.prefix, m.real, m.n, m.stages)
 
 
 def _enumerators(guard: str) -> str:
@@ -295,10 +379,17 @@ def _maps(names: Sequence[str], real: np.dtype[Any]) -> str:
 def _record(m: Module, states: int) -> str:
     """A law's record as an initialiser, for a generic step with room for ``states``."""
     lines = ["{"]
-    for field in (*INTEGERS, *NUMBERS):
+    integers, numbers = fields(m.stages)
+    for field in (*integers, *numbers):
         value = m.record[field]
-        number = field in INTEGERS
-        text = str(int(value)) if number else _braced(_cut(field, value, states), m.real)
+        if field in SHARED:
+            continue
+        if field == "row":
+            text = "{" + ", ".join(map(str, value[:states])) + "}"
+        elif field in integers:
+            text = str(int(value))
+        else:
+            text = _braced(_cut(field, value, states), m.real)
         lines.append(f"    .{field} = {text},")
     return "\n".join([*lines, "}"])
 

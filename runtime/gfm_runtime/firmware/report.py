@@ -18,17 +18,17 @@ from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal, template
 from gfm_runtime.firmware.module import (
-    INTEGERS,
-    NUMBERS,
     REALS,
     STYLES,
     Module,
     Style,
     check_modules,
+    fields,
 )
+from gfm_runtime.firmware.stage import CONSTANTS, SIZE, numbers_of, stage_text
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.kernel import law_dtype
-from gfm_runtime.signals import NU, NY, group, table_hash
+from gfm_runtime.signals import NU, NY, carried_rows, group, table_hash
 
 FORMAT = 1  # of report.json
 
@@ -52,14 +52,15 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "states": m.n,
             "bytes": sizes(m, style),
             "operations": operations(m, style),
-            "record": {name: _hex(m.record[name]) for name in (*INTEGERS, *NUMBERS)},
+            "record": {name: _hex(m.record[name]) for part in fields(m.stages) for name in part},
         }
         for m in modules
     ]
-    real = str(modules[0].real)
+    real, stages = str(modules[0].real), modules[0].stages
     whole = {
         "format": FORMAT,
         "signal_table": table_hash(),
+        "stages": stages,
         "T_s": T_s,
         "real": real,
         "style": style,
@@ -101,9 +102,10 @@ def _exported(whole: Any) -> Exported:
     for key, allowed in (("format", (FORMAT,)), ("real", REALS), ("style", STYLES)):
         if whole[key] not in allowed:
             raise LawError(key, f"{whole[key]!r} must be {' or '.join(map(str, allowed))}")
-    dtype = law_dtype(whole["real"])
+    dtype, stages = law_dtype(whole["real"]), bool(whole.get("stages"))
     modules = [
-        Module(str(law["name"]), None, _record(law["record"], dtype)) for law in whole["laws"]
+        Module(str(law["name"]), None, _record(law["record"], dtype, stages), stages)
+        for law in whole["laws"]
     ]
     if not modules:
         raise LawError("laws", "there must be one")
@@ -111,19 +113,20 @@ def _exported(whole: Any) -> Exported:
     return Exported(modules, whole["real"], whole["style"])
 
 
-def _hex(value: Any) -> str | int:
-    """Numbers of a precision, in their order, between blanks; or an integer."""
-    if isinstance(value, np.integer):
-        return int(value)
+def _hex(value: Any) -> str | int | list[int]:
+    """Numbers of a precision, in their order, between blanks; or an integer, or a list of them."""
+    if value.dtype.kind == "i":
+        return value.tolist()
     return " ".join(literal(v, value.dtype).rstrip("f") for v in np.ravel(value))
 
 
-def _record(fields: Mapping[str, Any], dtype: np.dtype[Any]) -> np.void:
+def _record(given: Mapping[str, Any], dtype: np.dtype[Any], stages: bool) -> np.void:
     out = np.zeros(1, dtype)
-    for name in (*INTEGERS, *NUMBERS):
-        text = fields[name]
-        if name in INTEGERS:
-            out[0][name] = int(text)
+    integers, numbers_of = fields(stages)
+    for name in (*integers, *numbers_of):
+        text = given[name]
+        if name in integers:
+            out[0][name] = text
         else:
             numbers = [float.fromhex(word) for word in text.split()]
             out[0][name] = np.reshape(numbers, dtype[name].shape)
@@ -136,12 +139,13 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
     A compiler may keep a constant in its code, or once for several uses; ``gfmhil firmware check``
     measures what came of it.
     """
-    state = max(1, m.n) + 3 * NU
+    state = max(1, m.n) + 3 * NU + SIZE * m.stages
     if style == "records":
         n, of = m.n, 2 * NY + NU
         constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
+        constants += len(CONSTANTS) * m.stages
     else:
-        text = "".join(Unrolled(m.record).step_lines())
+        text = "".join(Unrolled(m.record, m.stages).step_lines()) + _stage_step(m, style)
         constants = len(set(re.findall(r"-?0x[\w.]+p[-+]\d+", text)))
     return {
         "state": state * m.real.itemsize,
@@ -152,25 +156,31 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
 def operations(m: Module, style: Style) -> dict[str, int]:
     """Floating-point operations of a step in which all limits clamp, the refusal included."""
     n = m.n
+    stage = _stage_step(m, style)
     if style == "records":
         products = NU * (n + 3 * NY - 1) + 3 + NU * n + 2 * NU + n * (2 * NY + n)
         sums = NU * (n + 3 * NY) + 2 + NU * n + NU + 3 * NU + n * (2 * NY - 1 + n)
         text, limits, faded, excess = "", NU, 2 * NU + n, NU
     else:
-        text = "\n".join(Unrolled(m.record).step_lines())
+        text = "\n".join(Unrolled(m.record, m.stages).step_lines())
         products, sums = 0, 0
         limits, faded, excess = (text.count(part) for part in ("limited(", "faded(", "!= 0"))
-    ranges = sum(1 if s.low == -s.high else 2 for s in (*group("y"), *group("ref")))
+    text += stage
+    limits += stage.count(" limited(")
+    faded += stage.count(" faded(")
+    excess += stage.count(" != 0")
+    carried = (*carried_rows("y", m.stages), *group("ref"))
+    ranges = sum(1 if s.low == -s.high else 2 for s in carried)
     for name, code in ERROR_MAPS.items():
         if code and code == m.record["error_map"]:
             text += template("maps.c").split(f"/* @map {name}@ */\n")[1].split("/* @map")[0]
     said = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
     half_angle = bool(m.record["error_map"] == HYBRID_ANGLE)
     return {
-        "multiplications": products + said.count(" * "),
-        "additions": sums + len(re.findall(r" \+=? | -=? ", said)) + 2 * NU - 1,
+        "multiplications": products + len(re.findall(r" \*=? ", said)),
+        "additions": sums + len(re.findall(r" \+=? | -=? ", said)) + 2 * (NU + m.stages) - 1,
         "divisions": len(re.findall(r" /=? ", said)),
-        "square_roots": 2 * half_angle,
+        "square_roots": 2 * half_angle + stage.count(" sqrt("),
         "comparisons": 2 * limits
         + faded
         + excess  # whether a limit clamped
@@ -178,6 +188,17 @@ def operations(m: Module, style: Style) -> dict[str, int]:
         + ranges  # of the inputs
         + 1,  # whether u is finite
     }
+
+
+def _stage_step(m: Module, style: Style) -> str:
+    """The text of the inner stage that a step goes through."""
+    if not m.stages:
+        return ""
+    choices = dict(m.choices)
+    if style == "records":  # it leaves these to the numbers
+        choices |= {"power": choices["stage"], "threshold": choices["voltage"]}
+    keys = dict.fromkeys(("LAW", "law", "P", "GUARD", "sqrt", "least_v"), "")
+    return stage_text("stage.c", choices, keys | {"sqrt": "sqrt"} | numbers_of(m.record))
 
 
 def _page(laws: Sequence[Mapping[str, Any]], T_s: float, real: str, style: str) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from gfm_runtime.error_maps import DC_ENERGY, DVOC, HYBRID_ANGLE
 from gfm_runtime.firmware.c_text import literal
+from gfm_runtime.inner import NONE
 from gfm_runtime.signals import NU, NY
 
 _MAPS = {DC_ENERGY: "dc_energy", DVOC: "dvoc", HYBRID_ANGLE: "hybrid_angle"}
@@ -25,10 +26,12 @@ class Unrolled:
 
     Args:
         record: the law as ``gfm_runtime.kernel.pack_law`` gives it, one element.
+        stages: whether the instance has an inner stage's variables.
     """
 
-    def __init__(self, record: np.void) -> None:
+    def __init__(self, record: np.void, stages: bool = False) -> None:
         self.law, self.n = record, int(record["n"])
+        self._inner = stages and int(record["inner"]) != NONE
         self.real: np.dtype[Any] = record["u_0"].dtype
 
     def text(self, prefix: str) -> str:
@@ -142,10 +145,11 @@ class Unrolled:
         lines = [f"real {', '.join(f'x{i}' for i in range(n))};"] if n else []
         for i in range(NU):
             moved = [j for j in range(n) if law["W"][j, i] != 0]
+            u = "t->omega" if self._inner and i == 1 else f"t->u[{i}]"  # the power limiter moves it
             if moved:
-                lines.append(f"if (t->u[{i}] - t->raw[{i}] != 0) {{ /* back-calculation */")
+                lines.append(f"if ({u} - t->raw[{i}] != 0) {{ /* back-calculation */")
                 for j in moved:
-                    term = self._product(law["W"][j, i], f"(t->u[{i}] - t->raw[{i}])")
+                    term = self._product(law["W"][j, i], f"({u} - t->raw[{i}])")
                     lines.append(f"    s->x[{j}] += {term};")
                 lines.append("}")
         for i in range(NU):
@@ -158,7 +162,13 @@ class Unrolled:
             terms += self._measured(law["B_y"][i], "t->u[1]")
             terms += self._products(law["A"][i, :n], "s->x[{}]")
             lines.append(f"x{i} = {_sum(terms) or '0'};")
-        return lines + [f"s->x[{i}] = faded(x{i});" for i in range(n)]
+        frozen = (
+            [i for i in range(n) if law["row"][i] == 2] if self._inner and law["freeze"] else []
+        )
+        lines += [f"s->x[{i}] = faded(x{i});" for i in range(n) if i not in frozen]
+        if frozen:
+            lines += ["if (!s->limited) {", *(f"    s->x[{i}] = faded(x{i});" for i in frozen), "}"]
+        return lines
 
     def _set_states(self) -> list[str]:
         law, n = self.law, self.n

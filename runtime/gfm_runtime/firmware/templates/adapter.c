@@ -24,21 +24,28 @@ static int @P@_do_look(int k, const golden_real *ref, const golden_real *y, gold
 }
 
 static int @P@_do_settle(int k, const golden_real *ref, const golden_real *y, golden_real *u,
-    const golden_real *trend)
+    const golden_real *trend@E@)
 {
-    return @T@_settle(@ARGUMENT@&@P@_of[k], ref, y, u, trend);
+    return @T@_settle(@ARGUMENT@&@P@_of[k], ref, y, u, trend@e@);
 }
 
 static int @P@_do_change(int k, const golden_real *ref, const golden_real *y, golden_real *u,
-    const golden_real *trend, golden_real *bump)
+    const golden_real *trend@E@, golden_real *bump)
 {
-    return @T@_switch(@ARGUMENT@&@P@_of[k], ref, y, u, trend, bump);
+    return @T@_switch(@ARGUMENT@&@P@_of[k], ref, y, u, trend@e@, bump);
 }
 
 static view_t @P@_do_view(int k)
 {
     const @T@_t *s = &@P@_of[k];
+/* @if stages@ */
+    static golden_real stage[GOLDEN_STAGE];
+    const view_t view = {s->x, s->offset, s->u, s->trend, @N@, stage, s->stage.e, s->limited};
+    memcpy(stage, &s->stage, sizeof stage);
+    return view;
+/* @else@ */
     const view_t view = {s->x, s->offset, s->u, s->trend, @N@};
     return view;
+/* @end@ */
 }
 

@@ -17,12 +17,23 @@ enum {
 
 @TYPES@
 
+/* @if stages@ */
+/* The inner stage's variables in the converter's dq frame, p.u. */
+typedef struct {
+@STAGE@
+} @P@_stage_t;
+
+/* @end@ */
 /* One instance. All that changes is in here, so there may be several. Treat it as read-only. */
 typedef struct {
     @P@_real x[@GUARD@_NX];      /* states of the law, scaled */
-    @P@_real offset[@GUARD@_NU]; /* p.u., what a change of law left in u; decays */
-    @P@_real u[@GUARD@_NU];      /* the last u, p.u. */
-    @P@_real trend[@GUARD@_NU];  /* p.u. per tick, filtered u[k] - u[k-1] */
+    @P@_real offset[@N_ROWS@]; /* p.u., what a change of law left in u; decays */
+    @P@_real u[@N_ROWS@];      /* the law's last u, p.u. */
+    @P@_real trend[@N_ROWS@];  /* p.u. per tick, filtered u[k] - u[k-1] */
+/* @if stages@ */
+    @P@_stage_t stage;
+    int limited;                /* whether the stage limited the current in this tick */
+/* @end@ */
     int reason;                 /* 0, or why it is in the safe state */
     int channel;                /* which signal was the reason, or -1 */
 } @P@_t;
@@ -30,7 +41,11 @@ typedef struct {
 /* Makes an instance ready: states 0, the last u as by default in the signal table. */
 void @P@_init(@P@_t *s);
 
+/* @if stages@ */
+/* Leaves the safe state: states 0; u and stage.e stay. Call settle before the next step. */
+/* @else@ */
 /* Leaves the safe state: states 0, and the last good u stays. Call settle before the next step. */
+/* @end@ */
 void @P@_reset(@P@_t *s);
 
 /* One tick: from the references and measurements at tick k to u[k], and the state to k + 1.
@@ -38,19 +53,33 @@ void @P@_reset(@P@_t *s);
 int @P@_step(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
     @P@_real u[]);
 
+/* @if stages@ */
+/* The law's own u[k] (i_u, omega_u, E_u) without a step. */
+/* @else@ */
 /* u[k] without a step. */
+/* @end@ */
 int @P@_look(@LAW@const @P@_t *s, const @P@_real ref[], const @P@_real y[],
     @P@_real u[]);
 
+/* @if stages@ */
+/* Sets the state so that the law's own u[k] is u, and goes on with the slope trend (p.u. per tick); and
+ * the stage so that the bridge's voltage goes on at e (e_d, e_q), p.u. On return u is what comes out
+ * of the law: the same but for rounding, or this law's limit. u, trend and e are not parts of s. */
+/* @else@ */
 /* Sets the state so that u[k] is u, and goes on with the slope trend (p.u. per tick). On return u is
  * what comes out: the same but for rounding, or this law's limit. u and trend are not parts of s. */
+/* @end@ */
 int @P@_settle(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
-    @P@_real u[], const @P@_real trend[]);
+    @P@_real u[], const @P@_real trend[]@E_OF@);
 
 /* Changes to this law without a bump, in one tick: look at the old law for u, switch with that u and
+/* @if stages@ */
+ * the old law's trend and stage.e, and go on with step of this one. bump is max |change of u|, p.u. */
+/* @else@ */
  * the old law's trend, and go on with step of this one. bump is max |change of u|, p.u. */
+/* @end@ */
 int @P@_switch(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
-    @P@_real u[], const @P@_real trend[], @P@_real *bump);
+    @P@_real u[], const @P@_real trend[]@E_OF@, @P@_real *bump);
 
 #ifdef __cplusplus
 }

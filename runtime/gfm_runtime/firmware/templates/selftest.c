@@ -23,6 +23,10 @@ unsigned long golden_elapsed;
 typedef struct {
     const golden_real *x, *offset, *u, *trend;
     int n;
+/* @if stages@ */
+    const golden_real *stage, *e;
+    int limited;
+/* @end@ */
 } view_t;
 
 typedef struct {
@@ -31,9 +35,9 @@ typedef struct {
     int (*step)(int k, const golden_real *ref, const golden_real *y, golden_real *u);
     int (*look)(int k, const golden_real *ref, const golden_real *y, golden_real *u);
     int (*settle)(int k, const golden_real *ref, const golden_real *y, golden_real *u,
-        const golden_real *trend);
+        const golden_real *trend@E@);
     int (*change)(int k, const golden_real *ref, const golden_real *y, golden_real *u,
-        const golden_real *trend, golden_real *bump);
+        const golden_real *trend@E@, golden_real *bump);
     view_t (*view)(int k);
 } law_t;
 
@@ -65,9 +69,9 @@ static unsigned compare(const golden_real *found, const golden_word *expected, i
 unsigned golden_row(const golden_word row[])
 {
     static const golden_real none[3];
-    static golden_real u[3], bump;
+    static golden_real u[GOLDEN_NU], bump;
     static int law, k;
-    golden_real ref[5], y[5];
+    golden_real ref[5], y[GOLDEN_NY], own[3];
     unsigned differ;
     view_t now;
     int result;
@@ -78,20 +82,22 @@ unsigned golden_row(const golden_word row[])
         law = (int)row[1];
         k = 0;
         laws[law].init(k);
-        u[0] = u[1] = u[2] = bump = 0;
+        memset(u, 0, sizeof u);
+        bump = 0;
         break;
     case 2: /* change to the row's law */
         now = laws[law].view(k);
-        laws[law].look(k, ref, y, u);
+        laws[law].look(k, ref, y, own);
         law = (int)row[1];
         k = 1 - k;
         laws[law].init(k);
-        laws[law].change(k, ref, y, u, now.trend, &bump);
+        laws[law].change(k, ref, y, own, now.trend@NOW_E@, &bump);
         break;
     case 3: /* leave the safe state */
         laws[law].reset(k);
-        memcpy(u, laws[law].view(k).u, sizeof u);
-        laws[law].settle(k, ref, y, u, none);
+        now = laws[law].view(k);
+        memcpy(own, now.u, sizeof own);
+        laws[law].settle(k, ref, y, own, none@NOW_E@);
         break;
     default:
         break;
@@ -99,12 +105,17 @@ unsigned golden_row(const golden_word row[])
     result = laws[law].step(k, ref, y, u);
     now = laws[law].view(k);
     differ = (golden_word)result != row[2];
-    row += 13;
-    differ += compare(u, row, 3) + compare(&bump, row + 3, 1);
-    differ += compare(now.x, row + 4, now.n);
-    row += 4 + GOLDEN_NX;
+    row += 8 + GOLDEN_NY;
+    differ += compare(u, row, GOLDEN_NU) + compare(&bump, row + GOLDEN_NU, 1);
+    differ += compare(now.x, row + GOLDEN_NU + 1, now.n);
+    row += GOLDEN_NU + 1 + GOLDEN_NX;
     differ += compare(now.offset, row, 3) + compare(now.u, row + 3, 3);
-    return differ + compare(now.trend, row + 6, 3);
+    differ += compare(now.trend, row + 6, 3);
+/* @if stages@ */
+    differ += compare(now.stage, row + 9, GOLDEN_STAGE);
+    differ += (golden_word)now.limited != row[9 + GOLDEN_STAGE];
+/* @end@ */
+    return differ;
 }
 
 #ifndef GOLDEN_NO_MAIN

@@ -7,7 +7,11 @@
 typedef @C_REAL@ golden_real;
 typedef uint@BITS@_t golden_word;
 
-enum { GOLDEN_LAWS = @LAWS@, GOLDEN_NX = @NX@, GOLDEN_WORDS = @WORDS@ };
+enum { GOLDEN_LAWS = @LAWS@, GOLDEN_NX = @NX@, GOLDEN_NY = @NY@, GOLDEN_NU = @NU@ };
+/* @if stages@ */
+enum { GOLDEN_STAGE = @STAGE@ };
+/* @end@ */
+enum { GOLDEN_WORDS = @WORDS@ };
 
 /* One row: the numbers of words that differ. Rows go in their order; the first row starts anew. */
 unsigned golden_row(const golden_word row[]);

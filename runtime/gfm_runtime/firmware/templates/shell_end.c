@@ -18,8 +18,12 @@ void @P@_init(@P@_t *s)
 {
     static const real u[] = {@U_DEFAULT@};
     int i;
+/* @if stages@ */
+    s->stage.e[0] = u[2];
+    s->stage.e[1] = 0;
+/* @end@ */
     @P@_reset(s);
-    for (i = 0; i < @GUARD@_NU; i++)
+    for (i = 0; i < @N_ROWS@; i++)
         s->u[i] = u[i];
 }
 
@@ -28,8 +32,16 @@ void @P@_reset(@P@_t *s)
     int i;
     for (i = 0; i < @GUARD@_NX; i++)
         s->x[i] = 0;
-    for (i = 0; i < @GUARD@_NU; i++)
+    for (i = 0; i < @N_ROWS@; i++)
         s->offset[i] = s->trend[i] = 0;
+/* @if stages@ */
+    {
+        const @P@_stage_t rest = {
+            .e = {s->stage.e[0], s->stage.e[1]}, .pll = {1, 0}, .omega_pll = @OMEGA_DEFAULT@};
+        s->stage = rest;
+    }
+    s->limited = 0;
+/* @end@ */
     s->reason = @GUARD@_OK;
     s->channel = -1;
 }
@@ -37,13 +49,41 @@ void @P@_reset(@P@_t *s)
 int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 {
     tick_t t;
+/* @if pll@ */
+    real seen[@GUARD@_NREF];
+    int k;
+/* @end@ */
     int reason = refused(s, ref, y, &s->channel);
     if (reason != @GUARD@_OK)
         return s->reason = reason;
+    /* @if pll@ */
+        measure_frequency(@law@s, y);
+        for (k = 0; k < @GUARD@_NREF; k++)
+            seen[k] = ref[k];
+        seen[@GUARD@_REF_OMEGA_G] = s->stage.omega_pll;
+        ref = seen;
+    /* @end@ */
     set_inputs(@law@&t, ref, y);
     output(@law@s, &t);
+/* @if stages@ */
+    shape(@law@s, &t, y);
     advance(@law@s, &t);
-    /* An inner stage (current limiter, voltage and current loops) would act on t.u here. */
+    if (!((t.omega - t.omega) + (t.u[0] - t.u[0]) + (s->stage.e[0] - s->stage.e[0])
+            + (s->stage.e[1] - s->stage.e[1])
+            == 0)) {
+        /* omega_u first: column 3 takes it to the others */
+        s->channel = !(t.omega - t.omega == 0)         ? 1
+            : !(t.u[0] - t.u[0] == 0)                  ? 0
+            : !(s->stage.e[0] - s->stage.e[0] == 0)    ? 2
+                                                       : 3;
+        return s->reason = @GUARD@_BAD_U;
+    }
+    u[0] = t.u[0];
+    u[1] = t.omega;
+    u[2] = s->stage.e[0];
+    u[3] = s->stage.e[1];
+/* @else@ */
+    advance(@law@s, &t);
     if (!((t.u[1] - t.u[1]) + (t.u[0] - t.u[0]) + (t.u[2] - t.u[2]) == 0)) {
         /* omega_u first: column 3 takes it to the others */
         s->channel = !(t.u[1] - t.u[1] == 0) ? 1 : !(t.u[0] - t.u[0] == 0) ? 0 : 2;
@@ -52,6 +92,7 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
     u[0] = t.u[0];
     u[1] = t.u[1];
     u[2] = t.u[2];
+/* @end@ */
     return @GUARD@_OK;
 }
 
@@ -69,19 +110,19 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
         return reason;
     set_inputs(@law@&t, ref, y);
     evaluate(@law@s, &t);
-    for (i = 0; i < @GUARD@_NU; i++)
+    for (i = 0; i < @N_ROWS@; i++)
         u[i] = t.u[i];
     return @GUARD@_OK;
 }
 
-int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[])
+int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[]@E@)
 {
     tick_t t;
     int i, channel, reason = refused(s, ref, y, &channel);
     if (reason != @GUARD@_OK)
         return reason;
     set_inputs(@law@&t, ref, y);
-    for (i = 0; i < @GUARD@_NU; i++) {
+    for (i = 0; i < @N_ROWS@; i++) {
         s->offset[i] = 0;
         s->trend[i] = trend[i];
         s->u[i] = u[i] - trend[i];
@@ -94,21 +135,24 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
     s->offset[0] = u[0] - t.raw[0];
     s->offset[2] = u[2] - t.raw[2];
     evaluate(@law@s, &t);
-    for (i = 0; i < @GUARD@_NU; i++)
+/* @if stages@ */
+    settle_stage(@law@s, t.u, y, e);
+/* @end@ */
+    for (i = 0; i < @N_ROWS@; i++)
         u[i] = t.u[i];
     return @GUARD@_OK;
 }
 
-int @P@_switch(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[],
+int @P@_switch(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[]@E@,
     real *bump)
 {
-    real old[@GUARD@_NU], change;
+    real old[@N_ROWS@], change;
     int i, reason;
-    for (i = 0; i < @GUARD@_NU; i++)
+    for (i = 0; i < @N_ROWS@; i++)
         old[i] = u[i];
-    reason = @P@_settle(@law@s, ref, y, u, trend);
+    reason = @P@_settle(@law@s, ref, y, u, trend@e@);
     *bump = 0;
-    for (i = 0; i < @GUARD@_NU; i++) {
+    for (i = 0; i < @N_ROWS@; i++) {
         change = u[i] < old[i] ? old[i] - u[i] : u[i] - old[i];
         *bump = change > *bump ? change : *bump;
     }

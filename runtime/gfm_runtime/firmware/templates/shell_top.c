@@ -22,8 +22,11 @@ typedef @P@_real real;
 
 /* What a tick works on beside the state. */
 typedef struct {
-@TICK@    real raw[@GUARD@_NU]; /* u before the limits */
-    real u[@GUARD@_NU];
+@TICK@    real raw[@N_ROWS@]; /* u before the limits */
+    real u[@N_ROWS@];
+/* @if stages@ */
+    real omega; /* omega_u after the power limiter */
+/* @end@ */
 } tick_t;
 
 /* A NaN passes, as it does in the bench: step finds it. */

@@ -1,0 +1,131 @@
+"""A finished run of several converters in one network: a run for each, with what they share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.results.run import Run
+from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario.toml_out import write_scenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, repr=False)
+class NetworkRun(Mapping[str, Run]):
+    """The runs of a network's converters, by their names.
+
+    Attributes:
+        scenario: of the whole network.
+        runs: of each converter, in the order of the scenario.
+        folder: which has a run folder for each, by its name; None for a run in memory.
+    """
+
+    scenario: Scenario
+    runs: dict[str, Run]
+    folder: Path | None = None
+
+    def __getitem__(self, converter: str) -> Run:
+        return self.runs[converter]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.runs)
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    @property
+    def status(self) -> str:
+        """How the runs ended, in one word if they agree."""
+        found = {name: run.status for name, run in self.runs.items()}
+        if len(set(found.values())) == 1:
+            return next(iter(found.values()))
+        return ", ".join(f"{name} {status}" for name, status in found.items())
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The summary of each run, and what is not as expected in any."""
+        return {
+            "title": self.scenario.title,
+            "status": self.status,
+            "unmet": [f"{n}: {part}" for n, run in self.items() for part in run.summary["unmet"]],
+            "converters": {name: run.summary for name, run in self.items()},
+        }
+
+    @property
+    def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """The metrics of each run by converter, see ``Run.metrics``."""
+        return {name: run.metrics for name, run in self.items()}
+
+    def plot(self) -> list[Axes]:
+        """p, frequency, q and v_dc of all converters in one figure."""
+        from matplotlib import pyplot
+
+        from gfm_hil.results import figures
+
+        figure = pyplot.figure(figsize=figures.SIZE_LAWS, layout="constrained")
+        return figures.draw_laws(figure, self.scenario, self._columns(), self._events())
+
+    def save(self, folder: str | Path) -> Path:
+        """Write a folder with the run folder of each converter, and a figure of all; returns it.
+
+        Raises:
+            UserError: the folder holds something already, or cannot be written.
+        """
+        folder = Path(folder)
+        if folder.exists() and any(folder.iterdir()):
+            raise UserError(f"{folder}: is not empty; choose another folder")
+        for name, run in self.items():
+            run.save(folder / name)
+        self.conclude(folder)
+        return folder
+
+    def conclude(self, folder: Path, figures: bool = True) -> None:
+        """Write what the runs share into a folder that has theirs.
+
+        Raises:
+            UserError: the folder cannot be written.
+        """
+        try:
+            write_scenario(folder, self.scenario)
+            if figures and any(run.ticks for run in self.values()):
+                from gfm_hil.results.figures import draw_comparison
+
+                path = folder / "converters.png"
+                draw_comparison(path, self.scenario, self._columns(), self._events())
+            write_text(folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem.strerror}") from None
+
+    @classmethod
+    def load(cls, folder: str | Path) -> NetworkRun:
+        """The runs of a folder that ``save`` or ``gfmhil run`` has written.
+
+        Raises:
+            UserError: it is none.
+        """
+        folder = Path(folder)
+        scenario = load_scenario(folder / "scenario.toml")
+        return cls(scenario, {n: Run.load(folder / n) for n in scenario.converters}, folder)
+
+    def _columns(self) -> dict[str, Any]:
+        return {name: run.columns for name, run in self.items()}
+
+    def _events(self) -> list[dict[str, Any]]:
+        """What happened, of each converter and once for what they all saw."""
+        found: dict[tuple[int, str], dict[str, Any]] = {}
+        for run in self.values():
+            for event in run.summary["events"]:
+                found.setdefault((event["tick"], event["label"]), event)
+        return [found[key] for key in sorted(found)]
+
+    def __repr__(self) -> str:
+        lines = [f"  {name}: {run.status}" for name, run in self.items()]
+        return "\n".join(["<NetworkRun", *lines, ">"])

@@ -1,0 +1,190 @@
+"""A plant between two events: its wiring, and the records that compiled functions work on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from gfm_plant.emulator import plant_start, reconnect
+from gfm_plant.model import DELTA
+from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords, Record
+from gfm_plant.wiring import GRID_SOURCE, Wiring
+
+_DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
+_PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
+_LOOK = 10e-6  # s; how often a peak-current limit looks at the current
+_MOST = 500  # steps, or pieces, in a period
+
+
+@dataclass
+class Network:
+    """A plant of one converter or more.
+
+    Attributes:
+        records: what the compiled functions take.
+        wiring: how its parts are connected now.
+    """
+
+    records: PlantRecords
+    wiring: Wiring
+
+    @property
+    def par(self) -> Record:
+        """Parameters of the converters, shape (N,)."""
+        return self.records.par
+
+    @property
+    def st(self) -> Record:
+        """State of the converters, shape (N,)."""
+        return self.records.st
+
+    @property
+    def net(self) -> Record:
+        """Parameters of the network, shape (1,)."""
+        return self.records.net
+
+    @property
+    def now(self) -> Record:
+        """State of the network, shape (1,)."""
+        return self.records.now
+
+    def copy(self) -> Network:
+        """Return the same plant at the same instant, in memory of its own."""
+        return Network(self.records.copy(), self.wiring)
+
+    def restore(self, kept: Network) -> None:
+        """Take the wiring, the parameters and the instant of a copy."""
+        self.records.restore(kept.records)
+        self.wiring = kept.wiring
+
+    def start(self, x: NDArray[np.float64], u: NDArray[np.float64]) -> None:
+        """Put a plant fresh from `make_plant` into an equilibrium.
+
+        Args:
+            x: states of each converter, (N, 8); (8,) for one.
+            u: its commands, (N, 4); for one also (4,), or (3,) without the q component of the
+                bridge's voltage. All turn at the speed of the grid.
+        """
+        x, u = np.atleast_2d(x), np.atleast_2d(u)
+        u = np.pad(u, ((0, 0), (0, N_COMMANDS - u.shape[1])))
+        now, N = self.now[0], len(self.par)
+        turn = np.exp(1j * x[:, DELTA])
+        _set(now["unit"][:N], turn)
+        modes, sources = self.wiring.modes(self.wiring.blocked, False)
+        volts = {
+            unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(self.wiring.units)
+        }
+        volts[GRID_SOURCE] = complex(now["V_g"])
+        speed = float(self.net[0]["omega_b"]) * (u[0, 1] - 1.0)
+        z = modes.drive @ [volts[name] for name in sources] / (1j * speed - modes.rates)
+        w = modes.states @ z
+        for k, row in enumerate(x):  # as they are given: all digits
+            i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))
+            current = float(self.par[k]["current"])
+            w[N_OWN * k : N_OWN * (k + 1)] = i_f / current, v, i_o / current
+        _set(now["w"][: len(w)], w)
+        plant_start(self.records, x, u)
+
+    def rewire(self, wiring: Wiring) -> None:
+        """Go on from the present state with another wiring.
+
+        A branch that has come in two keeps its current in both.
+
+        Raises:
+            ValueError: as ``connect``; the plant is then unchanged.
+        """
+        before, w = self.wiring, self.now["w"][0].copy()
+        self.connect(wiring)
+        if wiring.split is not None and wiring.split != before.split:
+            there = wiring.order.index(wiring.split)
+            self.now["w"][0, wiring.order.index("beyond")] = w[there]
+        reconnect(self.records)
+
+    def connect(self, wiring: Wiring) -> None:
+        """Set the modes of all circuits that a wiring gives.
+
+        Raises:
+            ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast
+                for the DC link. The plant is then unchanged.
+        """
+        changed = self.records.copy()
+        _connect(changed, wiring)
+        self.records.par[:], self.records.net[:] = changed.par, changed.net
+        self.wiring = wiring
+
+
+def _connect(records: PlantRecords, wiring: Wiring) -> None:
+    net, N = records.net, len(wiring.units)
+    order = wiring.order
+    net["n_states"] = len(order)
+    net["to_grid"] = 0.0
+    for name, factor in wiring.to_grid().items():
+        net["to_grid"][0, order.index(name)] = factor
+    found = {}
+    for k in range(N + 1):
+        blocked = wiring.blocked | ({k - 1} if k > 0 else set())
+        for fault in (False, True) if wiring.fault else (False,):
+            found[k + (N + 1) * fault] = wiring.modes(frozenset(blocked), fault)
+    _pack_pieces(records, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
+    places: dict[str, tuple[int, ...]] = {unit.bridge: (k,) for k, unit in enumerate(wiring.units)}
+    places[GRID_SOURCE] = (N, N + 1)
+    parts = int(net[0]["n_parts"])
+    for circuit, (modes, sources) in found.items():
+        n = net["n_modes"][0, circuit] = len(modes.rates)
+        _set(net["rate"][0, circuit, :n], modes.rates)
+        for part, half in enumerate(net["half_h"][0, :parts]):
+            _set(net["decay"][0, circuit, part, :n], np.exp(modes.rates * half))
+        _set(net["states"][0, circuit, : len(order), :n], modes.states)
+        _set(net["modes"][0, circuit, :n, : len(order)], modes.modes)
+        net["drive"][0, circuit] = 0.0
+        for j, source in enumerate(sources):
+            for place in places[source]:
+                _set(net["drive"][0, circuit, :n, place], modes.drive[:, j])
+
+
+def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:
+    field[..., 0], field[..., 1] = values.real, values.imag
+
+
+def _pack_pieces(records: PlantRecords, fastest: float) -> None:
+    """Choose the pieces of Simpson's rule, and the DC link's steps in them, by the fastest mode."""
+    net, parts = records.net, int(records.net[0]["n_parts"])
+    stretch = net["stretch"][0, :parts]
+    longest = max(stretch)
+    if fastest * longest > 2 * _PIECE * _MOST:
+        raise ValueError(
+            f"the circuit's fastest mode = {fastest:.6g} rad/s: too fast for the DC link; allowed"
+            f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
+            " plant.grid.load_L"
+        )
+    least = 1.0
+    if min(records.par["i_peak"]) < math.inf:  # the hardware looks at the current once a piece
+        least = math.ceil(longest / _LOOK)
+    pieces = np.maximum(np.ceil(stretch * (fastest / (2 * _PIECE))), least)
+    net["pieces"][0, :parts], net["half_h"][0, :parts] = pieces, stretch / pieces / 2
+    for k, r in enumerate(records.par):
+        per_C = r["omega_b"] / r["C_dc"]
+        rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
+        if r["tau_dc"] > 0.0:
+            rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
+        if rate * longest > 2 * _DC_STEP * _MOST:
+            raise ValueError(
+                f"plant.dc_source k_p, k_i, tau_s: with C_dc they are as fast as {rate:.6g}"
+                f" rad/s; allowed are {2 * _DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
+            )
+        r["dc_steps"] = max(1, math.ceil(rate * max(net["half_h"][0, :parts]) / _DC_STEP))
+        for part, half in enumerate(net["half_h"][0, :parts]):
+            net["sensor_weights"][0, part, k] = _low_pass(float(r["omega_s"] * 2 * half))
+
+
+def _low_pass(x: float) -> list[float]:
+    """Weights of a first-order low-pass after a stretch of x time constants: of its state, and of
+    its input at the beginning, the middle and the end, between which the input is a parabola."""
+    A = np.diag([1.0, 1.0, 1.0], 1)
+    A[0, 0] = -x
+    whole, f_1, f_2, f_3 = expm(A)[0]  # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
+    return [whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)]

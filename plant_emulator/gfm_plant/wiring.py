@@ -1,0 +1,213 @@
+"""How converters, lines, loads and the grid are connected, and the circuits that this gives.
+
+A wiring never changes: an event makes another one. Elements are in p.u. of the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
+
+GRID_SOURCE = "grid"
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A converter as the circuit sees it: bridge, filter, and the line to its node.
+
+    Attributes:
+        node: where its line ends.
+        L_f, R_f, C_f, L_g, R_g: elements of Eq. (1)-(6), p.u. of the network.
+    """
+
+    name: str
+    node: str
+    L_f: float
+    R_f: float
+    C_f: float
+    L_g: float
+    R_g: float
+
+    @property
+    def terminal(self) -> str:
+        """The node of the filter capacitor."""
+        return f"{self.name}.terminal"
+
+    @property
+    def bridge(self) -> str:
+        """The node, and the source, of the bridge."""
+        return f"{self.name}.bridge"
+
+    @property
+    def states(self) -> tuple[str, str, str]:
+        """Names of its currents and its voltage, in the order of w."""
+        return f"{self.name}.i_f", f"{self.name}.v", self.line
+
+    @property
+    def line(self) -> str:
+        """The name of its line."""
+        return f"{self.name}.i_o"
+
+
+@dataclass(frozen=True)
+class FaultPlace:
+    """Where the three phases are shorted to ground, and through what.
+
+    Attributes:
+        node: the node, or the one at which the faulted branch starts.
+        branch: name of the branch with the fault inside, or None: at the node itself.
+        position: on that branch, in (0, 1).
+        R: p.u. of the network.
+    """
+
+    node: str
+    branch: str | None
+    position: float
+    R: float
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """The connections of a plant.
+
+    Attributes:
+        omega_b: rad/s.
+        units: the converters.
+        branches: lines between nodes, and loads with an inductor, which end at `circuit.GROUND`.
+        shunts: loads that are resistors.
+        capacitors: banks of them.
+        grid: node of the grid, None: there is none.
+        closed: whether the grid's breaker is closed.
+        opened: names of branches whose breakers are open.
+        fault: where one is, or may be again, or None.
+        blocked: indices of converters whose bridges are out of every circuit.
+    """
+
+    omega_b: float
+    units: tuple[Unit, ...]
+    branches: tuple[Branch, ...] = ()
+    shunts: tuple[Shunt, ...] = ()
+    capacitors: tuple[Capacitor, ...] = ()
+    grid: str | None = None
+    closed: bool = True
+    opened: frozenset[str] = frozenset()
+    fault: FaultPlace | None = None
+    blocked: frozenset[int] = frozenset()
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Names of the states as w has them: three a converter, the branches, the banks' voltages,
+        and what a fault within a branch adds: the current beyond it."""
+        own = tuple(name for unit in self.units for name in unit.states)
+        beyond = () if self.split is None else ("beyond",)
+        others = [part.name for part in self.branches] + [bank.name for bank in self.capacitors]
+        return (*own, *others, *beyond)
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes between the parts, each once."""
+        ends = [unit.node for unit in self.units]
+        ends += [node for branch in self.branches for node in (branch.start, branch.end)]
+        ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
+        return tuple(dict.fromkeys(node for node in ends if node != GROUND))
+
+    @property
+    def split(self) -> str | None:
+        """The branch that has a place for a fault inside."""
+        return None if self.fault is None else self.fault.branch
+
+    @property
+    def units_lines(self) -> tuple[Branch, ...]:
+        """The lines from the converters to their nodes."""
+        return tuple(Branch(u.line, u.terminal, u.node, u.L_g, u.R_g) for u in self.units)
+
+    def named_lines(self) -> dict[str, Branch]:
+        """Lines by the name that people use: a converter's line has that of the converter."""
+        own = {unit.name: line for unit, line in zip(self.units, self.units_lines, strict=True)}
+        return own | {b.name: b for b in self.branches if b.end != GROUND}
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the lines and loads between nodes and ground, without the converters' lines."""
+        return [branch.name for branch in self.branches] + [shunt.name for shunt in self.shunts]
+
+    @property
+    def has_load(self) -> bool:
+        """Whether anything is left to feed without the grid."""
+        return bool(self.shunts) or any(branch.end == GROUND for branch in self.branches)
+
+    def to_grid(self) -> dict[str, float]:
+        """What each state brings to the grid, as a factor of its current."""
+        found: dict[str, float] = {}
+        if self.grid is None or not self.closed:
+            return found
+        for branch in self._whole((*self.units_lines, *self.branches)):
+            if self.grid in (branch.start, branch.end):
+                found[branch.name] = 1.0 if branch.end == self.grid else -1.0
+        return found
+
+    def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
+        """The modes of a circuit, and the names of its sources in their order.
+
+        Args:
+            blocked: indices of the converters whose bridges block.
+            faulted: whether the fault is there.
+
+        Raises:
+            ValueError: as ``find_modes``.
+        """
+        filters, sources = [], []
+        shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
+        if faulted and self.fault is not None:
+            node = "beyond" if self.split else self.fault.node
+            shunts = _with_shunt(shunts, Shunt("fault", node, self.fault.R))
+        for k, unit in enumerate(self.units):
+            if k not in blocked:
+                i_f = unit.states[0]
+                filters.append(Branch(i_f, unit.bridge, unit.terminal, unit.L_f, unit.R_f))
+                sources.append(Source(unit.bridge, unit.bridge))
+        branches = [*self._whole(self.units_lines), *filters, *self._whole(self.branches)]
+        capacitors = [Capacitor(unit.states[1], unit.terminal, unit.C_f) for unit in self.units]
+        capacitors += self.capacitors
+        if self.grid is not None and self.closed:
+            sources.append(Source(GRID_SOURCE, self.grid))
+        if self.opened or not self.closed:
+            held = {GROUND} | {c.node for c in capacitors} | {s.node for s in shunts}
+            branches = _without_ends(branches, held | {source.node for source in sources})
+            met = {node for branch in branches for node in (branch.start, branch.end)}
+            shunts = [s for s in shunts if s.node in met]
+        modes = find_modes(branches, capacitors, sources, self.omega_b, self.order, shunts)
+        return modes, [source.name for source in sources]
+
+    def _whole(self, branches: Sequence[Branch]) -> Iterator[Branch]:
+        """Those that are closed; a split one as two."""
+        for branch in branches:
+            if branch.name in self.opened:
+                continue
+            if self.fault is None or branch.name != self.split:
+                yield branch
+                continue
+            at = self.fault.position
+            yield Branch(branch.name, branch.start, "beyond", at * branch.L, at * branch.R)
+            yield Branch("beyond", "beyond", branch.end, (1 - at) * branch.L, (1 - at) * branch.R)
+
+
+def _with_shunt(shunts: list[Shunt], more: Shunt) -> list[Shunt]:
+    """Add a shunt, in parallel to the one that is at its node already."""
+    for k, there in enumerate(shunts):
+        if there.node == more.node:
+            R = there.R * more.R / (there.R + more.R) if more.R > 0 else 0.0
+            return [*shunts[:k], Shunt(more.name, more.node, R), *shunts[k + 1 :]]
+    return [*shunts, more]
+
+
+def _without_ends(branches: list[Branch], held: set[str]) -> list[Branch]:
+    """Leave out what an open breaker has left hanging at one end, where no current can flow."""
+    while True:
+        met = [node for branch in branches for node in (branch.start, branch.end)]
+        kept = [b for b in branches if all(n in held or met.count(n) > 1 for n in (b.start, b.end))]
+        if len(kept) == len(branches):
+            return kept
+        branches = kept

@@ -1,0 +1,104 @@
+"""A law as a real-code model for EMT programs: the DLL interface of IEEE and CIGRE (CIGRE TB 958).
+
+The model is the exported C code with one more source, ``model.c``. The simulation program owns all
+states, and may copy them between two calls; so there may be several instances.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from gfm_runtime.errors import LawError
+from gfm_runtime.firmware.c_text import chosen, filled, identifier, plain, template
+from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
+from gfm_runtime.firmware.module import MADE, RESULTS, keys_of, make_modules, sources
+from gfm_runtime.law import Law
+from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, group, table_hash
+
+_INTERFACE = "IEEE_Cigre_DLLInterface.h"
+
+
+def dll_sources(name: str, law: Law, T_s: float, real: str, omega_b: float) -> dict[str, str]:
+    """The headers and sources of a model by file name.
+
+    Args:
+        name: of the law and the model.
+        law: with its inner stage, if it has one.
+        T_s: sampling time, s.
+        real: float32 or float64 inside; inputs and outputs are always real64.
+        omega_b: base frequency of the converter, rad/s, for an inner stage.
+
+    Raises:
+        LawError: as ``make_modules``.
+    """
+    modules = make_modules({name: law}, T_s, real, omega_b)
+    m = modules[0]
+    u = carried_rows("u", m.stages)
+    single = m.real == np.float32
+    keys = keys_of(m) | {
+        "MADE": MADE,
+        "LAW_NAME": plain(name),
+        "NAME": _string(name),
+        "VERSION": _string(f"signal table {TABLE_VERSION} ({table_hash()})"),
+        "TITLE": _string(law.title),
+        "SOURCE": _string(law.source),
+        "T_S": repr(float(T_s)),
+        "FIRST_INT": "limited" if m.stages else "reason",
+        "REAL64": "IEEE_Cigre_DLLInterface_DataType_real64_T",
+        "INPUTS": _ports((*group("ref"), *carried_rows("y", m.stages))),
+        "OUTPUTS": _ports(u),
+        "REASON": _string(
+            "0, or why the bridge must be blocked: "
+            + "; ".join(f"{code} {text}" for code, text in RESULTS.values() if code)
+        ),
+        "STATES": "FloatStates" if single else "DoubleStates",
+        "FLOATS": "REALS" if single else "0",
+        "DOUBLES": "0" if single else "REALS",
+        "U_LOW": ", ".join(repr(s.low) for s in u),
+        "U_HIGH": ", ".join(repr(s.high) for s in u),
+        "U_START": ", ".join(repr(s.default) + "f" * single for s in u),
+        "E_IN_USE": ", &u[2]" * m.stages,
+    }
+    return {
+        **sources(modules, T_s, "unrolled"),
+        _INTERFACE: filled(template(_INTERFACE), keys),
+        "model.c": filled(chosen(template("model.c"), m.choices), keys),
+    }
+
+
+def build_dll(folder: Path, name: str, files: Iterable[str]) -> Path:
+    """Compile by gcc the files of ``dll_sources`` in a folder; the shared library's path.
+
+    Raises:
+        LawError: there is no gcc (the apt package is named), or it fails.
+    """
+    host = TARGETS["host"]
+    if shutil.which(host.compiler) is None:
+        raise LawError(
+            f"law {name!r}", f"{host.compiler} is not there; apt-get install {host.packages}"
+        )
+    library = folder / f"gfm_{identifier(name)}.so"
+    own = [file for file in files if file.endswith(".c")]
+    called(
+        [host.compiler, *FLAGS, OPTIMISED, "-fPIC", "-shared", "-fvisibility=hidden",
+         *own, "-o", library.name, *host.link],
+        folder,
+    )  # fmt: skip
+    return library
+
+
+def _string(text: str) -> str:
+    return json.dumps(plain(text))
+
+
+def _ports(signals: Iterable[Signal]) -> str:
+    return "\n".join(
+        f"    {{{_string(s.name)}, {_string(f'{s.description}, of {s.base}')}, {_string(s.unit)}, "
+        "IEEE_Cigre_DLLInterface_DataType_real64_T, 1},"
+        for s in signals
+    )

@@ -1,0 +1,185 @@
+"""Runs of several converters in one network."""
+
+from __future__ import annotations
+
+import copy
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.cli import main
+from gfm_hil.core.errors import UserError
+from gfm_hil.results.network_run import NetworkRun
+from gfm_hil.scenario.model import find_scenario, load_scenario
+
+pytestmark = pytest.mark.full  # compiles the loop of several converters
+
+BUS = {"node": "bus"}
+LINE = {"start": "bus", "end": "far", "L": 0.2, "R": 0.02}
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    """Two converters that feed a load, and another one that comes on at 0.2 s."""
+    made: dict[str, Any] = {
+        "title": "two", "duration": 2.0, "law": "droop-3", "link": {"type": "inproc"},
+        "references": {"P_ref": 0.3},
+        "network": {
+            "converters": {"A": dict(BUS), "B": dict(BUS)},
+            "loads": {"base": {"node": "bus", "P": 0.6, "Q": 0.1},
+                      "step": {"node": "bus", "P": 0.4, "Q": 0.0, "closed": False}},
+        },
+        "events": [{"type": "breaker", "name": "step", "t": 0.2, "closed": True}],
+    }  # fmt: skip
+    return made | changes
+
+
+def test_two_equal_ones_share_a_load_and_the_frequency() -> None:
+    run = gfmhil.run_network(content())
+    assert run.status == "completed"
+    a, b = run["A"].signals, run["B"].signals
+    assert np.abs(a["p"] - b["p"]).max() < 1e-9
+    assert a["p"][-1] == pytest.approx(b["p"][-1]) and a["p"][-1] > 0.45
+    assert a["omega_u"][-1] == pytest.approx(b["omega_u"][-1], abs=1e-9)
+    assert a["p"][:1900] == pytest.approx(a["p"][0], abs=1e-6)  # at rest until the load comes
+
+
+def test_two_share_by_their_droops() -> None:
+    """The change of power of each is that of the frequency over its droop."""
+    given = content(duration=6.0)
+    given["network"]["converters"]["B"]["law"] = "vsg-2"
+    run = gfmhil.run_network(given)
+    slopes = {}
+    for name in "AB":
+        s = run[name].signals
+        slopes[name] = (s["omega_u"][-1] - s["omega_u"][0]) / (s["p"][-1] - s["p"][0])
+    # what each law does alone, on a grid whose frequency steps
+    for name, law in (("A", "droop-3"), ("B", "vsg-2")):
+        alone = {
+            "title": "alone", "duration": 6.0, "law": law, "references": {"P_ref": 0.3},
+            "link": {"type": "inproc"},
+            "events": [{"type": "grid-frequency", "t": 0.1, "f_hz": 49.95}],
+        }  # fmt: skip
+        s = gfmhil.run(alone).signals
+        expected = -0.001 / (s["p"][-1] - s["p"][0])
+        assert slopes[name] == pytest.approx(expected, rel=0.01)
+
+
+def test_the_rig_as_a_network_of_one_has_the_bits_of_the_rig() -> None:
+    rig = load_scenario("pref_step", in_process=True).model_dump(exclude_none=True)
+    alone = gfmhil.run(copy.deepcopy(rig))
+    rig["network"] = {"converters": {"A": {"node": "g"}}, "grid": "g"}
+    (one,) = gfmhil.run_network(rig).values()
+    assert set(one.columns) == set(alone.columns)
+    for name in alone.columns:
+        assert np.asarray(one.columns[name]) == pytest.approx(
+            np.asarray(alone.columns[name]), abs=1e-9
+        )
+
+
+def test_one_that_trips_leaves_the_load_to_the_other() -> None:
+    given = content(duration=3.0, events=[])
+    given["network"]["converters"]["A"] |= {
+        "plant": {"protection": {"over_current": {"threshold": 0.33}}}, "expect": "tripped",
+    }  # fmt: skip
+    given["events"] = [{"type": "reference", "t": 0.5, "P_ref": 0.4, "converter": "A"}]
+    run = gfmhil.run_network(given)
+    assert run["A"].status == "tripped" and run["B"].status == "completed"
+    assert run.status == "A tripped, B completed" and run.summary["unmet"] == []
+    assert "over-current" in run["A"].summary["reason"]
+    a, b = run["A"].signals, run["B"].signals
+    assert a["p"][-1] == pytest.approx(0.0, abs=0.01) and b["p"][-1] == pytest.approx(0.6, abs=0.03)
+
+
+def test_events_find_their_converter_and_everyone_sees_those_of_the_network() -> None:
+    given = content()
+    given["events"].append({"type": "reference", "t": 0.1, "V_ref": 1.02, "converter": "B"})
+    run = gfmhil.run_network(given)
+    labels = {name: [e["label"] for e in one.summary["events"]] for name, one in run.items()}
+    assert labels == {"A": ["step on"], "B": ["V_ref = 1.02", "step on"]}
+    assert run["A"].signals["ref_V_ref"][-1] == 1.0 and run["B"].signals["ref_V_ref"][-1] == 1.02
+
+
+def test_an_inner_stage_of_one_gives_all_its_signals() -> None:
+    given = content(events=[])
+    given["network"]["converters"]["B"] |= {"law": "vsg-2", "inner": "virtual-stator"}
+    run = gfmhil.run_network(given)
+    assert run.status == "completed"
+    assert run["B"].signals["y_i_d"][-1] == pytest.approx(0.3, abs=0.05)
+    assert "u_E_q" in run["A"].columns and "u_E_q" in run["B"].columns
+
+
+def test_a_run_on_disk_is_that_in_memory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "three.toml"
+    text = (
+        find_scenario("three_share_a_load")
+        .read_text("utf-8")
+        .replace("duration = 3.0", "duration = 0.7")
+    )
+    file.write_text(text, "utf-8")
+    assert main(["run", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"\n{name}\ncompleted" in said for name in "ABC")
+    kept = NetworkRun.load(tmp_path / "run")
+    memory = gfmhil.run_network(tomllib.loads(text))
+    for name in "ABC":
+        for column in memory[name].columns:
+            there = np.asarray(kept[name].columns[column][:])
+            assert (there == np.asarray(memory[name].columns[column][:])).all(), column
+    assert (tmp_path / "run" / "converters.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["unmet"] == []
+    again = memory.save(tmp_path / "saved")
+    assert NetworkRun.load(again).status == "completed"
+    assert gfmhil.load_run(tmp_path / "run" / "B").scenario.converter == "B"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"link": {"type": "shm"}}, "link.type = 'shm': a network runs in one process"),
+        ({"after_trip": "wait"}, "after_trip = 'wait': a network has no reset yet"),
+        ({"events": [{"type": "breaker", "name": "stop", "t": 0.1, "closed": True}]},
+         r"events.0: name = 'stop': must be one of \['A', 'B', 'base', 'step'\]"),
+        ({"events": [{"type": "reference", "t": 0.1, "P_ref": 0.1, "converter": "C"}]},
+         r"events.0.converter = 'C': must be one of \['A', 'B'\]"),
+        ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bsu"}]},
+         r"events.0: node = 'bsu': must be one of \['bus'\]"),
+        ({"events": [{"type": "fault", "t": 0.1, "R": 0.1}]}, "position = None, node = None"),
+        ({"network": {"converters": {"A": {"node": "x", "law": "drop-1"}}, "grid": "x"},
+          "events": []}, "network.converters.A.law"),
+        ({"network": {"converters": {"A": {"node": "x"}}, "grid": "y"}}, "the grid is at node 'y'"),
+        ({"network": {"converters": {"A": {"node": "x"}}, "lines": {"l": {**LINE, "L": 0.0}}}},
+         "network.lines.l.L: Input should be greater than 0"),
+        ({"network": {"converters": {"A": {"node": "x", "plant": {"grid": {"V_g": 0.9}}}}}},
+         "plant.grid: is the scenario's own"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_one_line_that_names_it(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        load_scenario(content(**change))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_takes_one_converter_says_so() -> None:
+    with pytest.raises(UserError, match="network: this takes one converter"):
+        gfmhil.run(content())
+    with pytest.raises(UserError, match="network: the scenario has none"):
+        gfmhil.run_network("pref_step")
+
+
+def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:
+    run = gfmhil.run_network("loss_of_the_last_machine")
+    assert run.status == "completed"
+    for one in run.values():
+        (opened,) = one.summary["events"]
+        assert opened["i_peak_cycle"] < 1.0 and opened["f_nadir_hz"] > 49.8
+    a, b = run["A"].signals, run["B"].signals
+    V = 0.5 * (a["true_V"][-1] + b["true_V"][-1])  # both feed the bus through the same short line
+    assert a["p"][-1] + b["p"][-1] == pytest.approx(1.2 * V**2, rel=0.03)
+    assert a["omega_u"][-1] == pytest.approx(b["omega_u"][-1], abs=1e-6)

@@ -1,0 +1,298 @@
+"""Several converters in one network, against SciPy and against networks that are the same."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from gfm_plant import (
+    Network,
+    NetworkParts,
+    Plant,
+    load_converter,
+    make_network,
+    plant_command,
+    plant_step,
+    take_out,
+)
+from gfm_plant.grid import fault, line_breaker, phase_jump
+from gfm_plant.model import DELTA, V_DC
+from gfm_plant.names import TRIPS
+
+T_S = 1e-4
+OFF = {name: {"enabled": False} for name, *_ in TRIPS}
+"""No protection: the sources follow no law here, so that their DC links drift."""
+
+
+def make(converters: dict[str, tuple[dict[str, Any], str]], **parts: Any) -> Network:
+    made = {
+        name: (Plant.model_validate({"protection": OFF, **options}), node)
+        for name, (options, node) in converters.items()
+    }
+    return make_network(made, T_S, Plant().grid, NetworkParts.model_validate(parts))
+
+
+def start(plant: Network, E: Any, delta: Any, omega: float = 1.0) -> np.ndarray:
+    """Let all sources turn at one speed for so long that the circuit is at rest; returns u."""
+    N = len(plant.par)
+    u = np.zeros((N, 4))
+    u[:, 1], u[:, 2] = omega, E
+    x = np.zeros((N, 8))
+    x[:, DELTA], x[:, V_DC] = delta, 1.0
+    plant.start(x, u)
+    # w as the phasors have it, which `start` takes from x for the converters' own states
+    modes, sources = plant.wiring.modes(frozenset(), False)
+    volts = [u[k, 2] * np.exp(1j * x[k, DELTA]) for k in range(N)]
+    volts += [1.0] if "grid" in sources else []
+    speed = plant.wiring.omega_b * (omega - 1)
+    w = modes.states @ (modes.drive @ volts / (1j * speed - modes.rates))
+    for k in range(N):
+        own = w[3 * k : 3 * k + 3] * np.exp(-1j * x[k, DELTA])
+        own[[0, 2]] *= plant.par[k]["current"]
+        x[k, 0:6:2], x[k, 1:6:2] = own.real, own.imag
+        u[k, 0] = u[k, 2] * own[0].real
+    plant.start(x, u)
+    return u
+
+
+def go(plant: Network, u: np.ndarray, ticks: int) -> None:
+    for _ in range(ticks):
+        for k in range(len(u)):
+            plant_command(plant.records, k, u[k])
+        plant_step(plant.records)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_against_an_adaptive_integrator(factor: float) -> None:
+    """Two converters, the second with other elements, at two nodes with a capacitor bank each."""
+    plant = make(
+        {"a": ({}, "m"), "b": ({"factors": {"L_f": factor, "C_f": 1 / factor, "C_dc": 0.8}}, "n")},
+        lines={"l": {"start": "m", "end": "n", "L": 0.2, "R": 0.03}},
+        loads={"z": {"node": "n", "P": 0.8, "Q": 0.3}, "r": {"node": "m", "P": 0.4}},
+        capacitors={"c": {"node": "m", "Q": 0.05}, "d": {"node": "n", "Q": 0.08}},
+    )
+    u = start(plant, [1.02, 0.99], [0.05, 0.0])
+    x0, w0 = plant.st["x"].copy(), plant.now["w"][0] @ [1, 1j]
+    order = plant.wiring.order
+    assert order == ("a.i_f", "a.v", "a.i_o", "b.i_f", "b.v", "b.i_o", "l", "z", "c", "d")
+    u[0] += [0.05, 2e-3, 0.03, 0.0]  # a step of everything
+    u[1] += [-0.02, -1e-3, -0.02, 0.0]
+    w_b, par = plant.wiring.omega_b, plant.par
+    z = 0.8**2 + 0.3**2
+
+    def slope(t: float, s: np.ndarray) -> np.ndarray:
+        i_f, v, i_o = s[0:6:3], s[1:6:3], s[2:6:3]
+        i_l, i_z, v_m, v_n, v_dc = s[6], s[7], s[8], s[9], s[10:12].real
+        e = u[:, 2] * np.exp(1j * (x0[:, DELTA] + w_b * (u[:, 1] - 1) * t))
+        v_node = np.array([v_m, v_n])
+        out = np.empty_like(s)
+        out[0:6:3] = w_b / par["L_f"] * (e - v - par["R_f"] * i_f)
+        out[1:6:3] = w_b / par["C_f"] * (i_f - i_o)
+        out[2:6:3] = w_b / par["L_g"] * (v - v_node - par["R_g"] * i_o)
+        out[6] = w_b / 0.2 * (v_m - v_n - 0.03 * i_l)
+        out[7] = w_b / (0.3 / z) * (v_n - 0.8 / z * i_z)
+        out[8] = w_b / 0.05 * (i_o[0] - i_l - 0.4 * v_m)
+        out[9] = w_b / 0.08 * (i_o[1] + i_l - i_z)
+        out[:10] -= 1j * w_b * s[:10]
+        drawn = (e * i_f.conj()).real
+        out[10:12] = w_b / par["C_dc"] * (u[:, 0] - drawn / v_dc)
+        return out
+
+    s0 = np.concatenate([w0[:10], [1.0, 1.0]])
+    exact = solve_ivp(slope, (0, 0.05), s0, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    go(plant, u, 500)
+    w = plant.now["w"][0] @ [1, 1j]
+    assert np.abs(w[:10] - exact[:10]).max() < 1e-9
+    assert plant.st["x"][:, V_DC] == pytest.approx(exact[10:12].real, abs=1e-8)
+
+
+def test_identical_converters_at_one_bus_are_one_with_a_longer_line() -> None:
+    """Each of n equal converters sees a shared line n times as long."""
+    n, L, R = 3, 0.1, 0.02
+    many = make(
+        {f"c{k}": ({}, "bus") for k in range(n)}, grid="far",
+        lines={"l": {"start": "bus", "end": "far", "L": L, "R": R}},
+    )  # fmt: skip
+    one = make(
+        {"c": ({}, "bus")}, grid="far",
+        lines={"l": {"start": "bus", "end": "far", "L": n * L, "R": n * R}},
+    )  # fmt: skip
+    found = []
+    for plant in (many, one):
+        u = start(plant, 1.0, 0.2)
+        phase_jump(plant, 20.0)
+        u[:, 2] += 0.02
+        go(plant, u, 3000)
+        found.append(plant.st["x"])
+    assert np.abs(found[0] - found[1][0]).max() < 1e-10
+
+
+def test_a_rating_is_as_many_converters_of_the_first_one(tmp_path: Path) -> None:
+    """A converter of twice the rating, the same in its own p.u., is two of the small one."""
+    paper = load_converter("paper").model_dump()
+    paper["S_n"] *= 2
+    for name in ("L_f", "R_f", "L_g", "R_g"):
+        paper[name] /= 2
+    for name in ("C_f", "C_dc"):
+        paper[name] *= 2
+    file = tmp_path / "large.toml"
+    file.write_text("".join(f"{k} = {v!r}\n" for k, v in paper.items() if v is not None))
+    small, large = ({}, "bus"), ({"converter": str(file)}, "bus")
+    line = {"l": {"start": "bus", "end": "far", "L": 0.1, "R": 0.02}}
+    found = []
+    for parts in ({"a": small, "b": small, "c": small}, {"a": small, "b": large}):
+        plant = make(parts, grid="far", lines=line)
+        u = start(plant, 1.0, [0.3, 0.1, 0.1][: len(parts)])
+        u[1:, 2] += 0.05
+        go(plant, u, 500)
+        found.append(plant.st["x"])
+    assert found[0][1] == pytest.approx(found[0][2], abs=1e-12)
+    assert found[1] == pytest.approx(found[0][:2], abs=1e-10)
+
+
+def tripping(**limits: float) -> Network:
+    """Two converters on a grid that trip above the currents that ``limits`` gives them."""
+    converters = {}
+    for name in "ab":
+        trip = {"threshold": limits[name]} if name in limits else OFF["over_current"]
+        converters[name] = ({"protection": {**OFF, "over_current": trip}}, "bus")
+    return make(
+        converters, grid="far", lines={"l": {"start": "bus", "end": "far", "L": 0.1, "R": 0.02}}
+    )
+
+
+def test_one_trips_and_the_other_goes_on() -> None:
+    plant = tripping(a=0.01)
+    u = start(plant, 1.0, 0.2)
+    alone = make(
+        {"a": ({}, "bus"), "b": ({}, "bus")}, grid="far",
+        lines={"l": {"start": "bus", "end": "far", "L": 0.1, "R": 0.02}},
+    )  # fmt: skip
+    start(alone, 1.0, 0.2)
+    go(plant, u, 1)
+    assert list(plant.st["trip"]) == [1, 0] and plant.st["x"][0, 0] == 0.0
+    take_out(plant)
+    assert plant.wiring.blocked == {0}
+    # the other one, against the same network in which a's bridge was never connected
+    w = plant.now["w"][0].copy()
+    alone.now["w"][0], alone.now["unit"][0] = w, plant.now["unit"][0]
+    alone.st["x"], alone.st["trip"] = plant.st["x"], [1, 0]
+    alone.connect(plant.wiring)
+    alone.rewire(plant.wiring)
+    for one in (plant, alone):
+        go(one, u, 500)
+    assert plant.st["x"] == pytest.approx(alone.st["x"], abs=1e-12)
+    assert abs(plant.st["x"][1, 4]) > 0.3
+
+
+def test_two_that_trip_at_once_trip_one_tick_apart() -> None:
+    plant = tripping(a=0.01, b=0.01)
+    u = start(plant, 1.0, 0.2)
+    trips = []
+    for _ in range(3):
+        go(plant, u, 1)
+        take_out(plant)
+        trips.append(list(plant.st["trip"]))
+    assert trips == [[1, 0], [1, 1], [1, 1]]
+    assert list(plant.st["trip_tick"]) == [1, 2]
+    go(plant, u, 1000)
+    assert np.abs(plant.st["x"][:, :2]).max() == 0.0
+
+
+def test_a_load_that_is_off_draws_nothing_and_a_line_that_opens_no_current() -> None:
+    def at(closed: bool) -> Network:
+        plant = make(
+            {"a": ({}, "bus")}, grid="far",
+            lines={"l": {"start": "bus", "end": "far", "L": 0.1, "R": 0.02},
+                   "m": {"start": "bus", "end": "far", "L": 0.1, "R": 0.02}},
+            loads={"z": {"node": "bus", "P": 0.3, "Q": 0.1, "closed": closed}},
+        )  # fmt: skip
+        return plant
+
+    plant, other = at(True), at(False)
+    u = start(plant, 1.0, 0.2)
+    line_breaker(plant, "z", closed=False)
+    go(plant, u, 20_000)
+    start(other, 1.0, 0.2)
+    go(other, u, 1)
+    assert plant.st["x"][0, :6] == pytest.approx(other.st["x"][0, :6], abs=1e-7)
+    line_breaker(plant, "m", closed=False)
+    k = plant.wiring.order.index("m")
+    go(plant, u, 10)
+    assert not plant.now["w"][0, k].any()
+
+
+def test_delays_of_different_length_cut_the_period() -> None:
+    delays = {"a": {"samples": 1, "fraction": 0.25}, "b": {"samples": 1, "fraction": 0.75}}
+    plant = make({name: ({"delay": d}, "bus") for name, d in delays.items()}, grid="bus")
+    assert plant.net[0]["n_parts"] == 3
+    assert plant.net[0]["stretch"][:3] == pytest.approx([0.25e-4, 0.5e-4, 0.25e-4])
+    u = start(plant, 1.0, 0.1)
+    go(plant, u, 3)
+    u[:, 2] = 1.1
+    plant_step(plant.records)
+    for k in range(2):
+        plant_command(plant.records, k, u[k])
+    plant_step(plant.records)  # a gets its command after a quarter of this period
+    i_a, i_b = plant.st["x"][0, 0] - plant.st["x"][1, 0], plant.st["x"][1, 0]
+    assert i_a > 0.0 and math.isfinite(i_b)
+
+
+def test_a_fault_at_a_node_is_that_at_the_end_of_every_line_to_it() -> None:
+    def ready() -> Network:
+        return make(
+            {"a": ({}, "bus"), "b": ({}, "bus")}, grid="far",
+            lines={"l": {"start": "bus", "end": "far", "L": 0.3, "R": 0.02}},
+        )  # fmt: skip
+
+    at_node, on_line = ready(), ready()
+    u = start(at_node, 1.0, 0.1)
+    start(on_line, 1.0, 0.1)
+    fault(at_node, None, 0.01, node="bus")
+    fault(on_line, 0.0, 0.01, line="l")
+    for plant in (at_node, on_line):
+        go(plant, u, 300)
+    assert at_node.st["x"] == pytest.approx(on_line.st["x"], abs=1e-12)
+
+
+BUS = {"a": ({}, "bus")}
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"grid": "buss"}, "the grid is at node 'buss', which has no path to a converter"),
+        ({"loads": {"z": {"node": "x", "P": 0.1}}}, "z is at node 'x', which has no path"),
+        ({"lines": {"l": {"start": "bus", "end": "x", "L": 0.1}}}, "node x: only l ends there"),
+        ({"loads": {"a": {"node": "bus", "P": 0.1}}}, "a is the name of two parts"),
+        ({"loads": {"y": {"node": "bus", "P": 0.1}, "z": {"node": "bus", "P": 0.1}}},
+         "y and z: two resistors at node bus"),
+        ({}, "node bus: only a.i_o ends there"),
+    ],
+)  # fmt: skip
+def test_impossible_networks(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(BUS, **parts)
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        (lambda p: fault(p, None, 0.1, node="x"), r"node = 'x': must be one of \['bus', 'far'\]"),
+        (lambda p: fault(p, 0.5, 0.1, line="x"), r"line = 'x': must be one of \['a', 'l'\]"),
+        (lambda p: fault(p, None, 0.1, node="far"), "node = 'far': is an ideal voltage"),
+        (lambda p: line_breaker(p, "x", closed=False), r"name = 'x': must be one of \['a', 'l'\]"),
+    ],
+)
+def test_impossible_events(event: Callable[[Network], None], message: str) -> None:
+    plant = make(BUS, grid="far", lines={"l": {"start": "bus", "end": "far", "L": 0.1}})
+    before = plant.copy()
+    with pytest.raises(ValueError, match=message):
+        event(plant)
+    assert plant.wiring == before.wiring and plant.records == before.records

@@ -1,0 +1,258 @@
+"""Laws as real-code models (IEEE/CIGRE, CIGRE TB 958): loaded as an EMT program does, bit by bit.
+
+The layout below is the interface's (natural alignment), not read from our header.
+"""
+
+from __future__ import annotations
+
+import ctypes as c
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.cli import main
+from gfm_runtime import LawSet, load_law
+from gfm_runtime.assembly import Controller
+from gfm_runtime.firmware.golden import inputs
+from gfm_runtime.inner import settle
+from gfm_runtime.signals import NU, carried, carried_rows, group, names
+from gfm_runtime.states import BAD_Y, RUNNING
+from gfm_runtime.switchover import settle_into
+
+from ..support.firmware import T_S, cc
+
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+
+SUPPORT = Path(__file__).parents[1] / "support"
+REAL64, EMT = 9, 1
+OK, MESSAGE = 0, 1
+TICKS = 1000
+
+
+class Signal(c.Structure):
+    _fields_ = [("Name", c.c_char_p), ("Description", c.c_char_p), ("Unit", c.c_char_p),
+                ("DataType", c.c_int), ("Width", c.c_int32)]  # fmt: skip
+
+
+class ModelInfo(c.Structure):
+    _fields_ = [
+        ("DLLInterfaceVersion", c.c_uint8 * 4),
+        *((name, c.c_char_p) for name in (
+            "ModelName", "ModelVersion", "ModelDescription", "GeneralInformation", "ModelCreated",
+            "ModelCreator", "ModelLastModifiedDate", "ModelLastModifiedBy", "ModelModifiedComment",
+            "ModelModifiedHistory")),
+        ("FixedStepBaseSampleTime", c.c_double), ("EMT_RMS_Mode", c.c_uint8),
+        ("NumInputPorts", c.c_int32), ("InputPortsInfo", c.POINTER(Signal)),
+        ("NumOutputPorts", c.c_int32), ("OutputPortsInfo", c.POINTER(Signal)),
+        ("NumParameters", c.c_int32), ("ParametersInfo", c.c_void_p),
+        ("NumIntStates", c.c_int32), ("NumFloatStates", c.c_int32), ("NumDoubleStates", c.c_int32),
+    ]  # fmt: skip
+
+
+class Instance(c.Structure):
+    _fields_ = [
+        ("ExternalInputs", c.c_void_p), ("ExternalOutputs", c.c_void_p), ("Parameters", c.c_void_p),
+        ("Time", c.c_double), ("SimTool_EMT_RMS_Mode", c.c_uint8),
+        ("LastErrorMessage", c.c_char_p), ("LastGeneralMessage", c.c_char_p),
+        ("IntStates", c.c_void_p), ("FloatStates", c.c_void_p), ("DoubleStates", c.c_void_p),
+    ]  # fmt: skip
+
+
+class Model:
+    """One instance in a program that hands out other memory at every call, as PSCAD does."""
+
+    def __init__(self, path: Path) -> None:
+        self._of = c.CDLL(str(path))
+        self._of.Model_GetInfo.restype = c.POINTER(ModelInfo)
+        self.info = self._of.Model_GetInfo().contents
+        self.outputs = np.zeros(self.info.NumOutputPorts)
+        self.inputs = np.zeros(self.info.NumInputPorts)
+        self._states = [
+            np.zeros(self.info.NumIntStates, np.int32),
+            np.zeros(self.info.NumFloatStates, np.float32),
+            np.zeros(self.info.NumDoubleStates),
+        ]
+        self.message = b""
+
+    def call(self, name: str) -> int:
+        arrays = [self.inputs.copy(), self.outputs.copy(), *(s.copy() for s in self._states)]
+        ins, outs, *states = (a.ctypes.data for a in arrays)
+        now = Instance(ins, outs, None, 0.0, EMT, None, None, *states)
+        result = int(getattr(self._of, name)(c.byref(now)))
+        _, self.outputs, *self._states = arrays
+        self.message = now.LastGeneralMessage or b""
+        return result
+
+    def start(self, u: Any) -> None:
+        for name in ("Model_FirstCall", "Model_CheckParameters"):
+            assert self.call(name) == OK
+        self.outputs[: len(u)] = u
+        assert self.call("Model_Initialize") == OK
+
+    def tick(self, ref: Any, y: Any) -> int:
+        self.inputs[:] = [*ref, *y]
+        return self.call("Model_Outputs")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    found: dict[Any, Path] = {}
+
+    def build(law: str, inner: str, real: str) -> Path:
+        if (law, inner, real) not in found:
+            folder = tmp_path_factory.mktemp("dll")
+            command = ["firmware", "dll", law, "--inner", inner, "--real", real, "-o", str(folder)]
+            assert main(command) == 0
+            found[law, inner, real] = next(folder.glob("*.so"))
+        return found[law, inner, real]
+
+    return build
+
+
+def accepted(seed: int, real: str, stages: bool) -> Any:
+    """Golden references and measurements (TICKS, n) without those that are refused, float64."""
+    _, refs, ys = inputs(seed, TICKS, np.dtype(real), stages)
+    rows = (*group("ref"), *carried_rows("y", stages))
+    both = np.hstack([refs, ys])
+    low, high = np.array([[r.low for r in rows], [r.high for r in rows]])
+    both[~((both >= low) & (both <= high)).all(axis=1)] = both[0]
+    return np.split(both.astype(float), [refs.shape[1]], axis=1)
+
+
+def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controller:
+    """The controller of the bench, its outputs beginning at u."""
+    one = Controller([LawSet("x", load_law(law, inner).laws)], T_S, ref, real=real)
+    one.start(np.zeros(one.active_law.order), u[:NU])
+    own = np.array(u[:NU])
+    settle_into(one.laws[0], one.states[0], ref, y, own, np.zeros(NU))
+    if one.inner:
+        settle(one.laws[:1], one.states[:1], own, y, u[2], u[3])
+    return one
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("law", "inner"),
+    [("vsg-2", "none"), ("hybrid-angle", "none"), ("vsg-2", "cascaded"),
+     ("mimo-gfm", "virtual-stator"), ("dvoc", "threshold-impedance")],
+)  # fmt: skip
+def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: str) -> None:
+    """Two instances in turn over 1,000 ticks of golden inputs, limits included."""
+    stages = inner != "none"
+    u = np.array([0.5, 1.0, 1.0, 0.05][: 3 + stages], real).astype(float)
+    twins = []
+    for seed in (1, 2):
+        refs, ys = accepted(seed, real, stages)
+        model = Model(built(law, inner, real))
+        model.start(u)
+        np.testing.assert_array_equal(model.outputs[:-1], u)
+        twins.append((model, bench(law, inner, real, refs[0], ys[0], u), refs, ys))
+    expected = u.copy()
+    for k in range(TICKS):
+        for model, kernel, refs, ys in twins:
+            kernel.ctl["ref"] = kernel.ctl["ref_target"] = refs[k]
+            kernel.step(ys[k], expected)
+            assert kernel.ctl["state"][0] == RUNNING
+            assert model.tick(refs[k], ys[k]) == OK
+            assert model.outputs.tobytes() == np.append(expected, 0.0).tobytes(), k
+
+
+@pytest.mark.skipif(
+    not all(map(shutil.which, ("x86_64-w64-mingw32-gcc", "wine"))),
+    reason="no mingw or wine; they take half a gigabyte, so CI goes without",
+)
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_the_model_has_the_same_bits_under_windows(built: Any, real: str, tmp_path: Path) -> None:
+    folder, u = built("vsg-2", "cascaded", real).parent, [0.5, 1.0, 1.0, 0.05, 0.0]
+    refs, ys = accepted(3, real, True)
+    ticks = np.hstack([refs, ys])
+    (tmp_path / "ticks.bin").write_bytes(np.array(u).tobytes() + ticks.tobytes())
+    cross = ["-std=c99", "-O2", "-ffp-contract=off", "-static-libgcc", f"-I{folder}"]
+    sources = sorted(map(str, folder.glob("*.c")))
+    for arguments in (
+        [*cross, "-shared", *sources, "-o", "model.dll"],
+        [*cross, str(SUPPORT / "load_model.c"), "-o", "load_model.exe"],
+    ):
+        done = cc(tmp_path, *arguments, compiler="x86_64-w64-mingw32-gcc")
+        assert done.returncode == 0, done.stderr
+    quiet = {
+        "WINEPREFIX": str(tmp_path / "wine"),
+        "WINEDEBUG": "-all",
+        "WINEDLLOVERRIDES": "mscoree=",
+    }
+    subprocess.run(
+        ["wine", "load_model.exe", "model.dll"], cwd=tmp_path, check=True, timeout=200,
+        env=os.environ | quiet,
+    )  # fmt: skip
+    found = np.fromfile(tmp_path / "found.bin").reshape(TICKS, len(u))
+    model = Model(built("vsg-2", "cascaded", real))
+    model.start(u[:-1])
+    for k in range(TICKS):
+        assert model.tick(refs[k], ys[k]) == OK
+        assert model.outputs.tobytes() == found[k].tobytes(), k
+
+
+@pytest.mark.parametrize("inner", ["none", "cascaded"])
+def test_the_model_says_what_it_is(built: Any, inner: str) -> None:
+    info = Model(built("vsg-2", inner, "float64")).info
+    assert bytes(info.DLLInterfaceVersion) == bytes([1, 1, 0, 0])
+    assert (info.ModelName, info.EMT_RMS_Mode, info.NumParameters) == (b"vsg-2", EMT, 0)
+    assert info.FixedStepBaseSampleTime == T_S
+    ports = [
+        [port[k] for k in range(n)]
+        for port, n in (
+            (info.InputPortsInfo, info.NumInputPorts),
+            (info.OutputPortsInfo, info.NumOutputPorts),
+        )
+    ]
+    stages = inner != "none"
+    wanted = [[*names("ref"), *carried("y", stages)], [*carried("u", stages), "reason"]]
+    assert [[p.Name.decode() for p in port] for port in ports] == wanted
+    assert {(p.DataType, p.Width) for port in ports for p in port} == {(REAL64, 1)}
+    assert info.NumFloatStates == 0 < info.NumDoubleStates
+
+
+def test_the_model_waits_for_measurements_and_stays_in_the_safe_state(built: Any) -> None:
+    model = Model(built("vsg-2", "cascaded", "float64"))
+    ref = np.array([s.default for s in group("ref")])
+    y = np.array([1.0, 0.5, 1.0, 0.0, 1.0, 0.5, 0.0, 1.0, 0.0, 0.5, 0.0])
+    model.start([0.5, 0.0, 0.0, 0.0])  # a frequency of 0 is no output
+    start = [0.0, 1.0, 1.0, 0.0]
+    assert model.tick(ref, 0 * y) == OK
+    assert model.outputs.tolist() == [*start, BAD_Y], "waits"
+    assert model.tick(ref, y) == OK and model.outputs[-1] == 0
+    held = model.outputs[:-1].copy()
+    assert model.tick(ref, y * np.nan) == MESSAGE and b"safe state" in model.message
+    assert model.tick(ref, y) == OK, "it says so once"
+    np.testing.assert_array_equal(model.outputs, [*held, BAD_Y])
+    for name in ("Model_Iterate", "Model_Terminate"):
+        assert model.call(name) == OK
+    model.start(held)
+    assert model.tick(ref, y) == OK and model.outputs[-1] == 0
+
+
+def test_only_the_interface_is_exported(built: Any, tmp_path: Path) -> None:
+    library = built("vsg-2", "cascaded", "float64")
+    said = cc(tmp_path, "-D", "--defined-only", str(library), compiler="nm").stdout
+    calls = ("CheckParameters", "FirstCall", "GetInfo", "Initialize", "Iterate", "Outputs",
+             "PrintInfo", "Terminate")  # fmt: skip
+    assert sorted(line.split()[-1] for line in said.splitlines()) == [f"Model_{n}" for n in calls]
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+    for compiler in ("gcc", "clang"):
+        done = cc(library.parent, *strict, "-fsyntax-only", "model.c", compiler=compiler)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_the_command_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["firmware", "dll", "mimo-gfm-scheduled", "-o", str(tmp_path)]) == 2
+    assert "has 2 stages; a model holds one law" in capsys.readouterr().err
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main(["firmware", "dll", "vsg-1", "-o", str(tmp_path)]) == 2
+    assert "apt-get install gcc libc6-dev" in capsys.readouterr().err
