@@ -18,10 +18,11 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.robust import Loops, Wanted, paper_problem
-from gfm_hil.cli.design.common import add_inner_option, channels_as_json, chosen_law, judged
+from gfm_hil.cli.design.common import add_inner_option, channels_as_json, chosen_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.box import STEP, step_run
+from gfm_hil.studies.tuned_law import problem_name
 from gfm_runtime import build_law, discretise
 from gfm_runtime.lawfile import LawFile
 
@@ -144,7 +145,7 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(result, indent=2))
     else:
-        _print(judged(file), result)
+        _print(result, problem_name(file))
     return 0
 
 
@@ -197,10 +198,10 @@ def _row(dc: str, what: str, count: int, worst: float | None, at: Point) -> dict
     return {"dc": dc, "what": what, "points": count, "worst": number, "at": asdict(at)}
 
 
-def _print(name: str, result: dict[str, Any]) -> None:
+def _print(result: dict[str, Any], problem: str) -> None:
     console = terminal(highlight=False)
     gamma = "none" if result["gamma"] is None else f"{result['gamma']:.4f}"
-    console.print(f"[bold]{name}[/]: γ = {gamma} of the paper's problem")
+    console.print(f"[bold]{result['law']}[/]: γ = {gamma} of {problem}")
     table = Table("DC source", "what", "points", "worst", "at", box=None, pad_edge=False)
     for row in result["box"]:
         what = row["what"].replace("[", "\\[")
