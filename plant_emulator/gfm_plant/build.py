@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from gfm_plant.options import (
     MEASURED,
     FiniteGrid,
     Grid,
+    Machine,
     NetworkParts,
     Overload,
     Plant,
@@ -34,6 +36,7 @@ from gfm_plant.records import (
     network_dtypes,
     size_for,
 )
+from gfm_plant.wiring import Machine as MachineParts
 from gfm_plant.wiring import Unit, Wiring
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
@@ -78,7 +81,7 @@ def make_network(
         ValueError: If there are too many parts, two of one name, converters of different voltages
             or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
-    names = [*converters, *parts.lines, *parts.loads, *parts.capacitors]
+    names = [*converters, *parts.lines, *parts.loads, *parts.capacitors, *parts.machines]
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise ValueError(f"network: {twice[0]} is the name of two parts")
     branches = [Branch(name, x.start, x.end, x.L, x.R) for name, x in parts.lines.items()]
@@ -98,15 +101,9 @@ def make_network(
     opened = {name for name, line in parts.lines.items() if not line.closed}
     opened |= {name for name, load in parts.loads.items() if not load.closed}
     return _make(
-        converters,
-        T_s,
-        grid,
-        parts.grid,
-        branches,
-        tuple(shunts.values()),
-        banks,
-        frozenset(opened),
-    )
+        converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks,
+        frozenset(opened), parts.machines,
+    )  # fmt: skip
 
 
 def _make(
@@ -118,13 +115,15 @@ def _make(
     shunts: Sequence[Shunt] = (),
     capacitors: Sequence[Capacitor] = (),
     opened: frozenset[str] = frozenset(),
+    machines: Mapping[str, Machine] = MappingProxyType({}),
 ) -> Network:
     """Return a plant; elements in p.u. of the first converter."""
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     N = len(converters)
-    states = N_OWN * N + len(branches) + len(capacitors) + 1  # one for a fault within a branch
-    net_dtype, now_dtype = network_dtypes(size_for(N, states))
+    # one more for a fault within a branch
+    states = N_OWN * N + len(branches) + len(capacitors) + len(machines) + 1
+    net_dtype, now_dtype = network_dtypes(size_for(N, states, len(machines)))
     records = PlantRecords(
         np.zeros(N, converter_par_dtype),
         np.zeros(N, converter_state_dtype),
@@ -143,7 +142,12 @@ def _make(
         _pack_protection(one, options.protection, T_s)
     net["omega_b"], net["T_s"], net["n_converters"] = first.bases.omega_b, T_s, N
     _pack_timing(records)
-    _pack_grid(records, units, grid.finite)
+    net["n_machines"] = len(machines)
+    if grid.finite is not None and grid_node is not None:
+        _pack_grid(records, units, grid.finite)
+    for j, (name, machine) in enumerate(machines.items(), 1):
+        _pack_swing(records, j, machine, machine.X / machine.S, f"network.machines.{name}")
+        net["E"][0, j], now["P_set"][0, j] = machine.E, machine.P
 
     st["x"][:, V_DC] = 1.0
     now["unit"][0, :, 0] = now["sequence"][0, 0, 0] = 1.0
@@ -158,6 +162,7 @@ def _make(
         tuple(branches),
         tuple(shunts),
         tuple(capacitors),
+        tuple(MachineParts(name, m.node, m.X / m.S, m.R / m.S) for name, m in machines.items()),
         grid_node,
         opened=opened,
     )
@@ -184,6 +189,7 @@ def _check_paths(wiring: Wiring) -> None:
     ends += [(b.name, node) for b in wiring.branches for node in (b.start, b.end)]
     ends += [(shunt.name, shunt.node) for shunt in wiring.shunts]
     ends += [(capacitor.name, capacitor.node) for capacitor in wiring.capacitors]
+    ends += [(machine.name, machine.node) for machine in wiring.machines]
     ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
     for name, node in ends:
         if node not in reached | {GROUND}:
@@ -232,19 +238,24 @@ def _pack_converter_circuit(
     )  # fmt: skip
 
 
-def _pack_grid(records: PlantRecords, units: Sequence[Unit], grid: FiniteGrid | None) -> None:
-    if grid is None:
-        return
-    net, T_s = records.net, float(records.net[0]["T_s"])
-    net["H_grid"], net["D_grid"], net["droop_grid"] = grid.H, grid.D, grid.droop
-    net["T_gov"], net["S_grid"] = grid.T_gov, grid.S
+def _pack_grid(records: PlantRecords, units: Sequence[Unit], grid: FiniteGrid) -> None:
     L = 1 / sum(1 / (unit.L_f + unit.L_g) for unit in units)
-    swing = math.sqrt(net[0]["omega_b"] / (2 * grid.H * grid.S * L))
-    governor = math.sqrt(1 / (2 * grid.H * grid.droop * grid.T_gov))
-    rate = max(swing, governor, grid.D / (2 * grid.H), 1 / grid.T_gov)
+    _pack_swing(records, 0, grid, L, "plant.grid.finite")
+
+
+def _pack_swing(
+    records: PlantRecords, j: int, swings: FiniteGrid | Machine, L: float, where: str
+) -> None:
+    """Pack a swing equation; L is the reactance, p.u. of the network, against which it swings."""
+    net, T_s = records.net, float(records.net[0]["T_s"])
+    for name in ("H", "D", "droop", "T_gov", "S"):
+        net[name][0, j] = getattr(swings, name)
+    swing = math.sqrt(net[0]["omega_b"] / (2 * swings.H * swings.S * L))
+    governor = math.sqrt(1 / (2 * swings.H * swings.droop * swings.T_gov))
+    rate = max(swing, governor, swings.D / (2 * swings.H), 1 / swings.T_gov)
     if rate * T_s > _SWING_STEP:
         raise ValueError(
-            f"plant.grid.finite: it swings at {rate:.6g} rad/s; allowed are"
+            f"{where}: it swings at {rate:.6g} rad/s; allowed are"
             f" {_SWING_STEP / T_s:.6g} rad/s at this T_s; raise S, H, T_gov or droop"
         )
 

@@ -17,7 +17,7 @@ from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED
 from gfm_plant.protection import protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.ramps import advance_grid, brought, settle_grid
+from gfm_plant.ramps import advance_grid, brought, given, settle
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
 from gfm_plant.solution import (
     I_F,
@@ -28,6 +28,7 @@ from gfm_plant.solution import (
     enter,
     grid_source,
     half_step,
+    machine_source,
     own,
     read_states,
     state,
@@ -59,8 +60,7 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
         if r.i_u_gain == 0.0:
             s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
         s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
-    if n.H_grid > 0.0:
-        settle_grid(n, now)
+    settle(n, now)
 
 
 @compiled
@@ -116,7 +116,7 @@ def plant_step(plant: PlantRecords) -> None:
         )  # fmt: skip
         for j in range(4):
             s.before[4 + j] = s.sensed[j]
-    for k in range(n.n_converters + 2):
+    for k in range(n.n_converters + 2 + n.n_machines):
         now.unit_before[k, 0], now.unit_before[k, 1] = now.unit[k, 0], now.unit[k, 1]
     for i in range(n.n_states):
         now.w_before[i, 0], now.w_before[i, 1] = now.w[i, 0], now.w[i, 1]
@@ -183,7 +183,7 @@ def _go_back(plant: PlantRecords) -> None:
         )  # fmt: skip
         for j in range(4):
             s.sensed[j] = s.before[4 + j]
-    for k in range(n.n_converters + 2):
+    for k in range(n.n_converters + 2 + n.n_machines):
         now.unit[k, 0], now.unit[k, 1] = now.unit_before[k, 0], now.unit_before[k, 1]
     for i in range(n.n_states):
         now.w[i, 0], now.w[i, 1] = now.w_before[i, 0], now.w_before[i, 1]
@@ -276,7 +276,9 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
     omega_g = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # in the middle of the tick
     for m in range(n.n_modes[c]):
         now.forced[m, 0] = now.forced[m, 1] = now.forced[m, 2] = now.forced[m, 3] = 0.0
-    g_0 = brought(n, now, now.unit) if n.H_grid > 0.0 else 0.0
+    swings = n.H[0] > 0.0 or n.n_machines > 0
+    if swings:
+        _bring(n, now, now.unit, n.half_h[part] / 3.0)
     for k in range(n.n_converters):
         _look(plant, k, 0, now.unit)
     for k in range(n.n_converters):
@@ -288,9 +290,12 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
     if now.unbalance_left > 0.0:
         E_r, E_i = now.V_g * now.sequence[1, 0], now.V_g * now.sequence[1, 1]
         drive(n, now, c, part, g + 1, E_r, E_i, -omega_g)
+    for j in range(1, n.n_machines + 1):
+        omega = now.omega[j] + 0.5 * n.T_s * now.slope[j]
+        drive(n, now, c, part, machine_source(n, j), n.E[j], 0.0, omega)
 
     half_step(n, now, c, part, 0)
-    if n.H_grid > 0.0:
+    if swings:
         read_states(n, now, c)
     else:
         for k in range(n.n_converters):
@@ -301,12 +306,13 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
                     now.w[j, 0], now.w[j, 1] = state(n, now, c, j)
     for k in range(n.n_converters):
         _look(plant, k, 1, now.halfway)
-    g_1 = brought(n, now, now.halfway) if n.H_grid > 0.0 else 0.0
+    if swings:
+        _bring(n, now, now.halfway, 4.0 * n.half_h[part] / 3.0)
 
     half_step(n, now, c, part, 2)
     read_states(n, now, c)
-    if n.H_grid > 0.0:
-        now.brought += n.half_h[part] / 3.0 * (g_0 + 4.0 * g_1 + brought(n, now, now.unit))
+    if swings:
+        _bring(n, now, now.unit, n.half_h[part] / 3.0)
     for k in range(n.n_converters):
         _look(plant, k, 2, now.unit)
         r, s = plant.par[k], plant.st[k]
@@ -317,6 +323,16 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
             for j in range(3):
                 _sense(n, s, k, 1 + j, part, s.seen[0, j], s.seen[1, j], s.seen[2, j])
         s.x[DELTA] += 2.0 * n.half_h[part] * n.omega_b * (s.u_now[1] - omega_g)
+
+
+@compiled
+def _bring(n: Any, now: Any, unit: Any, weight: float) -> None:
+    """Add to the energy that a finite grid and the machines get in this tick, when the sources'
+    phasors are at ``unit``; ``weight`` is that of Simpson's rule, s."""
+    if n.H[0] > 0.0:
+        now.brought[0] += weight * brought(n, now, unit)
+    for j in range(1, n.n_machines + 1):
+        now.brought[j] -= weight * given(n, now, j, unit)
 
 
 @compiled

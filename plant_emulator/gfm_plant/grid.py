@@ -25,7 +25,7 @@ def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) ->
     Raises:
         ValueError: If a value is out of range, or the grid is finite and has its own frequency.
     """
-    if plant.net[0]["H_grid"] > 0:
+    if plant.net[0]["H"][0] > 0:
         raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
     _require("omega_g", omega_g, omega_g > 0, "> 0 p.u.")
     plant.now["omega_g_to"], plant.now["omega_g_rate"] = omega_g, _rate(rate)
@@ -71,9 +71,9 @@ def grid_load(plant: Network, change: float) -> None:
         ValueError: If the grid is ideal, or `change` is not finite.
     """
     _require("change", change, True, "finite")
-    if plant.net[0]["H_grid"] == 0:
+    if plant.net[0]["H"][0] == 0:
         raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
-    plant.now["P_load"] += change
+    plant.now["P_load"][0, 0] += change
 
 
 def fault(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,13 +62,16 @@ class Network:
         self.records.restore(kept.records)
         self.wiring = kept.wiring
 
-    def start(self, x: NDArray[np.float64], u: NDArray[np.float64]) -> None:
+    def start(
+        self, x: NDArray[np.float64], u: NDArray[np.float64], machines: Sequence[float] = ()
+    ) -> None:
         """Put a plant fresh from `make_plant` into an equilibrium.
 
         Args:
             x: states of each converter, (N, 8); (8,) for one.
             u: its commands, (N, 4); for one also (4,), or (3,) without the q component of the
                 bridge's voltage. All turn at the speed of the grid.
+            machines: angle of each machine's voltage, rad.
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
         u = np.pad(u, ((0, 0), (0, N_COMMANDS - u.shape[1])))
@@ -79,6 +83,13 @@ class Network:
             unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(self.wiring.units)
         }
         volts[GRID_SOURCE] = complex(now["V_g"])
+        for j, (machine, angle) in enumerate(zip(self.wiring.machines, machines, strict=True), 1):
+            unit = np.exp(1j * angle)
+            now["unit"][N + 1 + j] = unit.real, unit.imag
+            now["omega"][j] = u[0, 1]
+            volts[machine.emf] = float(self.net[0]["E"][j]) * unit
+        if self.net[0]["reference"]:
+            now["omega_g"] = u[0, 1]
         speed = float(self.net[0]["omega_b"]) * (u[0, 1] - 1.0)
         z = modes.drive @ [volts[name] for name in sources] / (1j * speed - modes.rates)
         w = modes.states @ z
@@ -102,6 +113,8 @@ class Network:
         if wiring.split is not None and wiring.split != before.split:
             there = wiring.order.index(wiring.split)
             self.now["w"][0, wiring.order.index("beyond")] = w[there]
+        if before.grid is None and self.net[0]["reference"] == 0:  # the last machine is gone
+            self.now["omega_g_slope"] = 0.0
         reconnect(self.records)
 
     def connect(self, wiring: Wiring) -> None:
@@ -130,8 +143,13 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
         for fault in (False, True) if wiring.fault else (False,):
             found[k + (N + 1) * fault] = wiring.modes(frozenset(blocked), fault)
     _pack_pieces(records, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
+    running = [j for j, m in enumerate(wiring.machines, 1) if m.name not in wiring.opened]
+    net["reference"] = running[0] if running and wiring.grid is None else 0
     places: dict[str, tuple[int, ...]] = {unit.bridge: (k,) for k, unit in enumerate(wiring.units)}
     places[GRID_SOURCE] = (N, N + 1)
+    for j, machine in enumerate(wiring.machines, 1):
+        places[machine.emf] = (N + 1 + j,)
+        net["current_at"][0, j] = order.index(machine.name)
     parts = int(net[0]["n_parts"])
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][0, circuit] = len(modes.rates)

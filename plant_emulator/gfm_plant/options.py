@@ -356,6 +356,23 @@ class CapacitorBank(Options):
     Q: Positive = Field(description="reactive power at nominal voltage, p.u. of the first one")
 
 
+class Machine(Options):
+    """A synchronous machine in its classical model: a constant voltage behind the transient
+    reactance, the swing equation, and a governor. It has no voltage regulator, no dampers, no
+    saliency and no limits."""
+
+    node: str = Field(min_length=1, description="where it is")
+    S: Positive = Field(description="rating over that of the first converter")
+    H: Positive = Field(description="inertia constant, s")
+    P: float = Field(description="power at nominal frequency, p.u. of its rating")
+    E: Positive = Field(1.05, description="voltage behind the reactance, p.u.")
+    X: Positive = Field(0.3, description="transient reactance, p.u. of its rating")
+    R: NonNegative = Field(0.0, description="resistance, p.u. of its rating")
+    D: NonNegative = Field(0.0, description="damping by frequency, p.u./p.u.")
+    droop: Positive = Field(0.05, description="frequency by power of the governor, p.u./p.u.")
+    T_gov: Positive = Field(0.5, description="lag of governor and turbine, s")
+
+
 class NetworkParts(Options):
     """What connects several converters, by its names."""
 
@@ -365,3 +382,4 @@ class NetworkParts(Options):
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
     loads: dict[str, Load] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
+    machines: dict[str, Machine] = Field({}, description="by name")

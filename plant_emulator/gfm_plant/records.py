@@ -25,19 +25,22 @@ N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds foll
 N_RING = 256  # places of a ring that holds one cycle
 
 SIZES = {1: 5, 2: 16, 4: 32, 12: 96}
-"""Records come in sizes, because each is compiled once a machine: converters, and states of the
+"""Records come in sizes, because each is compiled once a computer: converters, and states of the
 circuit, that fit in."""
+N_MACHINES = 4  # that fit into the records of two converters and more; into those of one, none
 
 
-def size_for(converters: int, states: int) -> int:
-    """Return the key of `SIZES` for so many converters, and states of the circuit.
+def size_for(converters: int, states: int, machines: int = 0) -> int:
+    """Return the key of `SIZES` for so many converters, states of the circuit, and machines.
 
     Raises:
         ValueError: If there are too many.
     """
     for size, most in SIZES.items():
-        if size >= converters and most >= states:
+        if size >= converters and most >= states and machines <= N_MACHINES * (size > 1):
             return size
+    if machines > N_MACHINES:
+        raise ValueError(f"network.machines: {machines}; at most {N_MACHINES}")
     raise ValueError(
         f"network: {converters} converters and {states} currents and voltages; at most"
         f" {max(SIZES)} and {max(SIZES.values())}"
@@ -165,18 +168,27 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
 
     Circuits come in pairs of one row each without and with the fault: row 0 as the converters are,
     and row 1 + k with the bridge of converter k blocked besides. Sources are the bridges, then the
-    positive and the negative sequence of the grid.
+    positive and the negative sequence of the grid, then the machines. What swings is the grid, if
+    it is finite, in place 0, and the machines.
     """
-    n_w, n_s, n_parts, n_c = SIZES[converters], converters + 2, converters + 1, 2 * (converters + 1)
+    n_m = N_MACHINES * (converters > 1)
+    n_w, n_s, n_parts = SIZES[converters], converters + 2 + n_m, converters + 1
+    n_c, n_swing = 2 * (converters + 1), 1 + n_m
     par = np.dtype(
         [
             ("omega_b", "f8"),  # rad/s
-            # a finite grid on its own rating (H_grid = 0: ideal); its rating over the network's
-            ("H_grid", "f8"),
-            ("D_grid", "f8"),
-            ("droop_grid", "f8"),
-            ("T_gov", "f8"),
-            ("S_grid", "f8"),
+            # swing equations and governors, on their own ratings (H = 0: an ideal grid); their
+            # ratings over the network's
+            ("n_machines", "i8"),
+            ("H", "f8", (n_swing,)),
+            ("D", "f8", (n_swing,)),
+            ("droop", "f8", (n_swing,)),
+            ("T_gov", "f8", (n_swing,)),
+            ("S", "f8", (n_swing,)),
+            # a machine's voltage behind its reactance, and the place of its current in w
+            ("E", "f8", (n_swing,)),
+            ("current_at", "i8", (n_swing,)),
+            ("reference", "i8"),  # without a grid: the machine whose speed is omega_g (0: none)
             ("to_grid", "f8", (n_w,)),  # what each state of w brings to the grid, as a current
             # one sampling period in stretches, between the instants at which a command begins to
             # act; each is cut into pieces for Simpson's rule, and each piece in halves
@@ -233,13 +245,15 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("unbalance_left", "f8"),
             ("faulted", "i8"),
             ("fault_left", "f8"),  # s until the fault is cleared
-            # a finite grid, p.u. of its rating: power of turbines, set point of governors, load;
-            # its d/dt omega_g, 1/s; energy that came since the last tick, p.u. of the network and s
-            ("P_turbine", "f8"),
-            ("P_set", "f8"),
-            ("P_load", "f8"),
+            # what swings, p.u. of its rating: power of turbines, set point of governors, load; its
+            # d/dt omega, 1/s; energy that came since the last tick, p.u. of the network and s
+            ("P_turbine", "f8", (n_swing,)),
+            ("P_set", "f8", (n_swing,)),
+            ("P_load", "f8", (n_swing,)),
             ("omega_g_slope", "f8"),
-            ("brought", "f8"),
+            ("omega", "f8", (n_swing,)),  # of the machines; that of the grid is omega_g
+            ("slope", "f8", (n_swing,)),
+            ("brought", "f8", (n_swing,)),
         ],
         align=True,
     )

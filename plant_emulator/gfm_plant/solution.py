@@ -37,6 +37,12 @@ def grid_source(n: Any) -> int:
 
 
 @compiled
+def machine_source(n: Any, j: int) -> int:
+    """Return the place of machine j among the sources; the first machine is number 1."""
+    return n.n_converters + 1 + j
+
+
+@compiled
 def turned(x: float) -> tuple[float, float]:
     """Return cos x and sin x; by their series where they are exact to rounding."""
     if abs(x) < 0.03:

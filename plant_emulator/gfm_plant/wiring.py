@@ -52,6 +52,26 @@ class Unit:
 
 
 @dataclass(frozen=True)
+class Machine:
+    """A synchronous machine as the circuit sees it: a voltage behind a reactance.
+
+    Attributes:
+        node: where it is connected.
+        X, R: its transient reactance and its resistance, p.u. of the network.
+    """
+
+    name: str
+    node: str
+    X: float
+    R: float
+
+    @property
+    def emf(self) -> str:
+        """The node, and the source, of its voltage."""
+        return f"{self.name}.emf"
+
+
+@dataclass(frozen=True)
 class FaultPlace:
     """Where the three phases are shorted to ground, and through what.
 
@@ -78,6 +98,7 @@ class Wiring:
         branches: lines between nodes, and loads with an inductor, which end at `circuit.GROUND`.
         shunts: loads that are resistors.
         capacitors: banks of them.
+        machines: the synchronous machines, whose breakers have their names.
         grid: node of the grid, None: there is none.
         closed: whether the grid's breaker is closed.
         opened: names of branches whose breakers are open.
@@ -90,6 +111,7 @@ class Wiring:
     branches: tuple[Branch, ...] = ()
     shunts: tuple[Shunt, ...] = ()
     capacitors: tuple[Capacitor, ...] = ()
+    machines: tuple[Machine, ...] = ()
     grid: str | None = None
     closed: bool = True
     opened: frozenset[str] = frozenset()
@@ -102,7 +124,8 @@ class Wiring:
         and what a fault within a branch adds: the current beyond it."""
         own = tuple(name for unit in self.units for name in unit.states)
         beyond = () if self.split is None else ("beyond",)
-        others = [part.name for part in self.branches] + [bank.name for bank in self.capacitors]
+        others = [part.name for part in (*self.branches, *self.machine_branches)]
+        others += [bank.name for bank in self.capacitors]
         return (*own, *others, *beyond)
 
     @property
@@ -110,6 +133,7 @@ class Wiring:
         """The nodes between the parts, each once."""
         ends = [unit.node for unit in self.units]
         ends += [node for branch in self.branches for node in (branch.start, branch.end)]
+        ends += [machine.node for machine in self.machines]
         ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
         return tuple(dict.fromkeys(node for node in ends if node != GROUND))
 
@@ -123,6 +147,11 @@ class Wiring:
         """The lines from the converters to their nodes."""
         return tuple(Branch(u.line, u.terminal, u.node, u.L_g, u.R_g) for u in self.units)
 
+    @property
+    def machine_branches(self) -> tuple[Branch, ...]:
+        """From the machines' voltages to their nodes."""
+        return tuple(Branch(m.name, m.emf, m.node, m.X, m.R) for m in self.machines)
+
     def named_lines(self) -> dict[str, Branch]:
         """Lines by the name that people use: a converter's line has that of the converter."""
         own = {unit.name: line for unit, line in zip(self.units, self.units_lines, strict=True)}
@@ -130,8 +159,9 @@ class Wiring:
 
     @property
     def parts(self) -> list[str]:
-        """Names of the lines and loads between nodes and ground, without the converters' lines."""
-        return [branch.name for branch in self.branches] + [shunt.name for shunt in self.shunts]
+        """Names of the lines, loads and machines, without the converters' lines."""
+        lines = (*self.branches, *self.machine_branches)
+        return [branch.name for branch in lines] + [shunt.name for shunt in self.shunts]
 
     @property
     def has_load(self) -> bool:
@@ -143,7 +173,7 @@ class Wiring:
         found: dict[str, float] = {}
         if self.grid is None or not self.closed:
             return found
-        for branch in self._whole((*self.units_lines, *self.branches)):
+        for branch in self._whole((*self.units_lines, *self.branches, *self.machine_branches)):
             if self.grid in (branch.start, branch.end):
                 found[branch.name] = 1.0 if branch.end == self.grid else -1.0
         return found
@@ -168,7 +198,12 @@ class Wiring:
                 i_f = unit.states[0]
                 filters.append(Branch(i_f, unit.bridge, unit.terminal, unit.L_f, unit.R_f))
                 sources.append(Source(unit.bridge, unit.bridge))
-        branches = [*self._whole(self.units_lines), *filters, *self._whole(self.branches)]
+        branches = [
+            *self._whole(self.units_lines),
+            *filters,
+            *self._whole((*self.branches, *self.machine_branches)),
+        ]
+        sources += [Source(machine.emf, machine.emf) for machine in self.machines]
         capacitors = [Capacitor(unit.states[1], unit.terminal, unit.C_f) for unit in self.units]
         capacitors += self.capacitors
         if self.grid is not None and self.closed:

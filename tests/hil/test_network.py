@@ -16,6 +16,7 @@ from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.scenario.model import find_scenario, load_scenario
+from gfm_hil.scenario.toml_out import scenario_toml
 
 pytestmark = pytest.mark.full  # compiles the loop of several converters
 
@@ -137,6 +138,14 @@ def test_a_run_on_disk_is_that_in_memory(
     again = memory.save(tmp_path / "saved")
     assert NetworkRun.load(again).status == "completed"
     assert gfmhil.load_run(tmp_path / "run" / "B").scenario.converter == "B"
+    with pytest.raises(UserError, match="is the folder of a network; name that of a converter: "):
+        gfmhil.load_run(tmp_path / "run")
+    assert main(["run", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    # what was cut off: the summaries are not there yet
+    for place in (tmp_path / "run", *(tmp_path / "run" / name for name in "ABC")):
+        (place / "summary.json").unlink()
+    assert main(["recover", str(tmp_path / "run")]) == 0
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["status"] == "completed"
 
 
 @pytest.mark.parametrize(
@@ -183,3 +192,29 @@ def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:
     V = 0.5 * (a["true_V"][-1] + b["true_V"][-1])  # both feed the bus through the same short line
     assert a["p"][-1] + b["p"][-1] == pytest.approx(1.2 * V**2, rel=0.03)
     assert a["omega_u"][-1] == pytest.approx(b["omega_u"][-1], abs=1e-6)
+
+
+def test_a_machine_and_a_converter_share_a_load_by_their_droops() -> None:
+    given = content(duration=8.0)
+    given["network"]["converters"] = {"A": {**BUS, "law": "vsg-2"}}
+    given["network"]["machines"] = {"M": {**BUS, "S": 2.0, "H": 3.0, "P": 0.2}}
+    run = gfmhil.run_network(given)["A"]
+    assert run.status == "completed"
+    s = run.signals
+    assert s["true_omega_g"][-1] == pytest.approx(s["omega_u"][-1], abs=1e-6)
+    off = s["omega_u"][-1] - s["omega_u"][0]
+    V = s["true_V"][-1]
+    machine = -2.0 * off / 0.05  # its rating, over its droop
+    rise = s["p"][-1] - s["p"][0]
+    assert off < -1e-3 and rise + machine == pytest.approx(0.4 * V**2, rel=0.05)
+
+
+def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole() -> None:
+    given = content()
+    given["network"]["converters"]["B"] |= {"law": "vsg-2", "inner": "virtual-stator"}
+    whole = load_scenario(given)
+    part = load_scenario(tomllib.loads(scenario_toml(whole.of("B"))))
+    assert part == whole.of("B") and part.converter == "B"
+    for name in "AB":
+        assert part.of(name) == whole.of(name).model_copy(update={"converter": name})
+    assert (part.of("A").law, part.of("A").inner) == ("droop-3", None)

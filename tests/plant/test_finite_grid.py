@@ -38,9 +38,9 @@ def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
         ]])  # fmt: skip
 
     grid_load(plant.plant, 0.01)
-    P_set, load = float(s["P_set"]), float(s["P_load"])
+    P_set, load = float(s["P_set"][0]), float(s["P_load"][0])
     t = np.arange(1, 3001) * 1e-4
-    z = np.concatenate([plant.x, [1.0, s["P_turbine"], plant.u[0]]])
+    z = np.concatenate([plant.x, [1.0, s["P_turbine"][0], plant.u[0]]])
     exact = solve_ivp(slope, (0, t[-1]), z, "DOP853", t, rtol=1e-11, atol=1e-12).y
     found = np.empty((len(t), 2))
     for k in range(len(t)):

@@ -25,6 +25,8 @@ from gfm_plant.grid import fault, line_breaker, phase_jump
 from gfm_plant.model import DELTA, V_DC
 from gfm_plant.names import TRIPS
 
+pytestmark = pytest.mark.full  # compiles the plant for several converters
+
 T_S = 1e-4
 OFF = {name: {"enabled": False} for name, *_ in TRIPS}
 """No protection: the sources follow no law here, so that their DC links drift."""

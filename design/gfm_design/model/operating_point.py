@@ -90,18 +90,20 @@ def operating_point(
 
 def operating_points(
     plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]
-) -> list[OperatingPoint]:
+) -> tuple[list[OperatingPoint], list[float]]:
     """Solve for the common operating point of several converters, each under its law.
 
-    Unknowns are those of each converter, and the voltages of the nodes; of an island also the
-    frequency. The currents that meet at a node add up to nothing.
+    Unknowns are those of each converter, the voltages of the nodes, and the angles of the machines;
+    of an island also the frequency. The currents that meet at a node add up to nothing, and each
+    machine gives what its governor asks for.
 
     Args:
         plant: as it is to start.
         laws, refs: of each converter, as for ``operating_point``.
 
     Returns:
-        That of each converter, its angle against the grid or, in an island, the first node.
+        That of each converter, its angle against the grid or, in an island, the first node; and the
+        angle of each machine's voltage, rad.
 
     Raises:
         NoEquilibrium: there is none, or Newton's method does not find it.
@@ -117,9 +119,12 @@ def operating_points(
     sizes = [side.size for side in sides]
     ends = np.cumsum(sizes)
 
+    n, M = plant.net[0], len(wiring.machines)
+    nodes_end = ends[-1] + 2 * len(free)
+
     def parts(z: Vector) -> tuple[list[Vector], dict[str, complex], float]:
         own = np.split(z[: ends[-1]], ends[:-1])
-        pairs = z[ends[-1] : ends[-1] + 2 * len(free)].reshape(-1, 2)
+        pairs = z[ends[-1] : nodes_end].reshape(-1, 2)
         volts = {node: complex(*pair) for node, pair in zip(free, pairs, strict=True)}
         if fixed is not None:
             volts[fixed] = complex(now["V_g"])
@@ -147,11 +152,18 @@ def operating_points(
             missing[shunt.node] -= volts[shunt.node] / shunt.R
         for capacitor in wiring.capacitors:
             missing[capacitor.node] -= 1j * omega * capacitor.C * volts[capacitor.node]
+        for j, machine in enumerate(wiring.machines, 1):
+            emf = float(n["E"][j]) * cmath.exp(1j * z[nodes_end + j - 1])
+            i = (emf - volts[machine.node]) / complex(machine.R, omega * machine.X)
+            missing[machine.node] += i
+            asked = now["P_set"][j] - (omega - 1.0) * (1.0 / n["droop"][j] + n["D"][j])
+            rows.append(np.array([(emf * i.conjugate()).real / n["S"][j] - asked]))
         met = [part for node in free for part in (missing[node].real, missing[node].imag)]
         return np.concatenate([*rows, met, [volts[free[0]].imag] if island else []])
 
     starts = [side.first(1.0, 1.0) for side in sides]
-    z0 = np.concatenate([*starts, np.tile([1.0, 0.0], len(free)), [1.0] if island else []])
+    volts = np.tile([1.0, 0.0], len(free))
+    z0 = np.concatenate([*starts, volts, np.zeros(M), [1.0] if island else []])
     z = _newton(residual, z0)
     if z is None:
         names = [
@@ -159,7 +171,8 @@ def operating_points(
         ]
         raise NoEquilibrium(f"{', '.join(names)}: have no common steady state")
     own, _, omega = parts(z)
-    return [side.found(mine, omega) for side, mine in zip(sides, own, strict=True)]
+    points = [side.found(mine, omega) for side, mine in zip(sides, own, strict=True)]
+    return points, [float(angle) for angle in z[nodes_end : nodes_end + M]]
 
 
 class _Side:

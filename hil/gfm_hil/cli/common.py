@@ -23,6 +23,7 @@ from rich.table import Table
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.recording.run import controlled_by
+from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
@@ -166,6 +167,13 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
             highlight=False, soft_wrap=True,
         )  # fmt: skip
     console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
+
+
+def print_network(runs: NetworkRun, folder: Path) -> None:
+    """The tables that end a run of several converters."""
+    for name, run in runs.items():
+        print(f"\n{name}")
+        print_summary(run.summary, folder / name)
 
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:

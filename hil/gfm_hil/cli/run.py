@@ -12,6 +12,7 @@ from gfm_hil.cli.common import (
     add_scenario_options,
     exit_code,
     new_folder,
+    print_network,
     print_summary,
     progress_bar,
     resolve,
@@ -87,7 +88,5 @@ def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) 
     if options.json:
         print(json.dumps(runs.summary, indent=2), flush=True)
     else:
-        for name, run in runs.items():
-            print(f"\n{name}")
-            print_summary(run.summary, folder / name)
+        print_network(runs, folder)
     return max(exit_code(run.summary) for run in runs.values())

@@ -106,12 +106,14 @@ def make_benches(scenario: Scenario) -> list[Bench]:
         if scenario.network is None:
             grid = scenario.plant.grid
             starts = [operating_point(plant.par, laws[0], refs[0], grid.omega_g, grid.V_g)]
+            machines = list[float]()
         else:
-            starts = operating_points(plant, laws, refs)
+            starts, machines = operating_points(plant, laws, refs)
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
-    plant.start(np.array([s.x for s in starts]), np.array([s.commands for s in starts]))
+    x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
+    plant.start(x, u, machines)
     inner = scenario.has_inner
     benches = []
     for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):
@@ -122,8 +124,8 @@ def make_benches(scenario: Scenario) -> list[Bench]:
             controller.start(start.x_law, start.u, y, start.e)
         else:
             controller.start(start.x_law, start.u)
-        u = start.commands[: len(carried("u", inner))].copy()
-        bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), u)
+        told = start.commands[: len(carried("u", inner))].copy()
+        bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told)
         bench.keep()
         _ready_gains(one)
         benches.append(bench)

@@ -105,6 +105,11 @@ class RecordedRun:
             summary = read_summary(folder)
         except FileNotFoundError as problem:
             going = (folder / "scenario.toml").is_file()
+            if going and (names := read_scenario(folder).parts):
+                raise UserError(
+                    f"{folder}: is the folder of a network; name that of a converter:"
+                    f" {', '.join(str(folder / name) for name in names)}"
+                ) from None
             what = "the run is not over, see gfmhil stream, or was cut off, see gfmhil recover"
             what = what if going else "is not a run folder"
             missing = Path(problem.filename).name

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
+from gfm_hil.recording.run import read_scenario
 from gfm_hil.results.run import Run
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.results.run_folder import recover
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 
 if TYPE_CHECKING:
@@ -105,6 +107,18 @@ class NetworkRun(Mapping[str, Run]):
             raise UserError(f"{folder}: {problem.strerror}") from None
 
     @classmethod
+    def recover(cls, folder: Path) -> NetworkRun:
+        """Complete the folder of a network whose run was cut off, converter by converter.
+
+        Raises:
+            UserError, Unfinished: as ``run_folder.recover``.
+        """
+        scenario = read_scenario(folder)
+        found = cls(scenario, {name: recover(folder / name) for name in scenario.parts}, folder)
+        found.conclude(folder)
+        return found
+
+    @classmethod
     def load(cls, folder: str | Path) -> NetworkRun:
         """The runs of a folder that ``save`` or ``gfmhil run`` has written.
 
@@ -112,8 +126,10 @@ class NetworkRun(Mapping[str, Run]):
             UserError: it is none.
         """
         folder = Path(folder)
-        scenario = load_scenario(folder / "scenario.toml")
-        return cls(scenario, {n: Run.load(folder / n) for n in scenario.converters}, folder)
+        scenario = read_scenario(folder)
+        if not scenario.parts:
+            raise UserError(f"{folder}: is not the folder of a network")
+        return cls(scenario, {n: Run.load(folder / n) for n in scenario.parts}, folder)
 
     def _columns(self) -> dict[str, Any]:
         return {name: run.columns for name, run in self.items()}

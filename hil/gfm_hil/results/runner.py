@@ -114,10 +114,11 @@ def run_network(
         UserError: the folder is in use, or there is no operating point.
     """
     names = scenario.converters
-    for name in names:
-        check_free(folder / name, scenario.ticks * len(names), scenario.has_inner)
+    check_free(folder, scenario.ticks * len(names), scenario.has_inner)
     benches = compiled_benches(scenario, notice)
     runs: dict[str, Run] = {}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_scenario(folder, scenario)
     with ExitStack() as stack:
         places = [folder / name for name in names]
         for place, bench in zip(places, benches, strict=True):

@@ -245,6 +245,11 @@ class Scenario(_Model):
         """Names of the converters of the network; none without one."""
         return [] if self.network is None else list(self.network.converters)
 
+    @property
+    def parts(self) -> list[str]:
+        """Names of the converters that have a run folder of their own within the run's."""
+        return self.converters if self.converter is None else []
+
     def of(self, name: str) -> Scenario:
         """The scenario as one converter of the network sees it: with its law, references and plant,
         and the events of the network and of itself."""
@@ -252,6 +257,8 @@ class Scenario(_Model):
         given = ("law", "inner", "references", "plant", "expect")
 
         def whole(member: Member) -> Member:
+            if self.converter is not None:  # it was made whole before
+                return member
             own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
             if "plant" in own:
                 own["plant"] = self.plant.model_copy(update={"grid": Plant().grid})
