@@ -9,18 +9,23 @@ import numpy as np
 import pytest
 
 from gfm_design.margins.all_margins import loop_margins
+from gfm_design.model.box import Point
 from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import linearise_plant
+from gfm_design.tuning.gains import free_gains, tied
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.robust import Loops
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
-from gfm_runtime import LawError, LawSet, get_law, load_law
+from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.inner import Inner
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.signals import NU_INNER, NY_INNER
 
 T_S = 1e-4
@@ -252,3 +257,32 @@ def test_a_continuous_loop_has_no_stage() -> None:
     bare, stage = ClosedLoop.of("vsg-2", ideal=True), linearise_stage(Inner(), T_S, 314.0, op)
     with pytest.raises(ValueError, match="a continuous loop has none"):
         ClosedLoop(bare.plant, bare.law, stage=stage)
+
+
+def test_an_operating_point_at_the_power_limit_is_below_it() -> None:
+    # the shipped stages limit p to 1 p.u., which is rated power
+    point = Point(P_ref=1.0, delay=1.3)
+    law = discretise(replace(get_law("mimo-gfm-practical"), inner=Inner(P_max=1.0)), T_S)
+    free = discretise(replace(get_law("mimo-gfm-practical"), inner=Inner()), T_S)
+    np.testing.assert_array_equal(point.loop(law).A, point.loop(free).A)
+
+
+def test_a_search_in_the_box_sees_the_stage_at_every_point() -> None:
+    file = law_file("mimo-gfm-practical")
+    file = file.model_copy(update={"inner": named_inner("cascaded")})
+    gains = free_gains(file)
+    points = [Point(L_g=8.0), Point(P_ref=0.1, delay=1.3), Point(dc="regulated")]
+    values = np.array([g.start for g in gains]) * 1.02
+    named = {g.name: float(v) for g, v in zip(gains, values, strict=True)}
+    changed = build_law(file, tied(file, named))
+    each = [p.loop(discretise(changed, T_S)).sigma() for p in points]
+    np.testing.assert_allclose(Loops(file, gains, points).sigma(values), each, rtol=1e-6)
+
+
+def test_the_searchs_loop_has_the_norms_of_the_sampled_one() -> None:
+    """Its inverse Tustin transform on a grid, against the sampled loop's guaranteed norms."""
+    file = law_file("vsg-2").model_copy(update={"inner": named_inner("virtual-stator")})
+    problem = PaperProblem(file, free_gains(file))
+    start = np.array([g.start for g in problem.gains])
+    gamma = max(c.norm for c in problem.channels(start))
+    assert problem(start) == pytest.approx(gamma, rel=1e-3)

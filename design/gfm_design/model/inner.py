@@ -22,7 +22,7 @@ from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW
 
 Matrix = NDArray[np.float64]
 
-_ROUNDING = 1e-9  # p.u.; at rest exactly at a limit the stage does not limit
+_ROUNDING = 1e-6  # p.u., of an operating point; exactly at a limit the stage does not limit
 
 
 @dataclass(frozen=True)
