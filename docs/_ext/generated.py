@@ -29,6 +29,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "law-overview": law_pages.overview,
     "law-catalogue": law_pages.catalogue,
     "inner-keys": scenario_pages.inner_tables,
+    "network-keys": scenario_pages.network_tables,
     "law-keys": scenario_pages.law_tables,
     "law-mistakes": outputs.mistakes,
     "scenario-keys": scenario_pages.scenario_tables,

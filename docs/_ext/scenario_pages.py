@@ -38,6 +38,14 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[plant.delay]", options.Delay),
     ("[plant.protection]", options.Protection),
 )
+NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
+    ("[network]", scenario.Members),
+    ("[network.converters.NAME]", scenario.Member),
+    ("[network.lines.NAME]", options.Line),
+    ("[network.loads.NAME]", options.Load),
+    ("[network.capacitors.NAME]", options.CapacitorBank),
+    ("[network.machines.NAME]", options.Machine),
+)
 OVERLOAD = ("[[plant.protection.overload]]", options.Overload)
 TRIP = ("one protection, e.g. [plant.protection.over_current]", options.Trip)
 EVENTS = get_args(get_args(events.Event)[0])
@@ -154,6 +162,11 @@ def event_tables() -> str:
 def inner_tables() -> str:
     """Every kind of inner stage, and its power limiter."""
     return _tables(INNER_TABLES)
+
+
+def network_tables() -> str:
+    """Every table of the network in a scenario file."""
+    return _tables(NETWORK_TABLES)
 
 
 def law_tables() -> str:

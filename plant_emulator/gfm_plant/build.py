@@ -48,7 +48,7 @@ _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 def make_plant(options: Plant, T_s: float) -> Network:
     """Return the plant that `options` describe: one converter on its line, load and grid.
 
-    Its state is a de-energised converter on a closed grid breaker; `plant_init` puts it into an
+    Its state is a de-energised converter on a closed grid breaker; `Network.start` puts it into an
     operating point.
 
     Args:

@@ -39,7 +39,7 @@ class Rates(NamedTuple):
 
 @compiled
 def rates(r: Any, bridge: float) -> Rates:
-    """Return the rates of `r`, one entry of `plant_par_dtype`.
+    """Return the rates of `r`, one entry of `converter_par_dtype`.
 
     `bridge` is 1 in operation. 0 takes L_f out of the circuit: with i_d = i_q = 0 the same
     equations then describe a blocked bridge.

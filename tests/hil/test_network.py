@@ -178,6 +178,11 @@ def test_what_is_wrong_is_one_line_that_names_it(change: dict[str, Any], message
 def test_what_takes_one_converter_says_so() -> None:
     with pytest.raises(UserError, match="network: this takes one converter"):
         gfmhil.run(content())
+    with pytest.raises(UserError, match="'three_share_a_load': has a network; this takes one"):
+        gfmhil.campaign({
+            "title": "c", "scenario": "three_share_a_load", "laws": ["vsg-2"], "runs": 2, "seed": 1,
+            "draw": [{"path": "references.P_ref", "type": "uniform", "low": 0.2, "high": 0.4}],
+        })  # fmt: skip
     with pytest.raises(UserError, match="network: the scenario has none"):
         gfmhil.run_network("pref_step")
 

@@ -88,6 +88,10 @@ def check_campaign(
     if text is None:
         text = toml_text(content)
     base = load_scenario(_beside(path, file.scenario), in_process=True)
+    if base.network is not None:
+        raise UserError(
+            f"{path}: scenario = {file.scenario!r}: has a network; this takes one converter"
+        )
     content = base.model_dump(mode="json")
     content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
     _check_paths(path, file, content)
