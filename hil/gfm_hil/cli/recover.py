@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from gfm_hil.cli.common import print_network, print_summary
-from gfm_hil.recording.run import read_scenario
+from gfm_hil.recording.run import converters_of
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import recover
 
@@ -25,8 +25,7 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Complete the folder; returns the exit code."""
     folder: Path = options.folder
-    network = (folder / "scenario.toml").is_file() and read_scenario(folder).parts
-    run = NetworkRun.recover(folder) if network else recover(folder)
+    run = NetworkRun.recover(folder) if converters_of(folder) else recover(folder)
     if options.json:
         print(json.dumps(run.summary, indent=2))
     elif isinstance(run, NetworkRun):

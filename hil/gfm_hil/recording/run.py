@@ -105,7 +105,7 @@ class RecordedRun:
             summary = read_summary(folder)
         except FileNotFoundError as problem:
             going = (folder / "scenario.toml").is_file()
-            if going and (names := read_scenario(folder).parts):
+            if going and (names := converters_of(folder)):
                 raise UserError(
                     f"{folder}: is the folder of a network; name that of a converter:"
                     f" {', '.join(str(folder / name) for name in names)}"
@@ -248,6 +248,15 @@ def read_scenario(folder: Path) -> Scenario:
     except ValueError as problem:
         reason = str(problem)
     raise UserError(f"{folder}: not a run folder: scenario.toml: {reason}")
+
+
+def converters_of(folder: Path) -> list[str]:
+    """Names of the converters that have a run folder of their own in that of a network; none in any
+    other folder."""
+    try:
+        return read_scenario(folder).parts
+    except UserError:
+        return []
 
 
 def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
