@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
-from _figures.common import FIGURES, GREY, arrow, box, number, run, scenario, write_table
+import numpy as np
+from _figures.common import (
+    FIGURES,
+    GREY,
+    arrow,
+    box,
+    number,
+    run,
+    scenario,
+    signed,
+    write_table,
+)
 from matplotlib.figure import Figure
 
+from gfm_design.margins.delays import overall_delay
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.linear import Mode
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.cycles import cycle_means, cycle_ticks
 from gfm_hil.results.figures import COLOURS, dress
 from gfm_hil.results.run import Run
 from gfm_hil.scenario.expectation import reason_name
+from gfm_plant import Plant
+from gfm_runtime import load_law
 from gfm_runtime.inner_file import inner_names
 
+_LAWS, _SCRS = ("vsg-2", "droop-3", "mimo-gfm-practical"), (1.5, 3.0, 10.0)
+_PLANT = {"delay": {"samples": 1, "fraction": 0.3}, "modulation": "space-vector"}
+_SLOWEST, _SPLIT = 1e-3, 20.0  # Hz; what turns more slowly is no oscillation; swings lie below
 _LAW, _STAGE, _GUARD = COLOURS[0], COLOURS[2], COLOURS[1]
 _AT, _DIP_S = 0.5, 0.15
 _CASES = {
@@ -95,7 +114,35 @@ def faults() -> None:
     write_table("inner_faults", head, rows)
 
 
+def loops() -> None:
+    """The linear loop of three laws behind every stage, in a weak, a middling and a strong grid."""
+    rows = []
+    for stage in inner_names():
+        for law in _LAWS:
+            cells = []
+            for scr in _SCRS:
+                plant = {**_PLANT, "grid": {"scr": scr, "x_over_r": 6.0}}
+                loop = ClosedLoop.of(load_law(law, stage).laws[0], Plant.model_validate(plant))
+                found = loop.modes()
+                swing = _least_damped(found, _SLOWEST, _SPLIT, 1)
+                fast = _least_damped(found, _SPLIT, np.inf, 0)
+                delay = 1e6 * overall_delay(loop).seconds
+                cells.append(f"{swing}; {fast}; {delay:.0f} µs")
+            rows.append([f"`{stage}`", law.replace("-", "\u2011"), *cells])
+    heads = [f"SCR {scr:g}" for scr in _SCRS]
+    write_table("inner_modes", ["stage", "law", *heads], rows)
+
+
+def _least_damped(modes: list[Mode], low: float, high: float, digits: int) -> str:
+    """The oscillation between two frequencies [Hz] that lasts longest, if there is one."""
+    for mode in modes:  # in this order
+        if low < mode.frequency_hz <= high:
+            return f"{signed(mode.sigma)} at {mode.frequency_hz:.{digits}f} Hz"
+    return "–"
+
+
 def inner_stage() -> None:
     """All of the page."""
     blocks()
+    loops()
     faults()

@@ -5,9 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import control
+import numpy as np
 import pytest
 
+from gfm_design.norms.performance import PAPER_WEIGHTS
+from gfm_design.tuning.paper_problem import LATE
 from gfm_hil.cli.main import main
+from gfm_hil.studies.law import Law
 from gfm_runtime import law_file
 
 Capture = pytest.CaptureFixture[str]
@@ -97,6 +102,43 @@ def test_poles_and_a_step(capsys: Capture, tmp_path: Path) -> None:
     assert "after P_ref" in capsys.readouterr().out
 
 
+STAGED = ("--law", "vsg-2", "--inner", "virtual-stator")
+
+
+def test_gamma_and_poles_behind_an_inner_stage(capsys: Capture) -> None:
+    out = said(capsys, "gamma", *STAGED)
+    # python-control's own norm of the loop, with the paper's weights by Tustin
+    loop = Law.load("vsg-2").with_inner("virtual-stator").closed_loop(LATE)
+    system = control.ss(*loop.performance(), loop.T_s)
+    omega = np.geomspace(1e-2, 0.999 * np.pi / loop.T_s, 4000)
+    z = np.exp(1j * omega * loop.T_s)
+    s = 2.0 / loop.T_s * (z - 1.0) / (z + 1.0)
+    T = system.frequency_response(omega).frdata
+    peaks = [np.abs(w(s) * T[w.i - 1, w.j - 1]).max() for w in PAPER_WEIGHTS]
+    assert out["gamma"] == pytest.approx(max(peaks), rel=1e-3)
+    scenario = "phase_jump_within_rating"
+    poles = said(capsys, "poles", *STAGED, "--scenario", scenario)
+    assert poles["stable"]
+    # the same stage by the scenario's own key, and none
+    assert poles["modes"] == said(capsys, "poles", "--scenario", scenario)["modes"]
+    bare = said(capsys, "poles", "--law", "vsg-2", "--inner", "none", "--scenario", scenario)
+    assert bare["modes"] != poles["modes"]
+    step = said(capsys, "step", *STAGED, "--scenario", scenario, "--seconds", "4")
+    assert step["y"]["p"]["end"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_tune_behind_an_inner_stage(capsys: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    before = said(capsys, "gamma", "--law", "mimo-gfm-practical", "--inner", "virtual-stator")
+    options = ("--inner", "virtual-stator", "--starts", "1", "--evaluations", "64", "--quiet")
+    out = said(capsys, "tune", "--law", "mimo-gfm-practical", *options, "--out", str(path))
+    # the reactive power's loop is too slow for the voltage over the stage's reactance
+    assert out["gamma"] < 2.5 < 20.0 < before["gamma"]
+    assert law_file(str(path)).inner.type == "virtual-stator"
+    again = said(capsys, "gamma", "--law", str(path))
+    assert again["gamma"] == pytest.approx(out["gamma"], rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -117,6 +159,9 @@ def test_poles_and_a_step(capsys: Capture, tmp_path: Path) -> None:
         (["tune", "--law", "vsg-2", "--evaluations", "0"], "at least 1"),
         (["tune", "--law", "vsg-2", "--seed", "-1"], "negative"),
         (["bode", "--at", "omega_g"], "omega_g"),
+        (["bode", "--inner", "no-such-stage"], "no-such-stage"),
+        (["gamma", *STAGED, "--discrete"], "sampled at 10 kHz in any case"),
+        (["tune", *STAGED, "--full-order"], "law on the bridge; use --inner none"),
         (["nyquist", "--law", "no-such-law"], "no-such-law"),
         (["step", "--of", "P"], "'P' is no input of the loop"),
         (["poles", "--out", "poles.none"], "poles.none"),

@@ -11,10 +11,9 @@ from gfm_design.margins.delays import DelayMargin, delay_at_u, delay_at_y, longe
 from gfm_design.margins.disk import DiskMargin, disk_margin
 from gfm_design.margins.locus import Locus, locus_at_u, locus_at_y
 from gfm_design.margins.tolerance import GridStrength, Range, element_ranges, grid_strength
-from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.closed_loop import U_CARRIED, Y_CARRIED, ClosedLoop
 from gfm_design.model.linear import Mode
 from gfm_plant.parameters import Element
-from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
 _AT_REST = 1e-6  # 1/s; a mode that decays more slowly is an integrator, to rounding
 _INSIDE, _OUTSIDE = 0.99, 1.01  # of a margin, in dB, degrees or seconds
@@ -109,7 +108,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
 
 
 def _channels(loop: ClosedLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargins, ...]:
-    names = U_NAMES if at_u else Y_NAMES
+    names = U_CARRIED if at_u else Y_CARRIED
     omega, H = locus.sampled()
     found = []
     for k, channel in enumerate(locus.channels):
@@ -124,7 +123,7 @@ def _confirmed(loop: ClosedLoop, channel: int, at_u: bool, m: GainPhase) -> bool
     """Check the eigenvalues of the loop closed slightly inside and outside of every margin."""
 
     def held(factor: complex) -> bool:
-        by = np.ones(NU if at_u else NY, complex)
+        by = np.ones(len(loop.u_delay if at_u else loop.y_delay), complex)
         by[channel] = factor
         return bool((loop.scaled(u=by) if at_u else loop.scaled(y=by)).sigma() < 0.0)
 

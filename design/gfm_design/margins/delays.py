@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.model.closed_loop import ClosedLoop
-from gfm_runtime.signals import NU, NY
 
 _TOLERANCE = 1e-6  # relative accuracy of the bisection
 
@@ -64,17 +63,17 @@ def longest(T_s: float) -> float:
 
 def overall_delay(loop: ClosedLoop) -> DelayMargin:
     """Margin for more delay of all of u at once; 0 for an unstable loop."""
-    return _margin(loop, np.ones(NU), np.zeros(NY))
+    return _margin(loop, np.ones(loop.u_delay.shape), np.zeros(1))
 
 
 def delay_at_u(loop: ClosedLoop, channel: int) -> DelayMargin:
     """Margin for more delay of one command only."""
-    return _margin(loop, np.eye(NU)[channel], np.zeros(NY))
+    return _margin(loop, np.eye(len(loop.u_delay))[channel], np.zeros(1))
 
 
 def delay_at_y(loop: ClosedLoop, channel: int) -> DelayMargin:
     """Margin for more delay of one measurement only."""
-    return _margin(loop, np.zeros(NU), np.eye(NY)[channel])
+    return _margin(loop, np.zeros(1), np.eye(len(loop.y_delay))[channel])
 
 
 def _margin(loop: ClosedLoop, u: Matrix, y: Matrix) -> DelayMargin:

@@ -69,14 +69,14 @@ class Locus:
 
 def locus_at_u(loop: ClosedLoop) -> Locus:
     """H at u: all loops are cut at the commands, before their delay."""
-    p, c = loop.held, loop.law
+    p, c = loop.held, loop.controller
     B = np.vstack([p.B, np.zeros((len(c.A), p.B.shape[1]))])
     return _locus(loop, B, np.hstack([c.D @ p.C, c.C]), loop.commands)
 
 
 def locus_at_y(loop: ClosedLoop) -> Locus:
     """H at y: all loops are cut at the measurements."""
-    p, c = loop.held, loop.law
+    p, c = loop.held, loop.controller
     C = np.hstack([p.C, np.zeros((p.C.shape[0], len(c.A)))])
     return _locus(loop, np.vstack([p.B @ c.D, c.B]), C, loop.measurements)
 

@@ -3,11 +3,12 @@
 The loop is continuous, as the paper's (Section III), or the exact sampled one of the bench. Around
 its operating point it maps w = (references r, grid d) to y as it truly is, before the sensors:
 
-    x' = A x + B w,    y = C x + D w,    x = (plant, its delay lines, law),
+    x' = A x + B w,    y = C x + D w,    x = (plant, its delay lines, law, inner stage),
 
-where x' is dx/dt or the x of the next tick. Every other quantity (modes, margins, gamma, step)
-follows from these matrices. A ``ClosedLoop`` may hold many loops: plants, laws or both on leading
-axes.
+where x' is dx/dt or the x of the next tick. With an inner stage the loop has four commands, those
+of the bridge, and eleven measurements; w and the y that it gives stay the same. Every other
+quantity (modes, margins, gamma, step) follows from these matrices. A ``ClosedLoop`` may hold many
+loops: plants, laws or both on leading axes.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import (
     LinearLaw,
     LinearPlant,
@@ -43,9 +45,10 @@ from gfm_plant.model import DELTA
 from gfm_plant.parameters import Element
 from gfm_plant.records import Record
 from gfm_runtime.catalogue import get_law
+from gfm_runtime.errors import LawError
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import realise
-from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES, Y_NAMES
+from gfm_runtime.signals import NY, REF_NAMES, Y_NAMES, carried
 from gfm_runtime.tustin import OMEGA_ROW, DiscreteLaw, discretise
 
 if TYPE_CHECKING:
@@ -58,6 +61,13 @@ T_S = 1e-4  # s
 REFERENCES = (1.0, 0.5, 1.0, 0.0, 1.0)  # (V_dcref, P_ref, omega_g, Q_ref, V_ref), Table III
 #: the loop's inputs w: the references, and the grid as Eq. (15) has it
 INPUTS = (*REF_NAMES, "grid.omega_g", "grid.V_g")
+
+#: every command and measurement that a loop may have; the last ones only with an inner stage
+U_CARRIED, Y_CARRIED = carried("u", True), carried("y", True)
+
+NOT_IDEAL = (
+    "runs from tick to tick: the continuous loop has none; use the sampled one, or inner none"
+)
 
 #: distances from a resonance at which to look, as multiples of its damping
 _ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
@@ -96,12 +106,14 @@ class ClosedLoop:
         law: continuous if the loop is, else from tick to tick; one or several on a leading axis.
         T_s: sampling time, s; None for a continuous loop, which has no delay.
         u_delay: from the tick that samples y[k] to the moment when u[k] acts, s: a number, or shape
-            (..., 3).
-        y_delay: how old y is at its tick, s: a number, or shape (..., 5).
+            (..., 3), with an inner stage (..., 4).
+        y_delay: how old y is at its tick, s: a number, or shape (..., 5), with an inner stage
+            (..., 11).
         origin: what it was made of, if known.
+        stage: the inner stage between the law and the bridge, one or several on a leading axis.
 
     Raises:
-        ValueError: a continuous loop with a delay.
+        ValueError: a continuous loop with a delay or an inner stage.
     """
 
     def __init__(
@@ -112,13 +124,17 @@ class ClosedLoop:
         u_delay: ArrayLike = 0.0,
         y_delay: ArrayLike = 0.0,
         origin: Origin | None = None,
+        stage: LinearStage | None = None,
     ) -> None:
-        many = plant.A.shape[:-2]
+        many, n_u, n_y = plant.A.shape[:-2], plant.B.shape[-1], plant.C.shape[-2]
         self.plant, self.law, self.T_s, self.origin = plant, law, T_s, origin
-        self.u_delay: Matrix = np.broadcast_to(np.asarray(u_delay, float), (*many, NU))
-        self.y_delay: Matrix = np.broadcast_to(np.asarray(y_delay, float), (*many, NY))
+        self.stage = stage
+        self.u_delay: Matrix = np.broadcast_to(np.asarray(u_delay, float), (*many, n_u))
+        self.y_delay: Matrix = np.broadcast_to(np.asarray(y_delay, float), (*many, n_y))
         if T_s is None and (self.u_delay.any() or self.y_delay.any()):
             raise ValueError("a continuous loop has no delay; sample it first")
+        if T_s is None and stage is not None:
+            raise ValueError("an inner stage runs from tick to tick; a continuous loop has none")
 
     @classmethod
     def of(
@@ -142,8 +158,8 @@ class ClosedLoop:
             ideal: the continuous loop, neither sampled nor delayed, whatever the plant says.
 
         Raises:
-            LawError: no such law, or it cannot be discretised.
-            NoEquilibrium: there is no operating point.
+            LawError: no such law, or it cannot be discretised; ``ideal`` with an inner stage.
+            NoEquilibrium: there is no operating point, or a limit of the inner stage acts there.
         """
         if not isinstance(law, DiscreteLaw):
             law = discretise(get_law(law) if isinstance(law, str) else law, T_s)
@@ -153,9 +169,12 @@ class ClosedLoop:
 
     @classmethod
     def _made(cls, plant: Plant, law: DiscreteLaw, ideal: bool, ref: Matrix, par: Record) -> Self:
-        grid, delay = plant.grid, plant.delay
+        grid, delay, inner = plant.grid, plant.delay, law.law.inner
+        if ideal and inner is not None:
+            raise LawError("inner", NOT_IDEAL)
         op = operating_point(par, law, ref, grid.omega_g, grid.V_g)
-        linear = linearise_plant(par, op, grid.omega_g, grid.V_g, grid.finite)
+        around = grid.omega_g, grid.V_g, grid.finite, inner is not None
+        linear = linearise_plant(par, op, *around)
         controlled = plant.dc_source.mode == "controlled"
         state_space = realise(law.law) if ideal else law
         reaction = linearise_law(law.law, state_space, op, ref, controlled)
@@ -163,19 +182,23 @@ class ClosedLoop:
         if ideal:
             return cls(linear, reaction, origin=origin)
         seconds = (delay.samples + delay.fraction) * law.T_s
-        return cls(linear, reaction, law.T_s, seconds, origin=origin)
+        stage = linearise_stage(inner, law.T_s, float(par[0]["omega_b"]), op) if inner else None
+        return cls(linear, reaction, law.T_s, seconds, origin=origin, stage=stage)
 
     @classmethod
     def stacked(cls, loops: Sequence[ClosedLoop]) -> Self:
         """Single loops of one sampling time, whose sampled plants have one size, as many plants.
 
-        The law is that of the first; ``with_law`` gives all of them another.
+        The law is that of the first; ``with_law`` gives all of them another. Either all have an
+        inner stage or none has.
         """
         plants = LinearPlant.stacked([loop.plant for loop in loops])
         u_delay, y_delay = (
             np.stack([getattr(o, n) for o in loops]) for n in ("u_delay", "y_delay")
         )
-        out = cls(plants, loops[0].law, loops[0].T_s, u_delay, y_delay)
+        stages = [loop.stage for loop in loops if loop.stage is not None]
+        stage = LinearStage.stacked(stages) if stages else None
+        out = cls(plants, loops[0].law, loops[0].T_s, u_delay, y_delay, stage=stage)
         out.__dict__["held"] = LinearPlant.stacked([loop.held for loop in loops])
         return out
 
@@ -187,8 +210,11 @@ class ClosedLoop:
     # other loops
 
     def with_law(self, law: LinearLaw) -> Self:
-        """The same plant under another law, or several; the sampled plant is kept."""
-        out = type(self)(self.plant, law, self.T_s, self.u_delay, self.y_delay)
+        """The same plant under another law, or several; sampled plant and inner stage are kept."""
+        return self._under(law, self.stage)
+
+    def _under(self, law: LinearLaw, stage: LinearStage | None) -> Self:
+        out = type(self)(self.plant, law, self.T_s, self.u_delay, self.y_delay, stage=stage)
         out.__dict__["held"] = self.held
         return out
 
@@ -197,15 +223,18 @@ class ClosedLoop:
         return type(self)(self.plant, self.law.sampled(T_s), T_s, delay)
 
     def later(self, u: ArrayLike = 0.0, y: ArrayLike = 0.0) -> Self:
-        """The sampled loop with more delay of u (3,) and y (5,), s; one number is for all."""
+        """The sampled loop with more delay of each u and of each y, s; one number is for all."""
         u_delay, y_delay = self.u_delay + np.asarray(u), self.y_delay + np.asarray(y)
-        return type(self)(self.plant, self.law, self.T_s, u_delay, y_delay, self.origin)
+        of = self.origin, self.stage
+        return type(self)(self.plant, self.law, self.T_s, u_delay, y_delay, *of)
 
     def scaled(self, u: ArrayLike = 1.0, y: ArrayLike = 1.0) -> Self:
-        """The loop with u (3,) and y (5,) multiplied on their way, by complex numbers too."""
-        by_u, by_y, c = np.broadcast_to(u, NU)[:, None], np.broadcast_to(y, NY), self.law
+        """The loop with u and y multiplied on their way, by complex numbers too; with an inner
+        stage u (4,) is what goes to the bridge and y (11,) what comes from the sensors."""
+        c = self.controller
+        by_u, by_y = np.broadcast_to(u, len(c.D))[:, None], np.broadcast_to(y, c.D.shape[1])
         parts = (c.A, c.B * by_y, by_u * c.C, by_u * c.D * by_y, c.B_r, by_u * c.D_r)
-        return self.with_law(LinearLaw(*parts, rows=c.rows))
+        return self._under(LinearLaw(*parts, rows=c.rows), None)
 
     def changed(self, factors: Mapping[Element, float]) -> Self:
         """The loop anew, at its own operating point, with elements at factors of their values.
@@ -233,22 +262,28 @@ class ClosedLoop:
     # matrices
 
     @cached_property
+    def controller(self) -> LinearLaw:
+        """What lies between the sensors and the bridge: the law, and the inner stage if any."""
+        return self.law if self.stage is None else self.stage.around(self.law)
+
+    @cached_property
     def held(self) -> LinearPlant:
         """The plant as the law meets it: from tick to tick with its delay lines, or continuous."""
         T_s = self.T_s
         if T_s is None:
             return self.plant
+        reads = self.stage is not None and self.stage.has_pll
         if self.plant.A.ndim == 2:
-            return sampled_plant(self.plant, T_s, self.u_delay, self.y_delay)
+            return sampled_plant(self.plant, T_s, self.u_delay, self.y_delay, reads)
         p = self.plant
         single = [LinearPlant(*m) for m in zip(p.A, p.B, p.B_d, p.C, p.C_true, strict=True)]
         each = zip(single, self.u_delay, self.y_delay, strict=True)
-        return LinearPlant.stacked([sampled_plant(of, T_s, u, y) for of, u, y in each])
+        return LinearPlant.stacked([sampled_plant(of, T_s, u, y, reads) for of, u, y in each])
 
     @cached_property
     def A(self) -> Matrix:
         """The loop's matrix, shape (..., n, n)."""
-        p, c = self.held, self.law
+        p, c = self.held, self.controller
         n, m = p.A.shape[-1], c.A.shape[-1]
         through = p.B @ c.D @ p.C
         out = np.empty((*np.broadcast_shapes(through.shape[:-2], c.A.shape[:-2]), n + m, n + m),
@@ -260,7 +295,7 @@ class ClosedLoop:
     @cached_property
     def state_space(self) -> StateSpace:
         """(A, B, C, D) from ``INPUTS`` (7) to y = (v_dc, p, omega_u, q, V) before the sensors."""
-        p, c, A = self.held, self.law, self.A
+        p, c, A = self.held, self.controller, self.A
         n, many = p.A.shape[-1], A.shape[:-2]
         B, D = np.zeros((*many, A.shape[-1], len(INPUTS))), np.zeros((*many, NY, len(INPUTS)))
         C = np.zeros((*many, NY, A.shape[-1]))
@@ -288,13 +323,15 @@ class ClosedLoop:
     @cached_property
     def commands(self) -> tuple[int, ...]:
         """Those of u that act: i_u does not where the DC source regulates itself."""
-        acts = self.plant.B.any(axis=0) & (self.law.C.any(axis=1) | self.law.D.any(axis=1))
+        c = self.controller
+        acts = self.plant.B.any(axis=0) & (c.C.any(axis=1) | c.D.any(axis=1))
         return tuple(int(j) for j in np.flatnonzero(acts))
 
     @cached_property
     def measurements(self) -> tuple[int, ...]:
-        """Those of y that the law uses for a command that acts."""
-        used = self.law.B.any(axis=0) | self.law.D[list(self.commands)].any(axis=0)
+        """Those of y that law and inner stage use for a command that acts."""
+        c = self.controller
+        used = c.B.any(axis=0) | c.D[list(self.commands)].any(axis=0)
         return tuple(int(i) for i in np.flatnonzero(used & self.plant.C.any(axis=1)))
 
     # results
@@ -381,9 +418,10 @@ class ClosedLoop:
         """L of all loops cut at u, or at y, so that S = (I + L)^-1; shape (K, 3, 3) or (K, 5, 5).
 
         omega [rad/s] has shape (K,). Delay, sensors and the omega_u loop of the law are in it.
+        With an inner stage the cut is at the bridge, (K, 4, 4), or at the sensors, (K, 11, 11).
         """
-        p, c, s = self.held, self.law, self._at(omega)
-        zero = np.zeros((NY, NU))
+        p, c, s = self.held, self.controller, self._at(omega)
+        zero = np.zeros(c.D.shape[::-1])
         plant, law = response((p.A, p.B, p.C, zero), s), response((c.A, c.B, c.C, c.D), s)
         return -plant @ law if at_y else -law @ plant
 
@@ -394,15 +432,16 @@ class ClosedLoop:
         this L, see ``margins.locus``.
 
         Args:
-            at: i_u, omega_u or E_u, or one of v_dc, p, q and V; see ``commands`` and
-                ``measurements``.
+            at: i_u, omega_u or E_u, or one of v_dc, p, q and V; with an inner stage E_u is the d
+                axis of the bridge's voltage, and there are E_q, i_d, i_q, v_d, v_q, i_od and i_oq;
+                see ``commands`` and ``measurements``.
             omega: frequencies, rad/s, shape (K,).
 
         Raises:
             ValueError: the loop does not use such a channel.
         """
-        used = {U_NAMES[j]: (j, False) for j in self.commands}
-        used |= {Y_NAMES[i]: (i, True) for i in self.measurements}
+        used = {U_CARRIED[j]: (j, False) for j in self.commands}
+        used |= {Y_CARRIED[i]: (i, True) for i in self.measurements}
         if at not in used:
             raise ValueError(f"{at!r} is no channel of the loop; use one of {list(used)}")
         k, at_y = used[at]
@@ -439,18 +478,19 @@ class ClosedLoop:
         v[0, _V_C], v[1, _V_C + 1] = 1.0, 1.0  # these come before i_o: the same places in rest
         v[:, delta] = -x[_V_C + 1], x[_V_C]  # v in the steady frame, by delta
         alone = LinearPlant(A, whole.B[rest], whole.B_d[rest], C, whole.C_true[:, rest])
-        p = ClosedLoop(alone, self.law, self.T_s, self.u_delay, self.y_delay).held
-        c, at = self.law, self._at(omega)
-        G = response((p.A, p.B, p.C, np.zeros((NY, NU))), at)
+        of = alone, self.law, self.T_s, self.u_delay, self.y_delay
+        p, c, at = ClosedLoop(*of, stage=self.stage).held, self.controller, self._at(omega)
+        n_y, n_u = p.C.shape[0], p.B.shape[1]
+        G = response((p.A, p.B, p.C, np.zeros((n_y, n_u))), at)
         K = response((c.A, c.B, c.C, c.D), at)
         y = response((A, by_i, C, y_by_i), s) * np.exp(-s[:, None] * self.y_delay)[:, :, None]
-        u = np.linalg.solve(np.eye(NU) - K @ G, K @ y)
+        u = np.linalg.solve(np.eye(n_u) - K @ G, K @ y)
         if self.T_s is not None:  # u acts late, and is held over the tick
             hold_at = (1.0 - np.exp(-s * self.T_s)) / (s * self.T_s)
             u = u * (hold_at[:, None] * np.exp(-s[:, None] * self.u_delay))[:, :, None]
-        zero = np.zeros((2, NU + 2))
+        zero = np.zeros((2, n_u + 2))
         v_by = response((A, np.hstack([alone.B, by_i]), v, zero), s)
-        return -(v_by[..., NU:] + v_by[..., :NU] @ u)
+        return -(v_by[..., n_u:] + v_by[..., :n_u] @ u)
 
     def _at(self, omega: ArrayLike) -> Response:
         """s, or z = e^(s T_s), on the imaginary axis."""

@@ -24,15 +24,17 @@ from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import LawStateSpace
-from gfm_runtime.signals import NU, NY
-from gfm_runtime.tustin import DiscreteLaw, close_omega_u, tustin
+from gfm_runtime.signals import NU, NY, NY_INNER
+from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw, close_omega_u, tustin
 
 Matrix = NDArray[np.float64]
+Vector = NDArray[np.complex128]
 
 _STEP = 1e-30  # complex step
 _NUDGE = 1e-6  # central differences, for the error map alone: it is compiled for real numbers
 _WHOLE = 1e-9  # samples; a fraction below this is rounding
 _MEASURED = list(SENSED)
+_D, _Q = slice(0, 6, 2), slice(1, 6, 2)  # the axes of (i, v, i_o) in the plant's state
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,12 @@ class LinearPlant:
     """x' = A x + B u + B_d d,  y = C x: deviations from the operating point.
 
     x' is dx/dt, or the x of the next tick. Shapes: A (n,n), B (n,3), B_d (n,2), C and C_true (5,n);
-    several plants have one leading axis more. The first eight states are those of
-    ``gfm_plant.model``; a regulated DC source adds its integral, one with a lag its current, a
-    finite grid its frequency and its turbines' power, band-limited sensors add four, and a sampled
-    plant ends with its delay lines. C gives what the controller reads and C_true what the sensors
-    measure. The omega_u row of both is 0, since a law is fed its own omega_u.
+    for an inner stage B is (n,4) and C (11,n), in the order of the signal table. Several plants
+    have one leading axis more. The first eight states are those of ``gfm_plant.model``; a regulated
+    DC source adds its integral, one with a lag its current, a finite grid its frequency and its
+    turbines' power, band-limited sensors add four, and a sampled plant ends with its delay lines.
+    C gives what the controller reads and C_true what the sensors measure. The omega_u row of both
+    is 0, since a law is fed its own omega_u; only a PLL reads the omega_u that acts.
     """
 
     A: Matrix
@@ -65,8 +68,9 @@ class LinearLaw:
 
     x' is dx/dt, or the x of the next tick. The omega_u loop is closed and the error map is in the
     matrices, so y and r are plain measurements and references. Shapes: A (m,m), B and B_r (m,5),
-    C (3,m), D and D_r (3,5); several laws have leading axes. ``rows`` names the row of u that each
-    state belongs to; rows that do not act have no states.
+    C (3,m), D and D_r (3,5); with an inner stage B is (m,11), C (4,m), D (4,11) and D_r (4,5).
+    Several laws have leading axes. ``rows`` names the row of u that each state of the law belongs
+    to; rows that do not act have no states.
     """
 
     A: Matrix
@@ -120,26 +124,29 @@ def linearise_plant(
     omega_g: float = 1.0,
     V_g: float = 1.0,
     grid: FiniteGrid | None = None,
+    inner: bool = False,
 ) -> LinearPlant:
     """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g,
-    ideal or finite."""
+    ideal or finite; ``inner``: with the commands and the measurements of an inner stage."""
     r = par[0]
-    at = np.concatenate([op.x, op.u, [omega_g, V_g]])
+    commands = op.commands if inner else op.u
+    n_u = len(commands)
+    at = np.concatenate([op.x, commands, [omega_g, V_g]])
     slopes = np.empty((N_X + NY + 1, len(at)))
     for j in range(len(at)):
         z = at.astype(complex)
         z[j] += 1j * _STEP
-        x, u, d = np.split(z, [N_X, N_X + NU])
+        x, u, d = np.split(z, [N_X, N_X + n_u])
         p_g = d[1] * (np.cos(x[DELTA]) * x[4] - np.sin(x[DELTA]) * x[5])
-        slopes[:, j] = np.concatenate([f(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
+        slopes[:, j] = np.concatenate([_rates(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
     regulated, lags = int(r["i_u_gain"] == 0.0), int(r["tau_dc"] > 0.0)
     finite, sensors = 2 * int(grid is not None), 4 * int(r["filtered"])
     source, swing = N_X + regulated, N_X + regulated + lags  # where the states begin
     n = swing + finite
     s = slice(n, n + sensors)
     A, C = np.zeros((n + sensors, n + sensors)), np.zeros((NY, n + sensors))
-    B, B_d = np.zeros((n + sensors, NU)), np.zeros((n + sensors, 2))
-    A[:N_X, :N_X], B[:N_X], B_d[:N_X] = np.split(slopes[:N_X], [N_X, N_X + NU], axis=1)
+    B, B_d = np.zeros((n + sensors, n_u)), np.zeros((n + sensors, 2))
+    A[:N_X, :N_X], B[:N_X], B_d[:N_X] = np.split(slopes[:N_X], [N_X, N_X + n_u], axis=1)
     C[_MEASURED, :N_X] = slopes[N_X:-1][_MEASURED, :N_X]
     C_true = C.copy()
     per_i_dc, asked = B[V_DC, 0], np.zeros(n + sensors)  # the current asked of the DC source, by x
@@ -164,7 +171,26 @@ def linearise_plant(
         C = np.zeros_like(C)
         C[_MEASURED, s] = np.eye(4)
     C[_MEASURED] *= r["gain"][: len(_MEASURED), None]
+    if inner:  # the currents and voltages pass no filter
+        prompt = np.eye(NY_INNER - NY, n + sensors)
+        C = np.vstack([C, r["gain"][len(_MEASURED) :, None] * prompt])
     return LinearPlant(A, B, B_d, C, C_true)
+
+
+def _rates(x: Vector, u: Vector, d: Vector, par: Record) -> Vector:
+    """``gfm_plant.model.f``, under (i_u, omega_u, e_d, e_q) too: f has its voltage on the d axis,
+    and its equations are the same in any frame that is turned by a constant angle."""
+    if len(u) == NU:
+        return np.asarray(f(x, u, d, par))
+    size = np.sqrt(u[2] * u[2] + u[3] * u[3])
+    cos, sin = u[2] / size, u[3] / size
+    turned = x.copy()
+    turned[_D], turned[_Q] = cos * x[_D] + sin * x[_Q], cos * x[_Q] - sin * x[_D]
+    turned[DELTA] += 2.0 * np.arctan(sin / (1.0 + cos))
+    there = f(turned, np.array([u[0], u[1], size]), d, par)
+    dx = there.copy()
+    dx[_D], dx[_Q] = cos * there[_D] - sin * there[_Q], cos * there[_Q] + sin * there[_D]
+    return np.asarray(dx)
 
 
 def linearise_law(
@@ -215,6 +241,24 @@ def error_map_slopes(
     return slopes[0], slopes[1]
 
 
+def inverse_tustin(
+    A: Matrix, B: Matrix, C: Matrix, D: Matrix, half: float
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """The continuous system whose discretisation by Tustin is x' = A x + B w, z = C x + D w.
+
+    It has the same norms, at tan(omega half)/half in place of omega. The matrices may have leading
+    axes. ``half`` is half the sampling time in s; no eigenvalue may be at -1.
+    """
+    eye = np.eye(A.shape[-1])
+    forward = 2.0 * np.linalg.inv(A + eye)
+    return (
+        (eye - forward) / half,
+        forward @ B / (2.0 * half),
+        C @ forward,
+        D - 0.5 * C @ forward @ B,
+    )
+
+
 def hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     """exp(A T) and the integral of exp(A t) B over (0, T): the plant over a held input."""
     n, m = B.shape
@@ -231,7 +275,9 @@ def hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return out[:n, :n], out[:n, n:]
 
 
-def sampled_plant(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
+def sampled_plant(
+    plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix, reads_omega: bool = False
+) -> LinearPlant:
     """The plant from tick to tick, with delay lines as states.
 
     u_j[k] acts ``u_delay[j]`` seconds after its tick, through its own hold; y_i[k] is y_i
@@ -241,38 +287,41 @@ def sampled_plant(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matr
     Args:
         plant: a single continuous plant.
         T_s: sampling time, s.
-        u_delay, y_delay: shapes (3,) and (5,), s, all >= 0.
+        u_delay, y_delay: shapes (3,) and (5,), or (4,) and (11,), s, all >= 0.
+        reads_omega: y has the omega_u that acts at its tick, as a PLL needs it.
     """
-    n = len(plant.A)
+    n, n_u, n_y = len(plant.A), plant.B.shape[1], len(plant.C)
     # a command that does not act needs no delay line
     u_split = [_split(d, T_s) if plant.B[:, j].any() else (0, 0.0) for j, d in enumerate(u_delay)]
     y_split = [_split(d, T_s) for d in y_delay]
     lines = [whole + (part > 0.0) for whole, part in (*u_split, *y_split)]
     at = n + np.concatenate([[0], np.cumsum(lines)]).astype(int)  # where each line begins
-    size = int(at[-1])
-    now = np.eye(size + NU + plant.B_d.shape[1])  # (state, u[k], d[k]) by rows
-    aged = [np.vstack([now[size + j], now[at[j] : at[j + 1]]]) for j in range(NU)]  # u_j[k], ...
+    size = int(at[-1]) + reads_omega
+    now = np.eye(size + n_u + plant.B_d.shape[1])  # (state, u[k], d[k]) by rows
+    aged = [np.vstack([now[size + j], now[at[j] : at[j + 1]]]) for j in range(n_u)]  # u_j[k], ...
     step = np.zeros((size, len(now)))
-    for j, count in enumerate(lines[:NU]):
+    for j, count in enumerate(lines[:n_u]):
         step[at[j] : at[j + 1]] = aged[j][:count]
     # through the tick, from one switching of a command or reading of an output to the next
     switches = [part * T_s for _, part in u_split]
     readings = [(1.0 - part) * T_s if part else 0.0 for _, part in y_split]
     x, inputs = now[:n], np.hstack([plant.B, plant.B_d])
     for t, then in pairwise(sorted({0.0, T_s, *switches, *readings})):
-        for i in range(NY):
-            if lines[NU + i] and t == readings[i]:
-                line = slice(at[NU + i], at[NU + i + 1])
+        for i in range(n_y):
+            if lines[n_u + i] and t == readings[i]:
+                line = slice(at[n_u + i], at[n_u + i + 1])
                 step[line] = np.vstack([plant.C[i] @ x, now[line][:-1]])
         u = [aged[j][whole + (t < switches[j])] for j, (whole, _) in enumerate(u_split)]
         A, B = hold(plant.A, inputs, then - t)
-        x = A @ x + B @ np.vstack([*u, now[size + NU :]])
+        x = A @ x + B @ np.vstack([*u, now[size + n_u :]])
     step[:n] = x
-    read = [now[at[NU + i + 1] - 1, :size] for i in range(NY)]  # the oldest of each line
+    read = [now[at[n_u + i + 1] - 1, :size] for i in range(n_y)]  # the oldest of each line
     C_true = np.pad(plant.C_true, ((0, 0), (0, size - n)))
     prompt = np.pad(plant.C, ((0, 0), (0, size - n)))
-    C = np.where(np.array(lines[NU:])[:, None] > 0, read, prompt)
-    A, B, B_d = np.split(step, [size, size + NU], axis=1)
+    C = np.where(np.array(lines[n_u:])[:, None] > 0, read, prompt)
+    if reads_omega:
+        step[-1], C[OMEGA_COLUMN] = u[OMEGA_ROW], now[size - 1, :size]
+    A, B, B_d = np.split(step, [size, size + n_u], axis=1)
     return LinearPlant(A, B, B_d, C, C_true)
 
 

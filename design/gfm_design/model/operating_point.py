@@ -201,10 +201,12 @@ class _Side:
 
     def residual(self, z: Vector, V_g: float, omega_g: float, theta: float = 0.0) -> Vector:
         """What must vanish, at a voltage V_g of the line's far end that is ahead by theta, rad."""
-        law = self.law
+        law, ref = self.law, self.ref
+        if law.law.inner is not None and law.law.inner.f_pll > 0.0:
+            ref = np.array([*ref[:2], omega_g, *ref[3:]])  # the law sees what its PLL measures
         x, u, y, x_law = _unpack(z, self.par, law, omega_g, self.kept)
         x[DELTA] -= theta
-        u_law, x_next = _law(law, x_law, self.ref, y)
+        u_law, x_next = _law(law, x_law, ref, y)
         dx = f(x, u, np.array([omega_g, V_g]), self.par)
         dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = np.delete(dx, DELTA)  # delta rests by omega_u = omega_g

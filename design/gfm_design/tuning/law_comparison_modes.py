@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.closed_loop import U_CARRIED, Y_CARRIED, ClosedLoop
 from gfm_design.model.linear import Mode
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -51,8 +51,11 @@ def _states(loop: ClosedLoop) -> list[str]:
     size, acts = len(loop.plant.A) - len(_PLANT), loop.plant.B.any(axis=0)
     names = [*_PLANT, *["integral of the DC source"] * (size % len(_SENSORS))]
     names += _SENSORS if size >= len(_SENSORS) else ()
-    late = [*zip(U_NAMES, loop.u_delay * acts, strict=True)]
-    late += zip(Y_NAMES, loop.y_delay, strict=True)
+    late = [*zip(U_CARRIED, loop.u_delay * acts, strict=False)]
+    late += zip(Y_CARRIED, loop.y_delay, strict=False)
     for name, delay in late if loop.T_s else ():
         names += [f"{name} on its way"] * int(np.ceil(delay / loop.T_s - 1e-9))
-    return names + [f"law's state of {U_NAMES[row]}" for row in loop.law.rows]
+    if loop.stage is not None and loop.stage.has_pll:
+        names.append("omega_u that acts")
+    names += [f"law's state of {U_NAMES[row]}" for row in loop.law.rows]
+    return [*names, *(loop.stage.states if loop.stage else ())]

@@ -1,4 +1,9 @@
-"""The paper's synthesis problem as a cost: gamma of the ideal continuous loop."""
+"""The paper's synthesis problem as a cost: gamma of the ideal continuous loop.
+
+A law with an inner stage has no continuous loop, since the stage runs from tick to tick. Its gamma
+is that of the sampled loop with u one sample late and the weights by Tustin. The searches work on
+that loop's inverse Tustin transform, which has the same norms.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.model.closed_loop import REFERENCES, T_S, ClosedLoop
-from gfm_design.model.linear import LinearPlant
+from gfm_design.model.linear import LinearLaw, LinearPlant, inverse_tustin
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
 from gfm_design.norms.screen import Screen
@@ -19,6 +24,9 @@ from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law
 
 Vector = NDArray[np.float64]
+
+#: the paper's converter with u one sample late, on which a law with an inner stage is judged
+LATE = Plant.model_validate({"delay": {"samples": 1}})
 
 #: Section IV-A's initial K, by law: what ``tune`` starts from if not told otherwise
 PAPER_START: dict[str, dict[str, float]] = {
@@ -37,8 +45,9 @@ class PaperProblem:
     """gamma of a law on the paper's converter, as a function of its free gains.
 
     The plant is ideal whatever ``plant`` says of delay and sensors; factors and the DC source
-    count. The operating point is that of the starting gains. ``late`` is the loop there sampled at
-    T_s with one sample of delay, for other laws to be put into it.
+    count. With an inner stage u acts one sample late. The operating point is that of the starting
+    gains. ``late`` is the loop there sampled at T_s with one sample of delay, for other laws to be
+    put into it.
     """
 
     file: LawFile
@@ -49,17 +58,25 @@ class PaperProblem:
     T_s: float = T_S
 
     def __post_init__(self) -> None:
-        self._ideal = self.plant.model_copy(update={"sensors": Plant().sensors})
+        judged = LATE if self.has_stage else Plant()
+        update = {"sensors": judged.sensors, "delay": judged.delay}
+        self._judged = self.plant.model_copy(update=update)
         self._screen = Screen(self.weights)
         self.move_to({g.name: g.start for g in self.gains})
 
     def move_to(self, named: dict[str, float]) -> None:
         """Take the operating point of these gains (it hardly depends on them)."""
         law, ref = build_law(self.file, named), np.asarray(self.references)
-        self._rest = ClosedLoop.of(law, self._ideal, ref, T_s=self.T_s, ideal=True)
-        self.late = self._rest.sampled(self.T_s, self.T_s)
+        ideal = not self.has_stage
+        self._rest = ClosedLoop.of(law, self._judged, ref, T_s=self.T_s, ideal=ideal)
+        self.late = self._rest.sampled(self.T_s, self.T_s) if ideal else self._rest
         controlled = self.plant.dc_source.mode == "controlled"
         self.law = GainedLaw(self.file, self.gains, self.op, ref, controlled)
+
+    @property
+    def has_stage(self) -> bool:
+        """Whether the law has an inner stage, so that the sampled loop is judged."""
+        return self.file.inner is not None
 
     @property
     def op(self) -> OperatingPoint:
@@ -73,19 +90,24 @@ class PaperProblem:
 
     def loops(self, values: Vector) -> StateSpace:
         """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
-        return self.closed_loops(values).performance()
+        loops = self.closed_loops(values).performance()
+        return inverse_tustin(*loops, self.T_s / 2) if self.has_stage else loops
 
     def closed_loop(self, values: Vector) -> ClosedLoop:
-        """The continuous loop at these gains, with as few states as the law needs.
+        """The loop at these gains, with as few states as the law needs.
 
         Raises:
             LawError: the gains make no law.
         """
-        return self._rest.with_law(self.law.exact(values))
+        return self._rest.with_law(self._runs(self.law.exact(values)))
 
     def closed_loops(self, values: Vector) -> ClosedLoop:
-        """The continuous loops at rows of gains, in one; nan where they make no law."""
-        return self._rest.with_law(self.law(values))
+        """The loops at rows of gains, in one; nan where they make no law."""
+        return self._rest.with_law(self._runs(self.law(values)))
+
+    def _runs(self, law: LinearLaw) -> LinearLaw:
+        """The law as the loop has it, continuous or from tick to tick."""
+        return law.sampled(self.T_s) if self.has_stage else law
 
     def __call__(self, values: Vector) -> float:
         """Cost: a close lower bound of gamma, or what an unstable loop costs."""

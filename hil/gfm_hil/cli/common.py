@@ -33,7 +33,7 @@ EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run
 
 #: what the command line calls the overrides of ``load_scenario``
-_OPTIONS = {
+OPTIONS = {
     "mode": "--mode",
     "link__type": "--link",
     "link__endpoint": "--endpoint",
@@ -91,7 +91,7 @@ def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
     """
     return load_scenario(
         options.scenario,
-        _OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
+        OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
         mode=options.mode,
         link__type=options.link,
         link__endpoint=options.endpoint,

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
@@ -32,6 +33,8 @@ from gfm_hil.scenario.toml_out import write_scenario
 __all__ = ["Notice", "Progress", "Run", "run_scenario"]
 
 Notice = Callable[[str], None]
+
+_PIECE = 256  # ticks
 
 
 def run_scenario(
@@ -178,6 +181,14 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
 
 
+def _by_column(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A copy whose columns are contiguous, made in pieces that stay in the processor's cache."""
+    out = np.empty(rows.shape, order="F")
+    for k in range(0, len(rows), _PIECE):
+        out[k : k + _PIECE] = rows[k : k + _PIECE]
+    return out
+
+
 def _in_memory(
     benches: Sequence[Bench], plants: Sequence[Part], controllers: Sequence[Part]
 ) -> list[Run]:
@@ -198,8 +209,8 @@ def _in_memory(
         recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
         done = int(recorded[-1]) + 1 if len(recorded) else 0
         columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
-        columns |= named("plant", plant.signals[:done].copy("F"))
-        columns |= named("controller", controller.signals[:done].copy("F"))
+        columns |= named("plant", _by_column(plant.signals[:done]))
+        columns |= named("controller", _by_column(controller.signals[:done]))
         outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
         summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
         summary |= stages(scenario) | origin(scenario, date)

@@ -6,6 +6,7 @@ import math
 import platform
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
@@ -32,6 +33,12 @@ END_METRICS = ("p_final", "settling_s", "overshoot_pct")
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
 
 
+@cache
+def _version() -> str:
+    """Of this program; the look-up reads files, which a campaign would do for each of its runs."""
+    return version("gfmhil")
+
+
 def origin(scenario: Scenario, began: float) -> dict[str, Any]:
     """Where a recording comes from: date (UTC), version, this machine and the doctor's verdict.
 
@@ -42,7 +49,7 @@ def origin(scenario: Scenario, began: float) -> dict[str, Any]:
     judged = verdict() if scenario.mode == "realtime" else None
     return {
         "date": datetime.fromtimestamp(began, UTC).isoformat(timespec="seconds"),
-        "version": version("gfmhil"),
+        "version": _version(),
         "machines": {platform.node(): judged},
     }
 

@@ -314,8 +314,11 @@ class Scenario(_Model):
         """Whether a law of the run has an inner stage: frames and recording then carry its
         signals."""
         each = [self.of(name) for name in self.converters] or [self]
-        found = (load_law(name, one.inner) for one in each for name in one.laws())
-        return any(law.inner is not None for one in found for law in one.laws)
+        return any(
+            (law_file(name).inner if one.inner is None else named_inner(one.inner)) is not None
+            for one in each
+            for name in one.laws()
+        )
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:

@@ -40,12 +40,13 @@ class Stepped:
     ripple: float
 
 
-def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
+def step_run(point: Point, law: str, inner: str | None = None, seed: int = 1) -> Stepped:
     """Step P_ref from 0.5 to 1 p.u. on a point's plant, whatever its own P_ref is.
 
     Args:
         point: the plant.
         law: catalogue name or law file.
+        inner: inner stage in place of the law's own: a shipped name, a file, or ``none``.
         seed: of the sensors' noise.
     """
     plant = point.plant().model_dump(mode="json", exclude_none=True)
@@ -55,6 +56,7 @@ def step_run(point: Point, law: str, seed: int = 1) -> Stepped:
         "title": str(point),
         "duration": (_BEFORE + _AFTER) * T_S,
         "law": law,
+        "inner": inner,
         "seed": seed,
         "references": {"P_ref": STEP[0]},
         "events": [{"tick": _BEFORE, "type": "reference", "P_ref": STEP[1]}],

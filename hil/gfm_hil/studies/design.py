@@ -14,7 +14,7 @@ from gfm_design.norms.weights import read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.law_comparison_modes import culprit
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.core.errors import UserError, need
@@ -85,8 +85,10 @@ class Tuning:
         """A gamma below which no controller of any order comes; None if the solver found none.
 
         Raises:
-            UserError: python-control or slycot is not installed.
+            UserError: python-control or slycot is not installed, or the law has an inner stage.
         """
+        if self.problem.has_stage:
+            raise UserError("the full-order bound is that of a law on the bridge, without a stage")
         try:
             return full_order(self.problem.linear, self.problem.weights)
         except ModuleNotFoundError as missing:
@@ -103,19 +105,24 @@ class NotTuned(ArithmeticError):
 def gamma(law: str | Path | Law, weights: Weights = None, T_s: float | None = None) -> Gamma:
     """gamma of a law on the paper's converter at P_ref = 0.5 p.u.
 
+    With an inner stage it is that of the loop sampled at 10 kHz with u one sample late.
+
     Args:
         law: name, law file or ``Law``; ``Law.with_gains`` gives other gains.
         weights: file of weights or the weights; the paper's six if None.
         T_s: sampling time [s] of law and weights, by Tustin, without delay; None for the
-            continuous loop of the paper.
+            continuous loop of the paper. Not with an inner stage.
 
     Raises:
         Unstable: the loop is not stable; it has no gamma.
-        UserError: a weight that cannot be, or there is no operating point.
+        UserError: a weight that cannot be, there is no operating point, or T_s with an inner stage.
         LawError: the law is none.
     """
     law = as_law(law)
-    loop = law.closed_loop(ideal=True)
+    staged = law.file.inner is not None
+    if staged and T_s is not None:
+        raise UserError("gamma: the loop of an inner stage is sampled at 10 kHz in any case")
+    loop = law.closed_loop(LATE) if staged else law.closed_loop(ideal=True)
     if T_s is not None:
         loop = loop.sampled(T_s)
     return Gamma(law.name, loop.channels(_weights(weights)))
@@ -134,6 +141,8 @@ def tune(
     progress: Callable[[int, int, float], None] = lambda done, of, best: None,
 ) -> Tuning:
     """Choose the free gains of a law for the least gamma (Section III-B of the paper).
+
+    gamma is that of the function ``gamma``, with the law's inner stage if it has one.
 
     Args:
         law: name, law file or ``Law``; its parameters with ``free`` bounds may move.

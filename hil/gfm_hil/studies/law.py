@@ -172,26 +172,30 @@ class Law:
         """This law around a plant, linearised where both rest.
 
         Args:
-            on: a scenario (name, file or ``Scenario``), of which plant, references and sampling
-                time count, or a plant alone; the paper's converter without delay and sensors
-                if None.
+            on: a scenario (name, file or ``Scenario``), of which plant, references, sampling time
+                and inner stage count, or a plant alone; the paper's converter without delay and
+                sensors if None.
             ideal: the continuous loop, neither sampled nor delayed.
             more: ``references`` (V_dcref, P_ref, omega_g, Q_ref, V_ref) in p.u. and ``T_s`` in s,
                 instead of those of the scenario.
 
         Raises:
             UserError: no such scenario, or there is no operating point.
-            LawError: the law cannot be discretised at T_s.
+            LawError: the law cannot be discretised at T_s; ``ideal`` with an inner stage, which
+                runs from tick to tick.
         """
         from gfm_hil.studies.loop import Loop
 
+        file = self.file
         if isinstance(on, str | Path):
             on = load_scenario(on)
         if isinstance(on, Scenario):
             more = {"references": on.references.vector(), "T_s": on.T_s, **more}
+            if on.inner is not None:
+                file = self.file.model_copy(update={"inner": named_inner(on.inner)})
             on = on.plant
         try:
-            return Loop.of(self.built(), on, ideal=ideal, **more)
+            return Loop.of(build_law(file), on, ideal=ideal, **more)
         except NoEquilibrium as problem:
             raise UserError(str(problem)) from None
 

@@ -170,7 +170,7 @@ class Loop(ClosedLoop):
 def scenario_loop(scenario: Scenario) -> tuple[Loop, str]:
     """The scenario's first law at its start, of a scheduled law the stage in force; its label."""
     references = scenario.references.vector()
-    controller = Controller([load_law(scenario.law)], scenario.T_s, references)
+    controller = Controller([load_law(scenario.law, scenario.inner)], scenario.T_s, references)
     return Loop.of(controller.active_law, scenario.plant, references), controller.active
 
 

@@ -27,6 +27,13 @@ def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
     return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 
+def problem_name(file: LawFile) -> str:
+    """The problem whose gamma a synthesis gives."""
+    if file.inner is None:
+        return "the paper's problem (Section III-B)"
+    return f"the paper's weights, behind {file.inner.type}, sampled at 10 kHz, u one sample late"
+
+
 def law_text(
     file: LawFile, gains: Mapping[str, float], by: str, comments: Sequence[str], **about: str | None
 ) -> str:
@@ -69,7 +76,7 @@ def write_law(
         OSError: the file cannot be written.
     """
     comments = [
-        f"gamma = {result['gamma']:.6g} of the paper's problem (Section III-B), P_ref = 0.5",
+        f"gamma = {result['gamma']:.6g} of {problem_name(file)}, P_ref = 0.5",
         *(f"W_{c['i']}{c['j']}: {c['norm']:.6g}" for c in result["channels"]),
         f"{result['evaluations']} evaluations, {result['seconds']:.1f} s, seed {result['seed']}",
         *notes,

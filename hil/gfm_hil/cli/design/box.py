@@ -18,11 +18,12 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.robust import Loops, Wanted, paper_problem
-from gfm_hil.cli.design.common import channels_as_json
+from gfm_hil.cli.design.common import add_inner_option, channels_as_json, chosen_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.box import STEP, step_run
-from gfm_runtime import law_file
+from gfm_hil.studies.tuned_law import problem_name
+from gfm_runtime import build_law, discretise
 from gfm_runtime.lawfile import LawFile
 
 _SOURCES = get_args(Source)
@@ -39,6 +40,7 @@ _RANGE = {
 def add(kinds: Any) -> None:
     command = kinds.add_parser("box", help="whether a law holds in the box of real loops")
     command.add_argument("--law", required=True, help="catalogue name or law file")
+    add_inner_option(command)
     add_box(command)
     command.add_argument("--random", type=int, default=1000, help="points inside, of either source")
     command.add_argument("--seed", type=int, default=0, help="of those points")
@@ -113,7 +115,8 @@ def wanted(named: dict[str, float], box: Box) -> Wanted:
 
 def call(options: argparse.Namespace) -> int:
     """Report gamma, the delay margin, and the worst point of each kind."""
-    file, whole = law_file(options.law), read_box(options.box)
+    file, whole = chosen_law(options), read_box(options.box)
+    law = discretise(build_law(file), T_S)
     rows: list[dict[str, Any]] = []
     for dc in dict.fromkeys(whole.dc):
         box = replace(whole, dc=(dc,))
@@ -124,24 +127,25 @@ def call(options: argparse.Namespace) -> int:
             sigma = _loops(file, points).sigma(_values(file))
             k = int(np.argmax(sigma))
             row = _row(dc, f"sigma, {where} [1/s]", len(points), sigma[k], points[k])
-            worst = points[k].loop(options.law).modes()[0]
+            worst = points[k].loop(law).modes()[0]
             rows.append(row | {"mode_hz": worst.frequency_hz})
         gamma = _gamma(file, dc)
         rows.append(_row(dc, "gamma with this source", 1, gamma["gamma"], Point(dc=dc)))
         nominal = Point(dc=dc)
-        margin = overall_delay(nominal.loop(options.law)).seconds
+        margin = overall_delay(nominal.loop(law)).seconds
         rows.append(_row(dc, "delay margin [s]", 1, margin, nominal))
         if options.bench:
-            rows += _bench(options.law, box, options.json)
+            rows += _bench(options, box)
     result = {
         "law": file.name,
+        "inner": file.inner.type if file.inner else None,
         **_gamma(file, "controlled"),
         "box": rows,
     }
     if options.json:
         print(json.dumps(result, indent=2))
     else:
-        _print(result)
+        _print(result, problem_name(file))
     return 0
 
 
@@ -168,11 +172,12 @@ def _gamma(file: LawFile, dc: Source) -> dict[str, Any]:
         return {"gamma": None, "reason": str(problem)}
 
 
-def _bench(law: str, box: Box, quiet: bool) -> list[dict[str, Any]]:
+def _bench(options: argparse.Namespace, box: Box) -> list[dict[str, Any]]:
     """Worst overshoot of each L_g on the nonlinear bench, and how many runs ended early."""
     points = replace(box, P_ref=(STEP[0],)).corners()
-    console = terminal(stderr=True, quiet=quiet)
-    runs = [step_run(p, law) for p in track(points, "P_ref steps", console=console, transient=True)]
+    console = terminal(stderr=True, quiet=options.json)
+    bar = track(points, "P_ref steps", console=console, transient=True)
+    runs = [step_run(p, options.law, options.inner) for p in bar]
     rows = []
     for L_g in box.L_g:
         some = [r for r in runs if r.point.L_g == L_g]
@@ -193,10 +198,10 @@ def _row(dc: str, what: str, count: int, worst: float | None, at: Point) -> dict
     return {"dc": dc, "what": what, "points": count, "worst": number, "at": asdict(at)}
 
 
-def _print(result: dict[str, Any]) -> None:
+def _print(result: dict[str, Any], problem: str) -> None:
     console = terminal(highlight=False)
     gamma = "none" if result["gamma"] is None else f"{result['gamma']:.4f}"
-    console.print(f"[bold]{result['law']}[/]: γ = {gamma} of the paper's problem")
+    console.print(f"[bold]{result['law']}[/]: γ = {gamma} of {problem}")
     table = Table("DC source", "what", "points", "worst", "at", box=None, pad_edge=False)
     for row in result["box"]:
         what = row["what"].replace("[", "\\[")

@@ -14,11 +14,41 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
 from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
+from gfm_hil.studies.tuned_law import problem_name
+from gfm_runtime import law_file
+from gfm_runtime.inner_file import named_inner
+from gfm_runtime.lawfile import LawFile
+
+
+def add_inner_option(command: argparse.ArgumentParser) -> None:
+    """The inner stage."""
+    command.add_argument(
+        "--inner", metavar="NAME",
+        help="inner stage: a shipped name (gfmhil laws), a file, or none; the law's own by default",
+    )  # fmt: skip
+
+
+def chosen_law(options: argparse.Namespace) -> LawFile:
+    """The law file of --law, with the inner stage of --inner if it is given.
+
+    Raises:
+        LawError: no such law or stage, or a mistake in its file.
+    """
+    file = law_file(options.law)
+    if options.inner is None:
+        return file
+    return file.model_copy(update={"inner": named_inner(options.inner)})
+
+
+def judged(file: LawFile) -> str:
+    """The name of a law; with an inner stage also which problem its gamma is that of."""
+    return file.name if file.inner is None else f"{file.name}, {problem_name(file)}"
 
 
 def add_law_options(command: argparse.ArgumentParser) -> None:
-    """The law, its gains, the weights, and JSON."""
+    """The law, its inner stage, its gains, the weights, and JSON."""
     command.add_argument("--law", required=True, help="catalogue name or law file")
+    add_inner_option(command)
     command.add_argument("--gains", help="k=v,…: other values (tune: other starts)")
     command.add_argument("--weights", help="TOML file of weights; the paper's six by default")
     command.add_argument("--json", action="store_true", help="as JSON")

@@ -15,11 +15,18 @@ from gfm_design.tuning.gains import free_gains, tied
 from gfm_design.tuning.robust import Wanted, paper_problem
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.cli.design.box import add_box, margin_text, read_box, wanted
-from gfm_hil.cli.design.common import add_law_options, channels_as_json, print_channels, read_gains
+from gfm_hil.cli.design.common import (
+    add_law_options,
+    channels_as_json,
+    chosen_law,
+    judged,
+    print_channels,
+    read_gains,
+)
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.studies.tuned_law import law_text
-from gfm_runtime import build_law, discretise, law_file, parse_law
+from gfm_hil.studies.tuned_law import law_text, problem_name
+from gfm_runtime import build_law, discretise, parse_law
 from gfm_runtime.lawfile import LawFile
 
 
@@ -38,7 +45,7 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Tune a law for the box; exit code 3 if no stabilising gains are found."""
-    file = law_file(options.law)
+    file = chosen_law(options)
     only = options.only.split(",") if options.only else None
     gains = free_gains(file, read_gains(options.gains), only)
     box = read_box(options.box)
@@ -67,7 +74,7 @@ def call(options: argparse.Namespace) -> int:
     named = tied(file, dict(zip([g.name for g in gains], values, strict=True)))
     result = channels_as_json(channels) | {"seed": options.seed, "seconds": found.seconds}
     _write(Path(options.out), file, named, result | {"source": source}, box, demands)
-    print_channels(Path(options.out).stem, channels)
+    print_channels(judged(file.model_copy(update={"name": Path(options.out).stem})), channels)
     return 0
 
 
@@ -91,7 +98,7 @@ def _write(
 ) -> None:
     """The law file and, as comments, what its gains were tuned for."""
     comments = [
-        f"gamma = {result['gamma']:.4f} of the paper's problem (Section III-B), P_ref = 0.5, "
+        f"gamma = {result['gamma']:.4f} of {problem_name(file)}, P_ref = 0.5, "
         f"DC source {result['source']}:",
         "  " + ", ".join(f"W_{c['i']}{c['j']} {c['norm']:.4f}" for c in result["channels"]),
         f"seed {result['seed']}, {result['seconds']:.0f} s, started from {file.name}",

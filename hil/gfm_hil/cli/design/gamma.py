@@ -12,6 +12,8 @@ from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
+    chosen_law,
+    judged,
     print_channels,
     read_gains,
     singular_is_users,
@@ -27,7 +29,8 @@ def add(kinds: Any) -> None:
     command.add_argument(
         "--discrete",
         action="store_true",
-        help="of the loop sampled at 10 kHz: law and weights by Tustin, no delay",
+        help="of the loop sampled at 10 kHz: law and weights by Tustin, no delay; with an inner "
+        "stage the loop is sampled in any case",
     )
     command.set_defaults(call=call)
 
@@ -35,7 +38,7 @@ def add(kinds: Any) -> None:
 @singular_is_users
 def call(options: argparse.Namespace) -> int:
     """Report gamma of given gains; exit code 3 for an unstable loop, which has none."""
-    law, given = Law.load(options.law), read_gains(options.gains)
+    law, given = Law(chosen_law(options)), read_gains(options.gains)
     if given:
         law = law.with_gains(law.name, **given)
     try:
@@ -49,5 +52,5 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"law": law.name, **channels_as_json(channels)}, indent=2))
     else:
-        print_channels(law.name, channels)
+        print_channels(judged(law.file), channels)
     return 0

@@ -12,6 +12,8 @@ import numpy as np
 from rich.table import Table
 
 from gfm_design.margins.all_margins import UnstableLoop
+from gfm_hil.cli.common import OPTIONS
+from gfm_hil.cli.design.common import add_inner_option
 from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import numbers, terminal
@@ -37,6 +39,7 @@ def add(kinds: Any) -> None:
     ):
         command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
         command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
+        add_inner_option(command)
         command.add_argument(
             "--scenario", default="pref_step",
             help="scenario file or shipped name: plant, references, T_s; pref_step by default",
@@ -55,7 +58,8 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Print the table and draw the figure; exit code 3 where an unstable loop has no margins."""
-    scenario = load_scenario(options.scenario, law=options.law)
+    changed = {"law": options.law, "inner": options.inner}
+    scenario = load_scenario(options.scenario, OPTIONS, **changed)
     loop, label = scenario_loop(scenario)
     if options.out:
         _save(options.out, lambda: options.draw(loop, options))

@@ -11,7 +11,8 @@ from rich.progress import BarColumn
 
 from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
-from gfm_hil.cli.common import progress
+from gfm_hil.cli.common import OPTIONS, progress
+from gfm_hil.cli.design.common import add_inner_option
 from gfm_hil.cli.design.margin_report import as_json, no_margins, print_margins
 from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import RecordedRun
@@ -27,6 +28,7 @@ def add(kinds: Any) -> None:
         "margins", help="gain, phase, delay and disk margins, parameter ranges, stable grids"
     )
     command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
+    add_inner_option(command)
     where = command.add_mutually_exclusive_group(required=True)
     where.add_argument("--scenario", help="scenario file, or the name of a shipped one")
     where.add_argument("--run", type=Path, metavar="DIR", help="run folder: its scenario and delay")
@@ -39,12 +41,12 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Report the margins; exit code 3 for an unstable loop, which has none."""
-    run = None
+    run, changed = None, {"law": options.law, "inner": options.inner}
     if options.run is not None:
         run = RecordedRun.load(options.run)
-        scenario = load_scenario(str(options.run / "scenario.toml"), law=options.law)
+        scenario = load_scenario(str(options.run / "scenario.toml"), OPTIONS, **changed)
     else:
-        scenario = load_scenario(options.scenario, law=options.law)
+        scenario = load_scenario(options.scenario, OPTIONS, **changed)
     loop, label = scenario_loop(scenario)
     console = terminal(highlight=False)
     try:

@@ -14,6 +14,8 @@ from gfm_hil.cli.common import EXIT_OTHERWISE, progress
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
+    chosen_law,
+    judged,
     print_channels,
     read_gains,
     singular_is_users,
@@ -49,7 +51,9 @@ def call(options: argparse.Namespace) -> int:
     """Tune a law's free gains; exit code 3 if no stabilising ones are found."""
     if options.out and not Path(options.out).parent.is_dir():
         raise UserError(f"--out {options.out}: {Path(options.out).parent} is no folder")
-    law = Law.load(options.law)
+    law = Law(chosen_law(options))
+    if options.full_order and law.file.inner is not None:
+        raise UserError("--full-order: the bound is that of a law on the bridge; use --inner none")
     try:
         found = _searched(law, options)
     except NotTuned as none:
@@ -74,7 +78,7 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
-    print_channels(law.name, channels)
+    print_channels(judged(law.file), channels)
     lines = [
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"

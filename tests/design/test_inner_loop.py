@@ -1,0 +1,288 @@
+"""The loop with an inner stage: against the compiled kernel, and against the nonlinear bench."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_design.margins.all_margins import loop_margins
+from gfm_design.model.box import Point
+from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
+from gfm_design.model.inner import LinearStage, linearise_stage
+from gfm_design.model.linear import linearise_plant
+from gfm_design.tuning.gains import free_gains, tied
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.robust import Loops
+from gfm_hil.engine.inproc import run_ticks, stack
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.recording.columns import signals_of
+from gfm_hil.scenario.model import check_scenario
+from gfm_plant import NoEquilibrium, Plant, make_plant
+from gfm_plant.model import DELTA, f
+from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
+from gfm_runtime.assembly import Controller
+from gfm_runtime.inner import Inner
+from gfm_runtime.inner_file import named_inner
+from gfm_runtime.signals import NU_INNER, NY_INNER
+
+T_S = 1e-4
+PLANT: dict[str, Any] = {
+    "grid": {"scr": 3.0, "x_over_r": 6.0},
+    "delay": {"samples": 1, "fraction": 0.3},
+    "modulation": "space-vector",
+}
+SHIPPED = ("virtual-stator", "cascaded", "threshold-impedance")
+#: every block of the stage once with and once without its states
+STAGES = {
+    **{name: load_law("vsg-2", name).laws[0].inner for name in SHIPPED},
+    "stator with integral and PLL": Inner(k_ci=20.0, f_pll=15.0),
+    "voltage loop without integral": Inner("cascaded", k_vi=0.0, k_ci=10.0, f_pll=30.0),
+}
+
+
+def loop_of(stage: Inner | None, law: str = "vsg-2", **plant: Any) -> ClosedLoop:
+    options = Plant.model_validate({**PLANT, **plant})
+    return ClosedLoop.of(replace(get_law(law), inner=stage), options)
+
+
+class Kernel:
+    """One compiled tick of law and stage as a function of all it depends on, at rest."""
+
+    def __init__(self, loop: ClosedLoop) -> None:
+        of, self.loop = loop.made_of, loop
+        law = of.law.law
+        self.controller = Controller(
+            [LawSet("it", (law,))], T_S, of.ref, omega_b=float(of.par[0]["omega_b"])
+        )
+        self.y = np.concatenate([of.op.y, of.op.x[:6]])
+        self.controller.start(of.op.x_law, of.op.u, self.y, of.op.e)
+        self.ctl, self.states = self.controller.ctl.copy(), self.controller.states.copy()
+        self.n = of.law.order
+
+    def places(self) -> list[tuple[str, int]]:
+        """Where the states of ``LinearStage.states`` are kept; an angle has no place of its own."""
+        short = {"v_f": "v_f", "i*": "i_ref", "x_v": "x_v", "x_c": "x_c"}
+        assert self.loop.stage is not None
+        names = [name.split()[0] for name in self.loop.stage.states]
+        both = [name for name in names if name in short]
+        return [(short[name], k % 2) for k, name in enumerate(both)]
+
+    def __call__(self, x: np.ndarray, y: np.ndarray, ref: np.ndarray) -> np.ndarray:
+        """(next states, out) of deviations of the states, of y (11,) and of the references (5,)."""
+        c, n, places = self.controller, self.n, self.places()
+        c.ctl[:], c.states[:] = self.ctl, self.states
+        state, pll = c.states[0], len(x) - n > len(places)
+        state["x"][:n] += x[:n]
+        for (name, axis), value in zip(places, x[n:], strict=False):
+            state[name][axis] += value
+        if pll:
+            turned = complex(*state["pll"]) * np.exp(1j * x[-2])
+            state["pll"][:] = turned.real, turned.imag
+            state["omega_pll"] += x[-1]
+        c.states[0] = state
+        c.ctl["ref"] = c.ctl["ref_target"] = self.loop.made_of.ref + ref
+        u = np.zeros(NU_INNER)
+        c.step(self.y + y, u)
+        state = c.states[0]
+        after = [*state["x"][:n], *(state[name][axis] for name, axis in places)]
+        if pll:
+            after += [np.angle(complex(*state["pll"])), state["omega_pll"]]
+        return np.array([*after, *u])
+
+
+@pytest.mark.parametrize("law", ["vsg-2", "dvoc", "vsg-5"])
+@pytest.mark.parametrize("stage", STAGES)
+def test_law_and_stage_are_the_compiled_kernels_slopes(stage: str, law: str) -> None:
+    # differences of 1e-6 p.u. have an error of 1e-12 by curvature and of 1e-10 by rounding
+    loop = loop_of(STAGES[stage], law)
+    c, kernel, h = loop.controller, Kernel(loop), 1e-6
+    m = len(c.A)
+    A, B, B_r = (np.vstack(pair) for pair in ((c.A, c.C), (c.B, c.D), (c.B_r, c.D_r)))
+    zero = np.zeros(m), np.zeros(NY_INNER), np.zeros(5)
+    for which, wanted in enumerate((A, B, B_r)):
+        for k in range(wanted.shape[1]):
+            up, down = [z.copy() for z in zero], [z.copy() for z in zero]
+            up[which][k], down[which][k] = h, -h
+            found = (kernel(*up) - kernel(*down)) / (2 * h)
+            np.testing.assert_allclose(found, wanted[:, k], atol=1e-6, err_msg=f"{which}, {k}")
+
+
+def test_the_plant_under_a_turned_voltage_is_the_plant_in_a_turned_frame() -> None:
+    # central differences of f itself, with the voltage on f's own d axis
+    par = make_plant(Plant.model_validate(PLANT), T_S).par
+    op, h = loop_of(STAGES["cascaded"]).made_of.op, 1e-6
+    plant = linearise_plant(par, op, inner=True)
+    turn = np.conj(op.e) / abs(op.e)
+
+    def rates(x: np.ndarray, e: complex) -> np.ndarray:
+        there, by = x.copy(), np.conj(e) / abs(e)
+        for k in (0, 2, 4):
+            w = complex(x[k], x[k + 1]) * by
+            there[k : k + 2] = w.real, w.imag
+        there[DELTA] -= np.angle(by)
+        out = f(there, np.array([op.u[0], op.u[1], abs(e)]), np.ones(2), par)
+        for k in (0, 2, 4):
+            w = complex(out[k], out[k + 1]) / by
+            out[k : k + 2] = w.real, w.imag
+        return out
+
+    assert abs(turn - 1.0) > 1e-3
+    for j in range(8):
+        e = np.eye(8)[j] * h
+        slope = (rates(op.x + e, op.e) - rates(op.x - e, op.e)) / (2 * h)
+        np.testing.assert_allclose(plant.A[:, j], slope, atol=1e-4)
+    for j, step in ((2, h), (3, 1j * h)):
+        slope = (rates(op.x, op.e + step) - rates(op.x, op.e - step)) / (2 * h)
+        np.testing.assert_allclose(plant.B[:, j], slope, atol=1e-4)
+
+
+def bench_of(stage: str, law: str, ticks: int, plant: dict[str, Any], place: Any) -> Bench:
+    path = place / "stage.toml"
+    path.write_text(stage)
+    content = {"title": "", "duration": ticks * T_S, "law": law, "plant": plant}
+    return make_bench(check_scenario({**content, "inner": str(path)}, "test"))
+
+
+def recorded(bench: Bench, ticks: int) -> dict[str, np.ndarray]:
+    """The plant's columns by name, of a run from the bench's start."""
+    names, others = (signals_of(role, True) for role in ("plant", "controller"))
+    rows, other = np.full((1, ticks, len(names)), np.nan), np.empty((1, ticks, len(others)))
+    assert run_ticks(bench.plant.records, stack([bench]), rows, other, 0, ticks) == ticks
+    return dict(zip(names, rows[0].T, strict=True))
+
+
+PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
+
+
+@pytest.mark.parametrize(
+    ("stage", "law", "plant"),
+    [
+        *(('type = "' + name + '"', "vsg-2", {}) for name in SHIPPED),
+        ('type = "virtual-stator"', "mimo-gfm-practical", {"sensors": {"bandwidth_hz": 300.0}}),
+        ('type = "virtual-stator"', "droop-3", {"delay": {"samples": 0}}),
+        (PLL, "vsg-2", {}),
+        (
+            PLL,
+            "vsg-5",
+            {"delay": {"fraction": 0.7}, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}},
+        ),
+        (PLL, "vsg-5", {"dc_source": {"mode": "regulated"}, "delay": {"samples": 0}}),
+    ],
+)
+def test_a_step_is_that_of_the_nonlinear_bench(
+    stage: str, law: str, plant: dict[str, Any], tmp_path: Any
+) -> None:
+    # 1e-4 p.u. of P_ref: nonlinear terms are of the order of 1e-8
+    size, ticks = 1e-4, 1500
+    bench = bench_of(stage, law, ticks, {**PLANT, **plant}, tmp_path)
+    c = bench.controller
+    loop = ClosedLoop.of(c.active_law, bench.scenario.plant, REFERENCES)
+    c.set("P_ref", REFERENCES[1] + size)
+    rows = recorded(bench, ticks)
+    _, y = loop.step_response("P_ref", seconds=ticks * T_S)
+    for name, column, rest in (("true_p", 1, loop.made_of.op.y[1]), ("true_V", 4, None)):
+        found = rows[name]
+        moved = (found - (found[0] if rest is None else rest)) / size
+        assert np.abs(moved - y[:ticks, column]).max() < 2e-3 * np.abs(y[:, column]).max(), name
+
+
+def test_the_bench_rests_where_a_pll_measures_another_frequency(tmp_path: Any) -> None:
+    plant = {**PLANT, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}
+    bench = bench_of(PLL, "vsg-5", 300, plant, tmp_path)
+    assert np.ptp(recorded(bench, 300)["true_p"]) < 1e-11
+
+
+def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues() -> None:
+    loop = loop_of(STAGES["virtual-stator"])
+    found = loop_margins(loop)
+    assert [c.name for c in found.u] == ["i_u", "omega_u", "E_u", "E_q"]
+    assert [c.name for c in found.y] == ["v_dc", "p", "q", "V", "i_d", "i_q", "v_d", "v_q"]
+    assert all(c.confirmed for c in (*found.u, *found.y))
+    late = [loop.later(share * found.delay.seconds).sigma() for share in (0.99, 1.01)]
+    assert late[0] < 0.0 < late[1]
+
+
+@pytest.mark.parametrize("stage", ["virtual-stator", "cascaded"])
+def test_output_impedance_and_line_make_the_loop(stage: str) -> None:
+    # A step of V_g through the line onto the impedance, against the loop's own response, which
+    # holds V_g over a tick; at these frequencies the images of sampling are below 1e-3.
+    loop, omega = loop_of(STAGES[stage]), np.geomspace(0.5, 600.0, 25)
+    r, x = loop.made_of.par[0], loop.made_of.op.x
+    i, v, s = x[4:6], x[2:4], (1j * omega)[:, None, None]
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    line = (r["R_g"] + s * r["L_g"] / r["omega_b"]) * np.eye(2) + r["L_g"] * turn
+    Z, v_g = loop.output_impedance(omega), np.array([np.cos(x[DELTA]), -np.sin(x[DELTA])])
+    by_i = -np.linalg.solve(Z + line, np.broadcast_to(v_g[:, None], (len(omega), 2, 1)))
+    p = ((-Z @ by_i)[..., 0] @ i + by_i[..., 0] @ v) * (1.0 - np.exp(-s * T_S))[:, 0, 0]
+    found = loop.frequency_response(omega)[:, 1, INPUTS.index("grid.V_g")]
+    np.testing.assert_allclose(found, p / (1j * omega * T_S), atol=2e-3 * np.abs(found).max())
+
+
+def test_many_loops_with_stages_are_each_of_them() -> None:
+    loops = [loop_of(STAGES["cascaded"], grid={"scr": s, "x_over_r": 6.0}) for s in (2.0, 8.0)]
+    many = ClosedLoop.stacked(loops)
+    np.testing.assert_array_equal(many.A, [of.A for of in loops])
+    law = loops[0].law
+    changed = replace(law, B=1.1 * law.B)
+    again = [of.with_law(changed).A for of in loops]
+    np.testing.assert_array_equal(many.with_law(changed).A, again)
+    two = replace(law, **{n: np.stack([getattr(law, n)] * 2) for n in
+                          ("A", "B", "C", "D", "B_r", "D_r")})  # fmt: skip
+    np.testing.assert_array_equal(loops[0].with_law(two).A, [loops[0].A] * 2)
+    assert isinstance(many.stage, LinearStage)
+
+
+@pytest.mark.parametrize(
+    ("stage", "references", "said"),
+    [
+        (Inner(I_max=0.4), {}, "inner.I_max: 0.4 p.u.: this operating point needs"),
+        (Inner(P_max=0.3), {}, "the power limiter acts: p is 0.5 p.u., not in"),
+        (Inner("threshold-impedance", I_thr=0.3), {}, "the threshold impedance acts"),
+        (Inner(m=0.9), {}, "the limit of modulation acts"),
+    ],
+)
+def test_a_limit_that_acts_is_named(stage: Inner, references: Any, said: str) -> None:
+    with pytest.raises(NoEquilibrium, match=said):
+        loop_of(stage)
+
+
+def test_a_continuous_loop_has_no_stage() -> None:
+    law = replace(get_law("vsg-2"), inner=Inner())
+    with pytest.raises(LawError, match="inner: runs from tick to tick"):
+        ClosedLoop.of(law, ideal=True)
+    op = loop_of(None).made_of.op
+    bare, stage = ClosedLoop.of("vsg-2", ideal=True), linearise_stage(Inner(), T_S, 314.0, op)
+    with pytest.raises(ValueError, match="a continuous loop has none"):
+        ClosedLoop(bare.plant, bare.law, stage=stage)
+
+
+def test_an_operating_point_at_the_power_limit_is_below_it() -> None:
+    # the shipped stages limit p to 1 p.u., which is rated power
+    point = Point(P_ref=1.0, delay=1.3)
+    law = discretise(replace(get_law("mimo-gfm-practical"), inner=Inner(P_max=1.0)), T_S)
+    free = discretise(replace(get_law("mimo-gfm-practical"), inner=Inner()), T_S)
+    np.testing.assert_array_equal(point.loop(law).A, point.loop(free).A)
+
+
+def test_a_search_in_the_box_sees_the_stage_at_every_point() -> None:
+    file = law_file("mimo-gfm-practical")
+    file = file.model_copy(update={"inner": named_inner("cascaded")})
+    gains = free_gains(file)
+    points = [Point(L_g=8.0), Point(P_ref=0.1, delay=1.3), Point(dc="regulated")]
+    values = np.array([g.start for g in gains]) * 1.02
+    named = {g.name: float(v) for g, v in zip(gains, values, strict=True)}
+    changed = build_law(file, tied(file, named))
+    each = [p.loop(discretise(changed, T_S)).sigma() for p in points]
+    np.testing.assert_allclose(Loops(file, gains, points).sigma(values), each, rtol=1e-6)
+
+
+def test_the_searchs_loop_has_the_norms_of_the_sampled_one() -> None:
+    """Its inverse Tustin transform on a grid, against the sampled loop's guaranteed norms."""
+    file = law_file("vsg-2").model_copy(update={"inner": named_inner("virtual-stator")})
+    problem = PaperProblem(file, free_gains(file))
+    start = np.array([g.start for g in problem.gains])
+    gamma = max(c.norm for c in problem.channels(start))
+    assert problem(start) == pytest.approx(gamma, rel=1e-3)
