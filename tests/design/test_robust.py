@@ -113,6 +113,7 @@ def test_random_points_decay() -> None:
     assert sigma(RIG.random(100, seed=12)).max() < 0.0
 
 
+@pytest.mark.full
 def test_the_rigs_law_holds_beside_its_source() -> None:
     box = replace(RIG, R_f=THIRD, R_g=THIRD)
     assert sigma(box.corners(), RIG_LAW).max() <= -1.0

@@ -76,7 +76,13 @@ def exported(folder: Path, place: Path) -> tuple[list[can.Message], cantools.dat
         (19500, {}, {"y": 1, "u": 1}, CONTENT),
         (19510, {"every": 3}, {"y": 1, "u": 1}, CONTENT),
         (19520, {"fd": False, "bitrate": 1_000_000, "every": 10}, {"y": 2, "u": 1}, CONTENT),
-        (19550, {"every": 2}, {"y": 1, "u": 1}, {**CONTENT, "law": "vsg-2", "inner": "cascaded"}),
+        pytest.param(
+            19550,
+            {"every": 2},
+            {"y": 1, "u": 1},
+            {**CONTENT, "law": "vsg-2", "inner": "cascaded"},
+            marks=pytest.mark.full,
+        ),
     ],
     ids=["FD", "FD every third tick", "classic", "inner stage"],
 )

@@ -253,7 +253,7 @@ def test_the_folder_of_a_run_holds_what_the_design_says(make, tmp_path):
     run_scenario(scenario, tmp_path / "run")
     assert {path.name for path in (tmp_path / "run").iterdir()} == {
         "scenario.toml", "signals.npz", "timing.npz", "events.jsonl", "summary.json",
-        "report.html", "signals.png",
+        "report.html", "signals.png", "waveforms.png", "network.svg",
     }  # fmt: skip
     with np.load(tmp_path / "run" / "signals.npz") as file:
         assert list(file["laws"]) == ["mimo-gfm"]

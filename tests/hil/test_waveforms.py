@@ -212,6 +212,7 @@ def test_a_blocked_bridge_carries_no_current(run: Callable[..., Run]) -> None:
         assert not one.three_phase()[f"i_{k}"][after].any()
 
 
+@pytest.mark.full
 def test_converters_of_a_network_see_one_node(tmp_path: Path) -> None:
     """Of different ratings, in volts and amperes: behind their lines is the same voltage, and the
     load takes what both bring."""
