@@ -1,7 +1,7 @@
 """Settings for the whole suite, and its tiers.
 
 ``python -m pytest`` runs the fast tier: what needs no process of its own, in parallel. The other
-tiers are marked; the last two run one test at a time, unless told how many (``-n``):
+tiers are marked; the last two run one test at a time, as they measure out processors and ports:
 
 * ``full``: every law where the fast tier takes one of each structure, long computations, and
   compilers from apt,

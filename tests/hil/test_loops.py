@@ -314,7 +314,7 @@ def test_silence_of_the_other_role_ends_either(role, mode, place, make):
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_the_stop_flag_ends_both(mode, link, place, make):
     begin = time.monotonic()
-    content = {"mode": mode, "law": "vsg-2", "duration": 60.0, "link": LIVE}
+    content = {"mode": mode, "law": "vsg-2", "duration": 200.0, "link": LIVE}
     scenario = make(**content, late_policy={"hold": 10**6})
     pair = run_pair(scenario, place, link, stopped=lambda: time.monotonic() - begin > 1.0)
     ends = pair.ends()

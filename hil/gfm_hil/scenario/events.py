@@ -9,12 +9,14 @@ from __future__ import annotations
 import cmath
 import math
 from pathlib import PurePath
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gfm_plant import Network
 from gfm_runtime.signals import SIGNALS
+
+if TYPE_CHECKING:  # an operator's command loads no compiler
+    from gfm_plant import Network
 
 _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
 

@@ -13,12 +13,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gfm_hil.core.errors import UserError
-from gfm_plant import Network
 from gfm_runtime.errors import printable
 from gfm_runtime.signals import SIGNALS
+
+if TYPE_CHECKING:
+    from gfm_plant import Network
 
 _COLUMNS = ("t", "f_hz", "omega_g", "V_g")
 _RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
