@@ -1,4 +1,5 @@
-"""The public API: run scenarios, compare laws, change gains, load runs, from Python::
+"""The public API: run scenarios, compare laws, change gains, load runs, run conformity tests, from
+Python::
 
     import gfmhil
 
@@ -28,6 +29,8 @@ _HOMES = {
     "run_network": "gfm_hil.studies.notebook",
     "campaign": "gfm_hil.studies.notebook",
     "compare": "gfm_hil.studies.notebook",
+    "conform": "gfm_hil.studies.notebook",
+    "Conformity": "gfm_hil.studies.conformity.result",
     "Comparison": "gfm_hil.studies.notebook",
     "LawError": "gfm_runtime.errors",
 }

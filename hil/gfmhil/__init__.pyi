@@ -4,12 +4,14 @@ from gfm_hil.results.run import load_run as load_run
 from gfm_hil.scenario.model import Scenario as Scenario
 from gfm_hil.scenario.model import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
+from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.studies.law import Law as Law
 from gfm_hil.studies.law import laws as laws
 from gfm_hil.studies.loop import Loop as Loop
 from gfm_hil.studies.notebook import Comparison as Comparison
 from gfm_hil.studies.notebook import campaign as campaign
 from gfm_hil.studies.notebook import compare as compare
+from gfm_hil.studies.notebook import conform as conform
 from gfm_hil.studies.notebook import run as run
 from gfm_runtime.errors import LawError as LawError
 from gfmhil import design as design

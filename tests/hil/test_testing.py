@@ -14,7 +14,7 @@ import pytest
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.testing import Experiment
-from gfm_hil.testing.checks import Window, damped, envelope, overshoot, read_envelope, settles
+from gfm_hil.results.checks import Window, damped, envelope, overshoot, read_envelope, settles
 
 pytestmark = pytest.mark.processes
 

@@ -1,7 +1,8 @@
 """Argument parsing and exit codes.
 
-0: done, and a run ended as its scenario expects; 2: wrong input, nothing started; 3: a run ended
-otherwise, or its folder could not be completed; 130: interrupted.
+0: done, and a run ended as its scenario expects; 1: a conformity test fails or cannot be judged;
+2: wrong input, nothing started; 3: a run ended otherwise, or its folder could not be completed;
+130: interrupted.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ COMMANDS = {
     "stream": ("stream", "stream what a run records to PlotJuggler, your own tools or Prometheus"),
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
+    "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
     "firmware": ("firmware", "export laws as C99, and check them on a processor, bit by bit"),

@@ -14,7 +14,8 @@ from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.summary import END_METRICS
 from gfm_hil.scenario.model import Scenario
 
-_STYLE = """
+#: of every page that this program writes
+STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}
 h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
 table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
@@ -148,7 +149,7 @@ def write_report(
         states = ", ".join(f"{role} {state}" for role, state in summary["e2e"].items())
         facts.append(("end-to-end protection", states))
     rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
-    images = "".join(f'<img alt="{p.stem}" src="{_inline(p)}">' for p in pictures)
+    images = "".join(f'<img alt="{p.stem}" src="{inline(p)}">' for p in pictures)
     unmet = "".join(
         f'<p class="unmet">not as expected: {html.escape(part)}</p>' for part in summary["unmet"]
     )
@@ -158,7 +159,7 @@ def write_report(
         path,
         f"""<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{html.escape(scenario.title)}</title><style>{_STYLE}</style>
+<title>{html.escape(scenario.title)}</title><style>{STYLE}</style>
 <h1>{html.escape(scenario.title)}</h1>
 <p><span class="status {look}">{status}</span>{expected} {html.escape(summary["reason"])}</p>
 {unmet}
@@ -172,6 +173,7 @@ def write_report(
     return path
 
 
-def _inline(picture: Path) -> str:
+def inline(picture: Path) -> str:
+    """A picture as the address of an image in a page that needs no other file."""
     kind = {".png": "png", ".svg": "svg+xml"}[picture.suffix]
     return f"data:image/{kind};base64,{base64.b64encode(picture.read_bytes()).decode()}"

@@ -24,7 +24,12 @@ from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
 from gfm_hil.studies.campaign.result import CampaignResult, write_result
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.worker import compile_once
+from gfm_hil.studies.conformity import execute as conformity
+from gfm_hil.studies.conformity.result import Conformity
+from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test
 from gfm_hil.studies.law import Law
+from gfm_runtime import law_file
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.toml_file import read_toml
 
 if TYPE_CHECKING:
@@ -202,3 +207,50 @@ def campaign(
     if place is not None:
         write_result(found, place, axes, workers, time.monotonic() - began)
     return found
+
+
+def conform(
+    law: str | Path | Law | Sequence[str | Path | Law],
+    against: str | Path | Sequence[str | Path] = ALL,
+    folder: str | Path | None = None,
+    *,
+    inner: str | None = None,
+    converter: str | Path | None = None,
+    workers: int = 1,
+) -> Conformity:
+    """Run the published tests of grid-forming converters, and judge them clause by clause.
+
+    Args:
+        law: name, law file or ``Law``, or several of them.
+        against: shipped sets, ``all`` of them, or paths of your own.
+        folder: where to write the report with figures, results.json and junit.xml; None writes
+            nothing.
+        inner: inner stage of every law; each law's own if None.
+        converter: file of the converter under test; the shipped one if None.
+        workers: as for ``campaign``.
+
+    Raises:
+        UserError: one line a mistake; the folder is in use.
+        LawError: a law or the inner stage is none.
+    """
+    if not 1 <= workers <= 1024:
+        raise UserError(f"workers = {workers}: must lie in [1, 1024]")
+    given = [law] if isinstance(law, str | Path | Law) else list(law)
+    sets = [against] if isinstance(against, str | Path) else list(against)
+    place = None if folder is None else Path(folder)
+    if place is not None and place.exists() and any(place.iterdir()):
+        raise UserError(f"{place}: is not empty; choose another folder")
+    cases, under = load_cases([str(one) for one in sets]), load_under_test(converter)
+    if inner is not None:
+        named_inner(inner)
+    found: list[conformity.Found] = []
+    with _law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
+        for file in files.values():
+            law_file(file)
+        converters = Path(temporary) if place is None else place / "converters"
+        jobs = conformity.make_jobs(files, cases, inner, under, converters, place, True)
+        conformity.execute(jobs, workers, found.append)
+    made = Conformity(list(files), inner, under, cases, found, place)
+    if place is not None:
+        made.write(place)
+    return made

@@ -8,7 +8,7 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.testing import checks
+from gfm_hil.results import checks
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps
 

@@ -1,4 +1,5 @@
-"""The checks of one signal behind the assertions: each returns None, or what is wrong and where."""
+"""The checks of one signal behind the assertions of tests and the clauses of the conformity tests:
+each returns None, or what is wrong and where."""
 
 from __future__ import annotations
 
@@ -59,23 +60,33 @@ class Finding:
     high: Vector
 
 
+def settled_after(w: Window, to: float, tolerance: float) -> float | None:
+    """When the signal has come within ``to`` ± ``tolerance`` to stay, s after the step; None if it
+    has not at the end of the window."""
+    outside = np.flatnonzero(_away(w, to) > tolerance)
+    if not len(outside):
+        return 0.0
+    last = int(outside[-1])
+    return None if last >= len(w.t) - 1 else float(w.t[last + 1] - w.since)
+
+
+def _away(w: Window, to: float) -> Vector:
+    return np.nan_to_num(np.abs(w.x - to), nan=np.inf)
+
+
 def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | None:
     """The signal is within ``to`` ± ``tolerance`` from ``within`` s after the step to the end."""
     begin = w.since + within
     late = w.t >= begin - 1e-9
     if not late.any():
         raise UserError(f"within = {within:g}: the run ends {w.t[-1] - w.since:g} s after the step")
-    away = np.nan_to_num(np.abs(w.x - to), nan=np.inf)
-    outside = np.flatnonzero(away > tolerance)
-    if not len(outside) or not late[outside[-1]]:
+    away = _away(w, to)
+    if not (away[late] > tolerance).any():
         return None
-    last = int(outside[-1])
-    never = last >= len(w.t) - 1
+    took = settled_after(w, to, tolerance)
     worst = int(np.flatnonzero(late)[np.argmax(away[late])])
     ending = w.x[-max(1, round(_TAIL * len(w.x))) :]
-    how = (
-        "it had not at the end of the run" if never else f"it took {w.t[last + 1] - w.since:.4g} s"
-    )
+    how = "it had not at the end of the run" if took is None else f"it took {took:.4g} s"
     text = (
         f"{w.name} should settle at {w.show(to)} ± {tolerance:g} within {within:g} s, but {how}: "
         f"after these {within:g} s it was as far off as {w.show(w.x[worst])} "
@@ -109,11 +120,25 @@ def overshoot(w: Window, percent: float, to: float | None) -> Finding | None:
     return Finding(text, float(w.t[worst]), w.t, low, high)
 
 
-def envelope(w: Window, low: Vector, high: Vector) -> Finding | None:
-    """The signal stays between ``low`` and ``high``, each of shape (n,); NaN: no limit there."""
+def longest_beyond(w: Window, low: Vector, high: Vector) -> float:
+    """The longest time in one piece that the signal is not between ``low`` and ``high``, s."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], _beyond(w, low, high) > 0, [0]])))
+    lengths = edges[1::2] - edges[::2]
+    step = float(w.t[1] - w.t[0]) if len(w.t) > 1 else 0.0
+    return float(np.max(lengths, initial=0)) * step
+
+
+def _beyond(w: Window, low: Vector, high: Vector) -> Vector:
     beyond = np.fmax(np.fmax(low - w.x, w.x - high), 0.0)
     beyond[np.isnan(w.x)] = np.inf
-    if not beyond.any():
+    return beyond
+
+
+def envelope(w: Window, low: Vector, high: Vector, longest: float = 0.0) -> Finding | None:
+    """The signal stays between ``low`` and ``high``, each of shape (n,), but for at most
+    ``longest`` s in one piece; NaN: no limit there."""
+    beyond = _beyond(w, low, high)
+    if not beyond.any() or (longest > 0 and longest_beyond(w, low, high) <= longest + 1e-9):
         return None
     first, worst = int(np.flatnonzero(beyond)[0]), int(np.argmax(beyond))
     side, limit = ("below", low) if w.x[worst] < low[worst] else ("above", high)

@@ -1,0 +1,155 @@
+"""gfmhil conform: published tests of grid-forming converters, judged clause by clause."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.markup import escape
+from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
+from rich.table import Table
+
+from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder, progress
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.studies.campaign.execute import WorkerLost
+from gfm_hil.studies.conformity.execute import Found, execute, make_jobs
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS
+from gfm_hil.studies.conformity.result import Conformity
+from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, load_under_test, shipped_sets
+from gfm_runtime import law_file, law_names
+from gfm_runtime.inner_file import named_inner
+
+EXIT_FAILED = 1
+_COLOURS = {PASS: "green", FAIL: "red", CANNOT: "yellow"}
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Exit code 0: every clause passes; 1: one fails or cannot be judged; 2: wrong input."
+    )
+    command.add_argument(
+        "--law", action="append", metavar="LAW",
+        help="catalogue name or law file; may be repeated; all: the whole catalogue",
+    )  # fmt: skip
+    command.add_argument(
+        "--inner", metavar="NAME",
+        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
+    )  # fmt: skip
+    command.add_argument(
+        "--against", action="append", metavar="SET",
+        help=f"{', '.join(shipped_sets())}, or a path of your own; may be repeated; all: the "
+        "shipped ones (default)",
+    )  # fmt: skip
+    command.add_argument(
+        "--converter", metavar="FILE", help="the converter under test; the shipped one by default"
+    )
+    command.add_argument(
+        "-o", "--out", metavar="DIR", help="folder; runs/conform-<time> by default"
+    )
+    command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
+    command.add_argument("--no-figures", action="store_true", help="no figure of each run")
+    command.add_argument("--list", action="store_true", help="list the tests, and run nothing")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carry the command out; returns the exit code."""
+    cases = load_cases(options.against or [ALL])
+    if options.list:
+        terminal().print(_list(cases))
+        return 0
+    if not options.law:
+        raise UserError("--law: missing; name a law, or all")
+    if options.workers is not None and not 1 <= options.workers <= 1024:
+        raise UserError(f"--workers {options.workers}: must lie in [1, 1024]")
+    laws = list(dict.fromkeys(n for law in options.law for n in _names(law)))
+    for name in laws:
+        law_file(name)
+    if options.inner is not None:
+        named_inner(options.inner)
+    under = load_under_test(options.converter)
+    folder = new_folder(options.out, "conform")
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder}: is not empty; choose another --out")
+    files = {name: str(Path(name).absolute()) if name.endswith(".toml") else name for name in laws}
+    jobs = make_jobs(
+        files, cases, options.inner, under, folder / "converters", folder, not options.no_figures
+    )
+    found: list[Found] = []
+    lost = None
+    workers = options.workers or len(os.sched_getaffinity(0))
+    columns = BarColumn(), TaskProgressColumn(), "{task.fields[at]}", TimeRemainingColumn()
+    began = time.monotonic()
+    with Interrupt() as interrupt, progress("{task.description}", *columns,
+                                            quiet=options.quiet) as bar:  # fmt: skip
+        task = bar.add_task("conform", total=len(jobs), at="starting …")
+
+        def keep(one: Found) -> None:
+            found.append(one)
+            bad = sum(f.verdict != PASS for f in found)
+            at = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
+            bar.update(task, advance=1, at=escape(at))
+
+        try:
+            execute(jobs, workers, keep, lambda: interrupt.came, above(bar))
+        except WorkerLost as problem:
+            lost = problem
+    if len(found) < len(jobs):
+        why = str(lost) if lost else "interrupted"
+        done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
+        print(f"gfmhil: {why}; {done}", file=sys.stderr)
+        return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
+    result = Conformity(laws, options.inner, under, cases, found, folder)
+    result.write(folder)
+    _print(result, time.monotonic() - began)
+    return 0 if result.passed else EXIT_FAILED
+
+
+def _names(law: str) -> Sequence[str]:
+    return law_names() if law == ALL else [law]
+
+
+def _list(cases: Sequence[Case]) -> Table:
+    table = Table("test", "runs", "title", "source", box=None, pad_edge=False)
+    for case in cases:
+        runs = str(len(case.test.runs()))
+        table.add_row(case.id, runs, case.test.title, case.test.source.words())
+    return table
+
+
+def _print(result: Conformity, wall_s: float) -> None:
+    """The short table that ends the command."""
+    console = terminal()
+    if len(result.laws) == 1:
+        table = Table("test", "", "why", box=None, pad_edge=False)
+        for case in result.cases:
+            parts = result.of(result.laws[0], case.id)
+            verdict = result.matrix[result.laws[0], case.id]
+            wrong = [f for f in parts if f.verdict == verdict and f.words]
+            why = f"{wrong[0].part}: {wrong[0].words}" if wrong and wrong[0].part else ""
+            why = why or (wrong[0].words if wrong else "")
+            table.add_row(case.id, f"[{_COLOURS[verdict]}]{verdict}[/]", escape(why))
+        console.print(table)
+    else:
+        for table in fitting(console, result.laws, lambda laws: _matrix(result, laws)):
+            console.print(table)
+    verdicts = list(result.matrix.values())
+    told = ", ".join(f"{verdicts.count(v)} {v}" for v in (PASS, FAIL, CANNOT) if v in verdicts)
+    runs = f"{len(result.found)} runs in {wall_s:.1f} s"
+    console.print(f"{told}; {runs}", highlight=False)
+    report = Path(result.folder or ".") / "report.html"
+    console.print(escape(f"report: {report}"), highlight=False, soft_wrap=True)
+
+
+def _matrix(result: Conformity, laws: Sequence[str]) -> Table:
+    table = Table("test", *map(escape, laws), box=None, pad_edge=False)
+    for case in result.cases:
+        cells = [result.matrix[law, case.id] for law in laws]
+        table.add_row(case.id, *[f"[{_COLOURS[v]}]{SIGNS[v]} {v}[/]" for v in cells])
+    return table

@@ -1,0 +1,218 @@
+"""The parts of all tests under all laws, on several processes: each is run, judged and drawn."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.compiling import compiled_bench, compiled_benches
+from gfm_hil.results.run import Run
+from gfm_hil.results.runner import run_in_memory, run_network_in_memory
+from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.studies.campaign.execute import WorkerLost, processes
+from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, worst
+from gfm_hil.studies.conformity.model import Part, UnderTest
+from gfm_hil.studies.conformity.sets import Case, scenario_of
+
+_POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class Job:
+    """A part of a test under a law.
+
+    Attributes:
+        law, file: its name, and what a scenario calls it.
+        case, part: what to run.
+        inner: stage of every law; the law's own if None.
+        under: the converter under test.
+        converters: folder for converter files, which lasts while jobs run.
+        folder: where the scenario and the figure go; None writes neither.
+        figures: whether to draw one.
+    """
+
+    law: str
+    file: str
+    case: Case
+    part: Part
+    inner: str | None
+    under: UnderTest
+    converters: Path
+    folder: Path | None
+    figures: bool
+
+    @property
+    def name(self) -> str:
+        """Set, test and part, e.g. ``miso/2-rocof/down``."""
+        return "/".join(x for x in (self.case.id, self.part.name) if x)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What became of a part of a test under a law.
+
+    Attributes:
+        law, test, part: names; the part of a test without parts is empty.
+        status, reason: how the run ended; ``none`` if it did not take place.
+        verdicts: one a clause and time.
+        scenario: folder of the scenario that repeats the run, or None.
+        figure: file, or None.
+    """
+
+    law: str
+    test: str
+    part: str
+    status: str
+    reason: str
+    verdicts: list[Verdict]
+    scenario: Path | None = None
+    figure: Path | None = None
+
+    @property
+    def verdict(self) -> Outcome:
+        """The worst of the clauses; a part that did not run cannot be judged."""
+        return worst([v.verdict for v in self.verdicts])
+
+    @property
+    def words(self) -> str:
+        """What is wrong first, in one sentence; empty if all passes."""
+        told = [v for v in self.verdicts if v.verdict == self.verdict]
+        if self.verdict == PASS:
+            return ""
+        return told[0].text if told else self.reason
+
+
+def slug(name: str) -> str:
+    """A name as that of a file."""
+    return re.sub(r"[^\w.+-]+", "-", name.removesuffix(".toml")).strip("-")
+
+
+def make_jobs(
+    laws: Mapping[str, str],
+    cases: Sequence[Case],
+    inner: str | None,
+    under: UnderTest,
+    converters: Path,
+    folder: Path | None,
+    figures: bool,
+) -> list[Job]:
+    """A job for each part of each test under each law; ``laws`` are files by name, and the rest as
+    for ``Job``."""
+    return [
+        Job(law, file, case, part, inner, under, converters, folder, figures)
+        for law, file in laws.items()
+        for case in cases
+        for part in case.test.runs()
+    ]
+
+
+def execute(
+    jobs: Sequence[Job],
+    workers: int,
+    keep: Callable[[Found], None],
+    stopped: Callable[[], bool] = lambda: False,
+    notice: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Run all jobs, or until ``stopped``.
+
+    Args:
+        jobs: what to run.
+        workers: processes; 1 runs all in this one.
+        keep: given every finished part.
+        stopped: asked after each part, or a few times a second.
+        notice: told what a person should know while waiting.
+
+    Raises:
+        WorkerLost: a worker died, or a run raised an error.
+    """
+    if workers == 1:
+        for job in jobs:
+            if stopped():
+                return
+            keep(run_part(job))
+        return
+    _compile_once(jobs, notice)
+    with ExitStack() as stack:
+        pool: Executor = stack.enter_context(processes(workers))
+        pending = {pool.submit(run_part, job): job for job in jobs}
+        try:
+            while pending and not stopped():
+                done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                for future in done:
+                    _finish(future, pending.pop(future), keep)
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _finish(future: Future[Found], job: Job, keep: Callable[[Found], None]) -> None:
+    problem = future.exception()
+    if problem is not None:
+        words = f"{job.law}, {job.name}: {type(problem).__name__}: {problem}"
+        raise WorkerLost(words) from problem
+    keep(future.result())
+
+
+def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
+    """Fill numba's cache here, so that workers need not all compile the same."""
+    seen: set[tuple[bool, int]] = set()
+    for job in jobs:
+        if job.part.cannot is not None:
+            continue
+        try:
+            scenario = _scenario(job)
+            kind = scenario.has_inner, len(scenario.converters)
+            if kind not in seen:
+                (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
+                seen.add(kind)
+        except UserError:  # which the verdict will say
+            continue
+
+
+def _scenario(job: Job) -> Scenario:
+    return scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
+
+
+def run_part(job: Job) -> Found:
+    """Run, judge and draw a part; what cannot be run cannot be judged."""
+    test, part = job.case.test, job.part
+    criteria = [*test.criteria, *part.criteria]
+    names = job.law, job.case.id, part.name
+    if part.cannot is not None:
+        reason = f"Cannot be judged: {part.cannot}"
+        return Found(*names, "none", reason, cannot(criteria, reason))
+    try:
+        scenario = _scenario(job)
+        run, others = _run(scenario, test.judged)
+    except UserError as problem:
+        text = str(problem).replace("\n", "; ").replace(job.file, job.law)
+        reason = f"Cannot be judged: there is no such run: {text}"
+        return Found(*names, "none", reason, cannot(criteria, reason))
+    verdicts = judge(run, criteria, job.under, others)
+    place = figure = None
+    if job.folder is not None:
+        place = job.folder / "runs" / slug(job.law) / slug(job.name)
+        place.mkdir(parents=True, exist_ok=True)
+        write_scenario(place, scenario)
+    if place is not None and job.figures and run.ticks:
+        from gfm_hil.studies.conformity.figure import draw_part  # takes half a second to import
+
+        figure = place / "figure.png"
+        draw_part(figure, f"{job.law} · {job.name} · {scenario.title}", run, verdicts)
+    reason = str(run.summary["reason"])
+    return Found(*names, run.status, reason, verdicts, place, figure)
+
+
+def _run(scenario: Scenario, judged: str | None) -> tuple[Run, Mapping[str, Run]]:
+    """The run that is judged, and those of the other converters."""
+    if scenario.network is None:
+        return run_in_memory(scenario), {}
+    runs = run_network_in_memory(scenario)
+    name = judged or scenario.converters[0]
+    return runs[name], {other: run for other, run in runs.items() if other != name}

@@ -1,0 +1,287 @@
+"""What the tests showed of one law or several, and the files that say so."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.results.report import STYLE, cell, finite, inline
+from gfm_hil.studies.conformity.execute import Found, slug
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Outcome, Verdict, worst
+from gfm_hil.studies.conformity.model import KNOWN, UnderTest
+from gfm_hil.studies.conformity.sets import Case
+
+_STYLE = """
+.pass{background:#00734f} .fail{background:#b34500} .cannot{background:#777}
+td .status{padding:0 .4rem;white-space:nowrap} .scroll.text td{text-align:left;white-space:normal}
+.scroll.text td.number{white-space:nowrap}
+.matrix td,.matrix th{padding:.1rem .35rem;text-align:center}
+.matrix th:first-child{text-align:left} .matrix a{color:inherit;text-decoration:none}
+.matrix th.tall{writing-mode:vertical-rl;transform:rotate(180deg);text-align:left}
+"""
+
+
+@dataclass(frozen=True, repr=False)
+class Conformity:
+    """What the tests showed.
+
+    Attributes:
+        laws: names, in order.
+        inner: stage of every law; None: each law's own.
+        under: the converter under test.
+        cases: the tests, in order.
+        found: one a law and part that ran, in any order.
+        folder: with the report; None without one.
+    """
+
+    laws: list[str]
+    inner: str | None
+    under: UnderTest
+    cases: list[Case]
+    found: list[Found]
+    folder: Path | None = None
+
+    @property
+    def passed(self) -> bool:
+        """Whether every clause of every test passes under every law."""
+        return bool(self.matrix) and all(v == PASS for v in self.matrix.values())
+
+    @cached_property
+    def matrix(self) -> dict[tuple[str, str], Outcome]:
+        """The verdict by law and test: the worst of its parts."""
+        return {
+            (law, case.id): worst([found.verdict for found in self.of(law, case.id)])
+            for law in self.laws
+            for case in self.cases
+        }
+
+    def of(self, law: str, test: str) -> list[Found]:
+        """The parts of a test under a law, in the order of its file."""
+        case = next(case for case in self.cases if case.id == test)
+        order = [part.name for part in case.test.runs()]
+        mine = [f for f in self.found if f.law == law and f.test == test]
+        return sorted(mine, key=lambda f: order.index(f.part))
+
+    @property
+    def failures(self) -> list[str]:
+        """One line for each part that does not pass: law, test, verdict and why."""
+        return [
+            f"{f.law}, {'/'.join(x for x in (f.test, f.part) if x)}: {f.verdict}: {f.words}"
+            for law in self.laws
+            for case in self.cases
+            for f in self.of(law, case.id)
+            if f.verdict != PASS
+        ]
+
+    def plain(self) -> dict[str, Any]:
+        """The content of results.json."""
+        tests = {
+            case.id: {
+                "title": case.test.title,
+                "source": case.test.source.model_dump(),
+                "f_n": case.test.f_n,
+            }
+            for case in self.cases
+        }
+        laws: dict[str, Any] = {}
+        for law in self.laws:
+            laws[law] = {
+                case.id: {
+                    "verdict": self.matrix[law, case.id],
+                    "parts": [
+                        {
+                            "part": f.part,
+                            "verdict": f.verdict,
+                            "status": f.status,
+                            "reason": f.reason,
+                            "clauses": [v.plain() for v in f.verdicts],
+                        }
+                        for f in self.of(law, case.id)
+                    ],
+                }
+                for case in self.cases
+            }
+        return finite(
+            {
+                "version": version("gfmhil"),
+                "date": datetime.now(UTC).isoformat(timespec="seconds"),
+                "inner": self.inner,
+                "under_test": self.under.model_dump(mode="json", exclude_unset=True),
+                "passed": self.passed,
+                "tests": tests,
+                "laws": laws,
+            }
+        )
+
+    def write(self, folder: Path) -> None:
+        """Write report.html, results.json and junit.xml, and with several laws a report for each
+        and matrix.png.
+
+        Raises:
+            UserError: the folder cannot be written.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_text(folder / "results.json", json.dumps(self.plain(), indent=1) + "\n")
+            write_text(folder / "junit.xml", self._junit())
+            if len(self.laws) == 1:
+                write_text(folder / "report.html", self._page(self.laws[0]))
+                return
+            from gfm_hil.studies.conformity.figure import draw_matrix
+
+            draw_matrix(folder / "matrix.png", self.laws, [c.id for c in self.cases], self.matrix)
+            for law in self.laws:
+                write_text(folder / f"report-{slug(law)}.html", self._page(law))
+            write_text(folder / "report.html", self._overview(folder / "matrix.png"))
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem.strerror}") from None
+
+    def _junit(self) -> str:
+        """One suite a law and test, one case a clause; what cannot be judged is an error."""
+        top = ElementTree.Element("testsuites", name="gfmhil conform")
+        for law in self.laws:
+            for case in self.cases:
+                parts = self.of(law, case.id)
+                verdicts = [(f, v) for f in parts for v in f.verdicts]
+                bare = [f for f in parts if not f.verdicts]
+                outcomes = [v.verdict for _, v in verdicts] + [f.verdict for f in bare]
+                suite = ElementTree.SubElement(
+                    top, "testsuite", name=f"{law}: {case.id}", tests=str(len(outcomes)),
+                    failures=str(outcomes.count("fail")),
+                    errors=str(outcomes.count("cannot judge")),
+                )  # fmt: skip
+                for f, v in verdicts:
+                    _case(suite, law, f, f"{v.clause} [{v.kind} from {v.start:g} s]", v.verdict,
+                          v.text)  # fmt: skip
+                for f in bare:
+                    _case(suite, law, f, f.part, f.verdict, f.reason)
+        ElementTree.indent(top)
+        return ElementTree.tostring(top, encoding="unicode", xml_declaration=True) + "\n"
+
+    def _page(self, law: str) -> str:
+        body = [self._head(f"{law}: conformity")]
+        rows = [
+            [_status(self.matrix[law, c.id]), _link(c), html.escape(c.test.source.words())]
+            for c in self.cases
+        ]
+        body.append(_table(["verdict", "test", "source"], rows))
+        body += [self._section(law, case) for case in self.cases]
+        return _document(f"{law}: conformity", "\n".join(body))
+
+    def _overview(self, picture: Path) -> str:
+        heads = "".join(f'<th class="tall">{html.escape(c.id)}</th>' for c in self.cases)
+        rows = ""
+        for law in self.laws:
+            page = f"report-{slug(law)}.html"
+            cells = "".join(
+                f'<td><a href="{page}#{slug(c.id)}" title="{html.escape(c.test.title)}">'
+                f"{_status(self.matrix[law, c.id], short=True)}</a></td>"
+                for c in self.cases
+            )
+            rows += f'<tr><th><a href="{page}">{html.escape(law)}</a></th>{cells}</tr>'
+        matrix = f'<div class="scroll"><table class="matrix"><tr><th></th>{heads}</tr>{rows}'
+        sources = _table(
+            ["test", "source", "known"],
+            [
+                [html.escape(c.id), html.escape(c.test.source.words()),
+                 html.escape(KNOWN[c.test.source.known])]
+                for c in self.cases
+            ],
+        )  # fmt: skip
+        body = f"{self._head('Conformity of laws')}{matrix}</table></div><h2>Sources</h2>{sources}"
+        body += f'<h2>Figure</h2><img alt="matrix" src="{inline(picture)}">'
+        return _document("Conformity of laws", body)
+
+    def _head(self, title: str) -> str:
+        under = self.under
+        stage = "each law's own" if self.inner is None else self.inner
+        return (
+            f"<h1>{html.escape(title)}</h1><p>Inner stage: {html.escape(stage)}. Converter: "
+            f"{html.escape(under.plant.converter)}, declared droop {100 * under.droop:g} %, power "
+            f"{under.P_min:g} to {under.P_max:g} p.u. gfmhil {version('gfmhil')}, "
+            f"{datetime.now(UTC).date()}. These verdicts are about this model, not about a "
+            "product; check each limit against the source before you rely on it.</p>"
+        )
+
+    def _section(self, law: str, case: Case) -> str:
+        test = case.test
+        text = [
+            f'<h2 id="{slug(case.id)}">{_status(self.matrix[law, case.id])} '
+            f"{html.escape(f'{case.id}: {test.title}')}</h2>",
+            f"<p>{html.escape(test.description)}</p>",
+            f"<p>Source: {html.escape(test.source.words())}, {KNOWN[test.source.known]}.</p>",
+        ]
+        for f in self.of(law, case.id):
+            if f.part:
+                text.append(f"<h3>{_status(f.verdict)} {html.escape(f.part)}</h3>")
+            if f.verdicts:
+                text.append(_table(_HEADS, [_row(v) for v in f.verdicts]))
+            else:
+                text.append(f"<p>{html.escape(f.reason)}</p>")
+            if f.figure is not None:
+                alt = html.escape(f"{f.test} {f.part}")
+                text.append(f'<img alt="{alt}" src="{inline(f.figure)}">')
+            if f.scenario is not None:
+                text.append(
+                    f"<p><code>gfmhil run {html.escape(str(f.scenario / 'scenario.toml'))}</code> "
+                    "repeats the run.</p>"
+                )
+        return "\n".join(text)
+
+    def __repr__(self) -> str:
+        count = list(self.matrix.values())
+        told = ", ".join(f"{count.count(v)} {v}" for v in (PASS, FAIL, CANNOT) if v in count)
+        return "\n".join([f"<Conformity of {', '.join(self.laws)}: {told}", *self.failures, ">"])
+
+
+_HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "what was found")
+
+
+def _row(v: Verdict) -> list[str]:
+    measured = "–" if v.value is None else f"{cell(v.value)} {v.unit}".rstrip()
+    plain = (v.clause, v.signal or "–", f"{v.start:g} … {v.stop:g}", measured, v.limit, v.text)
+    return [_status(v.verdict), *map(html.escape, plain)]
+
+
+def _status(verdict: str, short: bool = False) -> str:
+    look = verdict.split()[0]
+    return f'<span class="status {look}">{SIGNS[verdict] if short else verdict}</span>'
+
+
+def _link(case: Case) -> str:
+    name = html.escape(f"{case.id}: {case.test.title}")
+    return f'<a href="#{slug(case.id)}">{name}</a>'
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table whose cells are HTML already."""
+    top = "".join(f"<th>{head}</th>" for head in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in rows)
+    return f'<div class="scroll text"><table><tr>{top}</tr>{body}</table></div>'
+
+
+def _document(title: str, body: str) -> str:
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{STYLE}{_STYLE}</style>\n{body}</html>\n"
+    )
+
+
+def _case(suite: Any, law: str, f: Found, name: str, verdict: str, text: str) -> None:
+    place = ".".join(x for x in (law, f.test, f.part) if x)
+    entry = ElementTree.SubElement(suite, "testcase", classname=place, name=name)
+    if verdict == FAIL:
+        ElementTree.SubElement(entry, "failure", message=text)
+    elif verdict == CANNOT:
+        ElementTree.SubElement(entry, "error", message=text, type=CANNOT)

@@ -1,0 +1,227 @@
+"""Finding and checking the sets of tests, and making the scenarios of their parts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.files import write_text
+from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario, check_scenario
+from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.studies.conformity.model import Part, Test, UnderTest
+from gfm_plant import ConverterParameters, load_converter
+from gfm_runtime.errors import meant, printable
+from gfm_runtime.toml_file import read_toml
+
+ALL = "all"
+_FOLDER, _UNDER_TEST = "conformity", "converter.toml"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A test with where it is from.
+
+    Attributes:
+        id: set and name, e.g. ``miso/3-phase-jump``.
+        path: of its file.
+    """
+
+    id: str
+    path: Path
+    test: Test
+
+
+def shipped_sets() -> dict[str, Path]:
+    """Folders of the shipped sets by name."""
+    found: dict[str, Path] = {}
+    for root in SCENARIO_FOLDERS:
+        folder = root / _FOLDER
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            if path.is_dir():
+                found[path.name] = path
+    return found
+
+
+def load_cases(names: Sequence[str]) -> list[Case]:
+    """The tests of sets, in order, each once.
+
+    Args:
+        names: shipped sets, ``all`` of them, folders of test files, or test files.
+
+    Raises:
+        UserError: one line per mistake.
+    """
+    shipped, found = shipped_sets(), dict[Path, Case]()
+    for name in names:
+        for chosen in shipped if name == ALL else [name]:
+            for path in _files(chosen, shipped):
+                found.setdefault(path, _load_case(path))
+    return list(found.values())
+
+
+def _files(name: str, shipped: Mapping[str, Path]) -> list[Path]:
+    folder = shipped.get(name, Path(name))
+    if folder.is_file():
+        return [folder]
+    files = sorted(folder.glob("*.toml")) if folder.is_dir() else []
+    if not files:
+        known = [ALL, *shipped]
+        raise UserError(
+            printable(
+                f"--against {name}: must be one of {known}, a folder with tests in TOML, or such a "
+                f"file{meant(name, known)}"
+            )
+        )
+    return files
+
+
+def _load_case(path: Path) -> Case:
+    test = _read(path, Test)
+    case = Case(f"{path.parent.name}/{path.stem}", path, test)
+    for part in test.runs():
+        if part.cannot is None:
+            content = _content(case, part, {})
+            bare = Scenario.model_validate
+            _checked(path, Scenario, partial(bare, content))
+            wrong = [a for c in (*test.criteria, *part.criteria) for a in c.at or []]
+            duration = content["duration"]
+            if any(not 0 < a < duration for a in wrong):
+                raise UserError(
+                    f"{path}: criteria.at = {wrong}: must lie in the run, (0, {duration:g}) s"
+                )
+    return case
+
+
+def load_under_test(given: str | Path | None) -> UnderTest:
+    """The converter under test, of a file; the shipped one if None.
+
+    Raises:
+        UserError: one line per mistake.
+    """
+    if given is None:
+        shipped = [root / _FOLDER / _UNDER_TEST for root in SCENARIO_FOLDERS]
+        given = next(path for path in shipped if path.is_file())
+    path = Path(given)
+    under = _read(path, UnderTest)
+    beside = path.parent / under.plant.converter
+    if under.plant.converter.endswith(".toml") and beside.is_file():
+        plant = under.plant.model_copy(update={"converter": str(beside.resolve())})
+        under = under.model_copy(update={"plant": plant})
+    try:
+        load_converter(under.plant.converter)
+    except (OSError, ValueError) as problem:
+        raise UserError(f"{path}: plant.converter = {under.plant.converter!r}: {problem}") from None
+    return under
+
+
+def _read(path: Path, model: type[Any]) -> Any:
+    try:
+        content = read_toml(path)
+    except (OSError, ValueError) as problem:
+        raise UserError(printable(f"{path}: {problem}")) from None
+    return _checked(path, model, partial(model.model_validate, content))
+
+
+def _checked(path: Path, model: type[BaseModel], make: Any) -> Any:
+    try:
+        return make()
+    except ValidationError as problem:
+        raise UserError("\n".join(f"{path}: {line}" for line in lines(problem, model))) from None
+
+
+def scenario_of(
+    case: Case, part: Part, under: UnderTest, law: str, inner: str | None, converters: Path
+) -> Scenario:
+    """The scenario of a part, checked.
+
+    Args:
+        case, part: what to run.
+        under: the converter under test.
+        law, inner: of every converter.
+        converters: folder for the files of converters of another frequency or rating.
+
+    Raises:
+        UserError: it cannot be run; one line a mistake.
+    """
+    test = case.test
+    plant = under.plant.model_dump(mode="json", exclude_unset=True)
+    content = _content(case, part, plant)
+    given = str(plant.get("converter", under.plant.converter))
+    content["plant"]["converter"] = _converter(given, test.f_n, 1.0, converters)
+    members = content.get("network", {}).get("converters", {})
+    for name, member in members.items():
+        own = _merged({k: v for k, v in content["plant"].items() if k != "grid"},
+                      member.get("plant", {}))  # fmt: skip
+        own["converter"] = _converter(given, test.f_n, test.ratings.get(name, 1.0), converters)
+        member["plant"] = own
+    content |= {"law": law} | ({} if inner is None else {"inner": inner})
+    return check_scenario(content, str(case.path))
+
+
+def _content(case: Case, part: Part, plant: dict[str, Any]) -> dict[str, Any]:
+    """The scenario of a part as plain data, without a law."""
+    base = _merged({"plant": plant, "link": {"type": "inproc"}}, case.test.scenario)
+    content = _merged(base, part.scenario)
+    words = part.title or part.name
+    content["title"] = f"{case.test.title}: {words}" if words else case.test.title
+    return content
+
+
+def _merged(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables merged key by key; anything else is replaced. Both stay as they are."""
+    made = {k: _merged(v, {}) if isinstance(v, dict) else v for k, v in base.items()}
+    for key, value in over.items():
+        before = made.get(key)
+        if isinstance(value, dict):
+            made[key] = _merged(before if isinstance(before, dict) else {}, value)
+        else:
+            made[key] = value
+    return made
+
+
+def _converter(given: str, f_n: float, rating: float, folder: Path) -> str:
+    """A converter at a nominal frequency and rating: itself, or a file in the folder."""
+    nominal = load_converter(given)
+    f_own = nominal.omega_n / (2 * math.pi)
+    if math.isclose(f_own, f_n, rel_tol=1e-9) and rating == 1.0:
+        return given
+    made = scaled(nominal, f_n, rating)
+    share = "" if rating == 1.0 else f"-{rating:g}"
+    path = folder / f"{Path(given).stem}-{f_n:g}hz{share}.toml"
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(path, toml_text(made.model_dump()))
+    return str(path.absolute())
+
+
+def scaled(nominal: ConverterParameters, f_n: float, rating: float) -> ConverterParameters:
+    """The same converter for another nominal frequency and rating: its elements have the same
+    per-unit values, and its DC link stores as much for its rating.
+
+    Args:
+        nominal: the converter.
+        f_n: nominal frequency, Hz.
+        rating: over that of the converter.
+    """
+    slower = nominal.omega_n / (2 * math.pi * f_n)
+    factors = {
+        "L_f": slower / rating, "L_g": slower / rating, "R_f": 1 / rating, "R_g": 1 / rating,
+        "C_f": slower * rating, "C_dc": rating,
+    }  # fmt: skip
+    elements = {name: getattr(nominal, name) * factor for name, factor in factors.items()}
+    return nominal.model_copy(
+        update={
+            **elements,
+            "S_n": nominal.S_n * rating,
+            "omega_n": 2 * math.pi * f_n,
+            "source": f"{nominal.source}; at {f_n:g} Hz and {rating:g} of the rating, with the "
+            "same elements per unit",
+        }
+    )
