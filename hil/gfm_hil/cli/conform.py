@@ -141,7 +141,8 @@ def _print(result: Conformity, wall_s: float) -> None:
             console.print(table)
     verdicts = list(result.matrix.values())
     told = ", ".join(f"{verdicts.count(v)} {v}" for v in (PASS, FAIL, CANNOT) if v in verdicts)
-    runs = f"{len(result.found)} runs in {wall_s:.1f} s"
+    count = len(result.found)
+    runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)
     report = Path(result.folder or ".") / "report.html"
     console.print(escape(f"report: {report}"), highlight=False, soft_wrap=True)

@@ -1,0 +1,462 @@
+"""Conformity tests: judged on runs made by formula, run against closed forms, and as a command."""
+
+from __future__ import annotations
+
+import cmath
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+import gfmhil
+from gfm_hil.cli import main
+from gfm_hil.core.errors import UserError
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.results.run import Run
+from gfm_hil.results.runner import run_in_memory
+from gfm_hil.scenario.model import Scenario
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, worst
+from gfm_hil.studies.conformity.model import Criterion, Part
+from gfm_hil.studies.conformity.sets import (
+    Case,
+    load_cases,
+    load_under_test,
+    scaled,
+    scenario_of,
+    shipped_sets,
+)
+from gfm_plant import load_converter
+
+Vector = NDArray[np.float64]
+Change = Callable[[dict[str, Any]], None]
+
+JUMPS = {2.0: -10.0, 7.0: 10.0, 12.0: -25.0, 17.0: 25.0}  # s: degrees
+PEAK = {10.0: 0.3, 25.0: 0.6}  # p.u.
+F_SWING, RATIO = 2.0, 0.3
+
+UNDER = load_under_test(None)
+CRITERIA: TypeAdapter[Criterion] = TypeAdapter(Criterion)
+
+
+def run_of(scenario: Scenario, status: str = "completed", reason: str = "", **x: Vector) -> Run:
+    """A finished run of arrays by formula, at rest where none is given."""
+    t = np.arange(len(x["p"])) * scenario.T_s
+    rest = {"V": 1.0, "i": 0.5, "omega_u": 1.0, "omega_g": 1.0, "delta": 0.3, "v_dc": 1.0, "q": 0.0}
+    columns = {"tick": np.arange(len(t)), "t": t, "ref_P_ref": np.full(len(t), 0.5)}
+    columns |= {f"true_{n}": x.get(n, np.full(len(t), value)) for n, value in rest.items()}
+    columns["true_p"] = x["p"]
+    return Run(scenario, {"status": status, "reason": reason, "events": []}, columns)
+
+
+@pytest.fixture(scope="module")
+def miso(tmp_path_factory: pytest.TempPathFactory) -> tuple[Case, Scenario]:
+    """MISO's phase jumps and their scenario."""
+    (case,) = (c for c in load_cases(["miso"]) if c.id == "miso/3-phase-jump")
+    (part,) = case.test.runs()
+    place = tmp_path_factory.mktemp("converters")
+    return case, scenario_of(case, part, UNDER, "droop-3", None, place)
+
+
+def answer(t: Vector, ratio: float, hz: float, rise: float) -> Vector:
+    """A damped swing of the height 1 that is there after ``rise`` s."""
+    pole = -ratio * 2 * math.pi * hz
+    swing = np.exp(pole * t) * np.cos(2 * math.pi * hz * math.sqrt(1 - ratio**2) * t)
+    return np.where(t < 0, 0.0, np.where(t < rise, t / rise if rise else 1.0, swing))
+
+
+def phase_jumps(
+    scenario: Scenario,
+    scale: float = 1.0,
+    ratio: float = RATIO,
+    hz: float = F_SWING,
+    rise: float = 0.0,
+    rest: float = 0.0,
+    ripple: float = 0.0,
+    slip: float = 0.0,
+    cut: int = 0,
+) -> Run:
+    """What an ideal converter does in MISO's test 3, and what goes wrong with it.
+
+    Args:
+        scale: of the answers to the jumps by 10 degrees.
+        ratio, hz: of the swing.
+        rise: s until p is at its peak.
+        rest: where p stays off after the first jump, p.u.
+        ripple: amplitude of a lasting 7 Hz oscillation, p.u.
+        slip: turns that the angle makes after the last jump.
+        cut: ticks that are missing at the end, after a trip.
+    """
+    t = np.arange(scenario.ticks - cut) * scenario.T_s
+    p, delta = np.full(len(t), 0.5), np.full(len(t), 0.3)
+    for at, degrees in JUMPS.items():
+        size = PEAK[abs(degrees)] * (scale if abs(degrees) == 10 else 1.0)
+        p -= math.copysign(size, degrees) * answer(t - at, ratio, hz, rise)
+        delta -= math.radians(degrees) * answer(t - at, 0.7, 1.0, 0.0)
+    p += rest * (t >= 2.0) + ripple * np.sin(2 * math.pi * 7 * t)
+    delta += slip * 2 * math.pi * np.clip(t - 19.0, 0.0, 1.0)
+    status, reason = ("tripped", "over-current") if cut else ("completed", "")
+    return run_of(scenario, status, reason, p=p, delta=delta)
+
+
+def failing(verdicts: list[Verdict]) -> set[str]:
+    return {v.kind for v in verdicts if v.verdict == FAIL}
+
+
+def test_an_ideal_answer_passes_every_clause_of_the_phase_jumps(
+    miso: tuple[Case, Scenario],
+) -> None:
+    case, scenario = miso
+    verdicts = judge(phase_jumps(scenario), case.test.criteria, UNDER)
+    assert {v.verdict for v in verdicts} == {PASS}
+    assert len(verdicts) == 18
+    of = {(v.kind, v.start): v for v in verdicts}
+    # the mean over a cycle that begins with the jump, of a swing that decays from 0.3
+    pole = 2 * math.pi * F_SWING * complex(-RATIO, math.sqrt(1 - RATIO**2))
+    mean = 0.3 * ((cmath.exp(pole / 60) - 1) / (pole / 60)).real
+    assert of["peak_delta_p", 2.0].value == pytest.approx(mean, rel=5e-3)
+    assert of["damped", 2.0].value == pytest.approx(RATIO, abs=1e-3)
+    assert of["rise_within", 7.0].value == pytest.approx(0.0, abs=0.2)
+    settled = of["settles", 12.0].value
+    assert settled is not None  # within 0.05 of an envelope of 0.6
+    assert 0 < settled < math.log(0.6 / 0.05) / (RATIO * 2 * math.pi * F_SWING) + 1 / 60
+
+
+@pytest.mark.parametrize(
+    ("mutation", "kind", "at"),
+    [
+        ({"scale": 0.95 * 0.2 / 0.2785}, "peak_delta_p", {2.0, 7.0}),  # 5 % less than is asked
+        ({"rise": 0.03, "scale": 1.1}, "rise_within", {2.0, 7.0}),
+        ({"ratio": 0.04, "hz": 6.0}, "damped", {2.0, 7.0, 12.0, 17.0}),
+        ({"rest": 1.05 * 0.05}, "settles", {2.0}),  # 5 % beyond the tolerance
+        ({"ripple": 0.0105}, "no_oscillation", {0.0}),
+        ({"slip": 1.0}, "stays_in_step", {17.0}),
+        ({"cut": 20}, "no_trip", {0.0}),
+    ],
+)
+def test_each_mutation_fails_its_own_clause_and_no_other(
+    miso: tuple[Case, Scenario], mutation: dict[str, Any], kind: str, at: set[float]
+) -> None:
+    case, scenario = miso
+    verdicts = judge(phase_jumps(scenario, **mutation), case.test.criteria, UNDER)
+    assert failing(verdicts) == {kind}
+    assert {v.start for v in verdicts if v.verdict == FAIL} == at
+    for v in verdicts:
+        assert v.text.endswith((".", "grows")) and v.clause
+        if v.verdict == CANNOT:  # what the trip cut off
+            assert "cut" in mutation and v.stop == 22.0 and "over-current" in v.text
+
+
+def test_what_a_trip_cuts_off_cannot_be_judged(miso: tuple[Case, Scenario]) -> None:
+    case, scenario = miso
+    verdicts = judge(phase_jumps(scenario, cut=60_000), case.test.criteria, UNDER)
+    assert worst([v.verdict for v in verdicts]) == FAIL
+    assert {v.verdict for v in verdicts if v.stop > 16.0 and v.kind != "no_trip"} == {CANNOT}
+    assert {v.verdict for v in verdicts if v.stop <= 16.0} == {PASS}
+
+
+def test_a_twin_that_trips_fails_the_clause_of_the_plant(miso: tuple[Case, Scenario]) -> None:
+    case, scenario = miso
+    twin = {"twin": phase_jumps(scenario, cut=20)}
+    verdicts = judge(phase_jumps(scenario), case.test.criteria, UNDER, twin)
+    (found,) = (v for v in verdicts if v.verdict == FAIL)
+    assert found.kind == "no_trip" and "twin" in found.text
+
+
+def one(kind: str, **more: Any) -> Criterion:
+    return CRITERIA.validate_python({"kind": kind, "clause": "as asked", **more})
+
+
+@pytest.fixture(scope="module")
+def ramp() -> Scenario:
+    """5 s with a ramp of the frequency from 2 s on, at 50 Hz."""
+    event = {"t": 2.0, "type": "grid-frequency", "f_hz": 49.5, "rate": 1.0}
+    return Scenario.model_validate(
+        {"title": "ramp", "duration": 5.0, "link": {"type": "inproc"}, "events": [event]}
+    )
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.05])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_energy_of_the_swing_equation_is_the_inertia_constant(
+    ramp: Scenario, factor: float, sign: int
+) -> None:
+    """P = -2 H / f_n df/dt while the frequency moves."""
+    H, rate, t = factor * 2.5, -sign * 1.0, np.arange(50_000) * 1e-4
+    p = 0.1 - 2 * H / 50 * rate * ((t >= 2.0) & (t < 2.5))
+    asked = one("energy", df_hz=-0.5 * sign, least_s=2.5, window=[0.0, 0.5])
+    (found,) = judge(run_of(ramp, p=p), [asked], UNDER)
+    assert found.value == pytest.approx(H, rel=1e-9)
+    assert found.verdict == (PASS if factor > 1 else FAIL)
+
+
+@pytest.mark.parametrize(
+    ("p", "omega_u", "verdict"),
+    [
+        (0.5 + 0.005 / 0.01, 0.995, PASS),
+        (0.5 + 1.06 * 0.005 / 0.01, 0.995, FAIL),  # further off than 0.02
+        (1.0, 0.98, PASS),  # the droop asks for 2.5: the declared power is the limit
+        (-1.0, 1.02, PASS),
+        (0.5, 0.98, FAIL),
+    ],
+)
+def test_droop_is_that_of_the_declaration_within_the_declared_power(
+    ramp: Scenario, p: float, omega_u: float, verdict: str
+) -> None:
+    t = np.arange(50_000) * 1e-4
+    late = t >= 2.3
+    run = run_of(ramp, p=np.where(late, p, 0.5), omega_u=np.where(late, omega_u, 1.0))
+    asked = one("settles", to="droop", tolerance=0.02, within=1.0)
+    (found,) = judge(run, [asked], UNDER)
+    assert found.verdict == verdict
+    assert found.value == (pytest.approx(0.3, abs=0.02) if verdict == PASS else None)
+
+
+@pytest.mark.parametrize("beyond", [0.09, 0.12])
+def test_a_limit_may_be_passed_for_a_time(ramp: Scenario, beyond: float) -> None:
+    """The mean over a cycle crosses the middle between 1 and 1.2 half a cycle late, both ways."""
+    t = np.arange(50_000) * 1e-4
+    V = np.where((t >= 2.5) & (t < 2.5 + beyond), 1.2, 1.0)
+    asked = one("stays_within", signal="V", low=0.8, high=1.1, longest_s=0.1)
+    (found,) = judge(run_of(ramp, p=np.full(len(t), 0.5), V=V), [asked], UNDER)
+    assert found.verdict == (PASS if beyond < 0.1 else FAIL)
+    assert found.value == pytest.approx(1.2)
+    never = one("stays_within", signal="V", high=1.1)
+    assert failing(judge(run_of(ramp, p=np.full(len(t), 0.5), V=V), [never], UNDER))
+
+
+@pytest.mark.parametrize(("level", "verdict"), [(0.84, PASS), (0.76, FAIL)])
+@pytest.mark.parametrize("power", [0.5, -0.5])
+def test_limits_may_be_parts_of_what_was_before(
+    ramp: Scenario, level: float, verdict: str, power: float
+) -> None:
+    t = np.arange(50_000) * 1e-4
+    p = np.where(t < 2.5, power, level * power)
+    asked = one("stays_within", low=0.8, of_before=True)
+    (found,) = judge(run_of(ramp, p=p), [asked], UNDER)
+    assert found.verdict == verdict
+
+
+def test_a_window_that_cannot_be_judged_says_why(ramp: Scenario) -> None:
+    run = run_of(ramp, p=np.full(50_000, 0.5))
+    for asked, why in (
+        (one("rise_within", within=0.01, direction="up"), "by 0 p.u. only"),
+        (one("damped", ratio=0.1, window=[0.0, 0.02]), "shorter than two cycles"),
+        (one("damped", ratio=0.1, at=[0.01]), "no whole cycle"),
+        (one("settles", to=0.5, tolerance=0.1, within=2.0, window=[0.0, 1.0]), "window ends"),
+    ):
+        (found,) = judge(run, [asked], UNDER)
+        assert found.verdict == CANNOT and why in found.text
+
+
+@pytest.mark.parametrize("scr", [3.0, 10.0])
+def test_the_peak_after_a_jump_is_that_of_the_closed_form(scr: float, tmp_path: Path) -> None:
+    """dP = V^2 sin(theta) / (X_p + 1/SCR), with X_p of the filter inductor alone.
+
+    The law turns its voltage back meanwhile: by 1 % droop behind its low-pass of 0.167 s, less
+    than 3 % in the cycle of the mean. The filter capacitor and what is left of the resistances
+    account for the rest of the tolerance.
+    """
+    content = f"""
+title = "closed form"
+f_n = 50.0
+source = {{ document = "here", clause = "closed form", revision = "1", known = "own" }}
+[scenario]
+duration = 1.0
+references = {{ P_ref = 0.0 }}
+plant = {{ factors = {{ R_f = 0.0 }}, grid = {{ scr = {scr}, x_over_r = 1000.0 }} }}
+events = [{{ t = 0.5, type = "grid-phase-jump", degrees = -10.0 }}]
+[[criteria]]
+kind = "peak_delta_p"
+clause = "closed form"
+least = 0.1
+direction = "up"
+"""
+    (tmp_path / "jump.toml").write_text(content)
+    (case,) = load_cases([str(tmp_path)])
+    scenario = scenario_of(case, case.test.runs()[0], UNDER, "droop-3", None, tmp_path)
+    (found,) = judge(run_in_memory(scenario), case.test.criteria, UNDER)
+    X_p = load_converter("paper").pu()["L_f"]
+    expected = math.sin(math.radians(10)) / (X_p + 1 / scr)
+    assert found.value == pytest.approx(expected, rel=0.05)
+
+
+def test_another_frequency_and_rating_keep_the_elements_per_unit() -> None:
+    paper = load_converter("paper")
+    twin = scaled(paper, 60.0, 0.5)
+    assert twin.pu() == pytest.approx({**paper.pu(), "C_dc": twin.pu()["C_dc"]})
+    assert twin.bases.omega_b == pytest.approx(120 * math.pi)
+    assert twin.C_dc * twin.V_dcref**2 / twin.S_n == pytest.approx(
+        paper.C_dc * paper.V_dcref**2 / paper.S_n
+    )
+
+
+def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> None:
+    cases = load_cases(["all"])
+    sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "withstand"}
+    assert {case.id.split("/")[0] for case in cases} == {*shipped_sets()} == sets
+    for case in cases:
+        for part in case.test.runs():
+            if part.cannot is None:
+                made = scenario_of(case, part, UNDER, "droop-3", "virtual-stator", tmp_path)
+                assert nominal_frequency(made) == pytest.approx(case.test.f_n)
+                assert made.plant.modulation == "space-vector"
+
+
+LAB = """
+title = "a small jump"
+f_n = 50.0
+
+[source]
+document = "Our lab"
+clause = "jump"
+revision = "1"
+known = "own"
+
+[scenario]
+duration = 1.5
+references = { P_ref = 0.5 }
+plant = { grid = { scr = 5.0, x_over_r = 6.0 } }
+events = [{ t = 0.5, type = "grid-phase-jump", degrees = -5.0 }]
+
+[[criteria]]
+kind = "no_trip"
+clause = "lasts"
+
+[[criteria]]
+kind = "peak_delta_p"
+clause = "opposes"
+least = 0.05
+direction = "up"
+"""
+STRICT = LAB.replace("least = 0.05", "least = 5.0")
+NONE = """
+[[parts]]
+name = "unheard-of"
+cannot = "nobody built it"
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """A folder with a set of one test that passes."""
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    (folder / "jump.toml").write_text(LAB)
+    return folder
+
+
+def test_command_writes_report_results_and_junit(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = lab.parent / "out"
+    asked = ["conform", "--law", "droop-3", "--against", str(lab), "-o", str(out)]
+    assert main([*asked, "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "lab/jump" in said and "pass" in said and "report.html" in said
+    content = json.loads((out / "results.json").read_text("utf-8"))
+    assert content["passed"] is True
+    (part,) = content["laws"]["droop-3"]["lab/jump"]["parts"]
+    assert [c["verdict"] for c in part["clauses"]] == [PASS, PASS]
+    report = (out / "report.html").read_text("utf-8")
+    assert all(word in report for word in ("Our lab, jump, 1", "opposes", "at least 0.05 p.u."))
+    assert "data:image/png;base64," in report
+    suite = ElementTree.parse(out / "junit.xml").getroot()[0]
+    assert suite.attrib["tests"] == "2" and suite.attrib["failures"] == "0"
+    # the scenario that the report names repeats the run
+    (made,) = (out / "runs").rglob("scenario.toml")
+    again = gfmhil.run(made)
+    assert again.metrics["phase jump -5° @ 0.5 s"]["p_peak_cycle"] > 0.55
+    assert main([*asked, "--workers", "1"]) == 2  # the folder is in use
+    assert "is not empty" in capsys.readouterr().err
+
+
+def test_exit_code_is_1_if_a_clause_fails_or_cannot_be_judged(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (lab / "strict.toml").write_text(STRICT)
+    (lab / "none.toml").write_text(LAB + NONE)
+    for name, code in (("jump", 0), ("strict", 1), ("none", 1)):
+        file, out = str(lab / f"{name}.toml"), str(lab.parent / name)
+        asked = ["conform", "--law", "droop-3", "--against", file, "-o", out, "--no-figures"]
+        assert main([*asked, "--workers", "1", "--quiet"]) == code
+        tree = ElementTree.parse(lab.parent / name / "junit.xml").getroot()
+        kinds = [e.tag for e in tree.iter() if e.tag in ("failure", "error")]
+        assert kinds == {"jump": [], "strict": ["failure"], "none": ["error"] * 2}[name]
+    assert "nobody built it" in capsys.readouterr().out
+
+
+def test_several_laws_give_a_matrix(lab: Path) -> None:
+    laws = ["droop-3", gfmhil.Law.load("vsg-2").with_gains("stiff", D_p=0.05)]
+    (lab / "strict.toml").write_text(STRICT)
+    found = gfmhil.conform(laws, lab, lab.parent / "out")
+    tests = ("lab/jump", "lab/strict")
+    assert found.matrix == {
+        (law, test): verdict
+        for law in ("droop-3", "stiff")
+        for test, verdict in zip(tests, (PASS, FAIL), strict=True)
+    }
+    assert not found.passed and len(found.failures) == 2
+    names = {path.name for path in (lab.parent / "out").iterdir()}
+    assert {"report.html", "report-droop-3.html", "report-stiff.html", "matrix.png"} <= names
+    assert "report-stiff.html#lab-jump" in (lab.parent / "out" / "report.html").read_text("utf-8")
+
+
+def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
+    text = LAB.replace("scr = 5.0", "scr = 0.5").replace("P_ref = 0.5", "P_ref = 1.0")
+    (lab / "jump.toml").write_text(text)
+    found = gfmhil.conform("droop-3", lab)
+    assert found.matrix == {("droop-3", "lab/jump"): CANNOT}
+    assert "there is no such run" in found.failures[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('kind = "no_trip"', 'kind = "no_tripp"', "no_tripp"),
+        ("f_n = 50.0", "f_n = 50.0\nvolts = 3", "volts"),
+        ("duration = 1.5", "duration = -1.5", "duration"),
+        ("duration = 1.5", 'duration = 1.5\nlaw = "vsg-2"', "scenario.law"),
+        ('known = "own"', 'known = "rumour"', "rumour"),
+        ("least = 0.05", "least = 0.05\nat = [7.0]", "at = [7.0]"),
+    ],
+)
+def test_wrong_test_files_are_told_in_one_line(
+    lab: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, says: str
+) -> None:
+    (lab / "jump.toml").write_text(LAB.replace(old, new))
+    assert main(["conform", "--law", "droop-3", "--against", str(lab)]) == 2
+    error = capsys.readouterr().err
+    assert "jump.toml" in error and says in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--against", "misso"], "did you mean"),
+        (["--law", "drop-3"], "drop-3"),
+        (["--law", "droop-3", "--inner", "stator"], "stator"),
+        (["--law", "droop-3", "--workers", "0"], "--workers 0"),
+        (["--law", "droop-3", "--converter", "nowhere.toml"], "nowhere.toml"),
+        ([], "--law"),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
+) -> None:
+    assert main(["conform", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+
+
+def test_parts_without_a_criterion_are_refused() -> None:
+    with pytest.raises(ValueError, match="neither scenario nor criteria"):
+        Part(name="a", cannot="why", scenario={"duration": 1.0})
+    with pytest.raises(UserError, match="must be one of"):
+        load_cases(["nowhere"])
