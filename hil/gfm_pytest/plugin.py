@@ -1,4 +1,5 @@
-"""Fixture ``bench``, marker ``gfmhil``, options ``--gfmhil-link`` and ``--gfmhil-out``.
+"""Fixtures ``bench`` and ``conform``, marker ``gfmhil``, options ``--gfmhil-link`` and
+``--gfmhil-out``.
 
 It imports only pytest until a test uses the bench.
 """
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    from gfm_hil.studies.conformity.result import Conformity
     from gfm_hil.testing import Experiment
 
 _FIGURE = "gfmhil_figure"  # user property of a report, which pytest-xdist passes on too
@@ -95,6 +97,18 @@ def bench(
     yield experiment
     if experiment.pending and request.session.testsfailed == failed:
         experiment.assert_no_trip()  # run the steps after the last assertion too
+
+
+@pytest.fixture
+def conform(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., Conformity]:
+    """``gfmhil.conform``, which fails the test unless every clause passes; files are looked for
+    from the folder of the test, and the report is named."""
+    from gfm_hil.testing.gate import gate
+
+    out = request.config.getoption("--gfmhil-out")
+    return gate(request.path.parent, _folders(out, request.node.nodeid, tmp_path_factory))
 
 
 def _folders(out: str | None, nodeid: str, temporary: Any) -> Callable[[], Path]:

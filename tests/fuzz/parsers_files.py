@@ -25,6 +25,7 @@ from gfm_hil.scenario.profiles import read_profile
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 from gfm_hil.studies.campaign import loading
+from gfm_hil.studies.conformity.sets import load_cases, load_under_test
 from gfm_hil.telemetry.follow import Follower
 from gfm_runtime import LawError, discretise, get_law, load_law
 from gfm_runtime.firmware import STYLES, golden, make_modules
@@ -202,6 +203,27 @@ def _campaign(place: Path) -> Iterator[Take]:
         loading._TRIED = tried
 
 
+@contextlib.contextmanager
+def _conformity(place: Path) -> Iterator[Take]:
+    """An input is the file of a test, or of a converter under test."""
+    file = place / "test.toml"
+
+    def take(text: bytes) -> None:
+        file.write_bytes(text)
+        for load in (lambda: load_cases([str(file)]), lambda: load_under_test(file)):
+            try:
+                load()
+            except UserError as problem:
+                short(str(problem))
+
+    yield take
+
+
+def _conformity_files() -> st.SearchStrategy[bytes]:
+    folders = [folder / "conformity" for folder in SCENARIO_FOLDERS]
+    return texts(_shipped(*folders, *(folder / "miso" for folder in folders)))
+
+
 def short(text: str) -> None:
     """Check that an error message is readable."""
     assert len(text) < 20_000, f"{len(text)} characters"
@@ -373,6 +395,7 @@ FILES = (
     Parser("law", _law, lambda: texts(_shipped(CATALOGUE))),
     Parser("firmware", _firmware, lambda: texts(_reports())),
     Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
+    Parser("conformity", _conformity, _conformity_files),
     Parser("run_folder", _run_folder, _run_files),
     Parser("segment", _segment, _segments),
 )

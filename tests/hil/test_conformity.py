@@ -32,6 +32,7 @@ from gfm_hil.studies.conformity.sets import (
     scenario_of,
     shipped_sets,
 )
+from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 
 Vector = NDArray[np.float64]
@@ -360,7 +361,11 @@ def test_command_writes_report_results_and_junit(
     assert main([*asked, "--workers", "1"]) == 0
     said = capsys.readouterr().out
     assert "lab/jump" in said and "pass" in said and "report.html" in said
+    other = [*asked[:-1], str(lab.parent / "other"), "--no-figures", "--workers", "1", "--json"]
+    assert main(other) == 0
+    printed = json.loads(capsys.readouterr().out)
     content = json.loads((out / "results.json").read_text("utf-8"))
+    assert printed["laws"] == content["laws"]
     assert content["passed"] is True
     (part,) = content["laws"]["droop-3"]["lab/jump"]["parts"]
     assert [c["verdict"] for c in part["clauses"]] == [PASS, PASS]
@@ -460,3 +465,16 @@ def test_parts_without_a_criterion_are_refused() -> None:
         Part(name="a", cannot="why", scenario={"duration": 1.0})
     with pytest.raises(UserError, match="must be one of"):
         load_cases(["nowhere"])
+
+
+def test_the_gate_fails_a_test_with_each_part_and_the_report(lab: Path) -> None:
+    (lab / "strict.toml").write_text(STRICT)
+    folders = iter([lab.parent / "first", lab.parent / "second"])
+    conform = gate(lab.parent, lambda: next(folders))
+    assert conform("droop-3", against="lab/jump.toml").passed
+    with pytest.raises(
+        AssertionError, match="droop-3, lab/strict: fail: The one-cycle mean"
+    ) as why:
+        conform("droop-3", against="lab")
+    assert str(lab.parent / "second" / "report.html") in str(why.value)
+    assert (lab.parent / "second" / "report.html").is_file()

@@ -23,6 +23,8 @@ SHIPPED = {
     "law": [*LAWS.rglob("*.toml"), EXAMPLES / "my-law.toml", EXAMPLES / "droop-5-integral.toml"],
     "inner": [*LAWS.parent.glob("inner_stages/*.toml")],
     "campaign": [*SCENARIOS.glob("campaigns/*.toml")],
+    "conformity": [*SCENARIOS.glob("conformity/*/*.toml")],
+    "converter": [*SCENARIOS.glob("conformity/*.toml")],
 }
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.testing import Experiment
 from gfm_hil.results.checks import Window, damped, envelope, overshoot, read_envelope, settles
+from gfm_hil.testing import Experiment
 
 pytestmark = pytest.mark.processes
 
@@ -177,16 +177,19 @@ def project(name: str, tmp_path: Path, *options: str) -> subprocess.CompletedPro
 def test_example_law_passes_its_tests(tmp_path: Path) -> None:
     done = project("own_law", tmp_path)
     assert done.returncode == 0, done.stdout
-    assert "7 passed" in done.stdout
+    assert "9 passed" in done.stdout
 
 
 def test_wrong_law_fails_with_the_reason_and_figures(tmp_path: Path) -> None:
     done = project("own_law", tmp_path, "--law=too-stiff", "--gfmhil-out=figures", "-k", "not do")
     assert done.returncode == 1
-    assert "4 failed, 1 passed" in done.stdout
+    assert "5 failed, 2 passed" in done.stdout
     assert "p should settle at 0.7 p.u. ± 0.01 within 0.2 s, but it took 0.4" in done.stdout
     assert re.search(
         r"strongest oscillation after the step, at 8\.2\d Hz, has 0\.16\d", done.stdout
+    )
+    assert (
+        "my-droop" not in done.stdout and "phase-jump: fail: The one-cycle mean of p" in done.stdout
     )
     named = re.findall(r"^tests/.*: (.*\.png)$", done.stdout, re.MULTILINE)
     assert len(named) == 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 import time
@@ -55,6 +56,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
     command.add_argument("--list", action="store_true", help="list the tests, and run nothing")
+    command.add_argument("--json", action="store_true", help="print results.json, nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
 
 
@@ -107,7 +109,10 @@ def call(options: argparse.Namespace) -> int:
         return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
     result = Conformity(laws, options.inner, under, cases, found, folder)
     result.write(folder)
-    _print(result, time.monotonic() - began)
+    if options.json:
+        print(json.dumps(result.plain(), indent=1))
+    else:
+        _print(result, time.monotonic() - began)
     return 0 if result.passed else EXIT_FAILED
 
 

@@ -44,7 +44,7 @@ COMMANDS = {
     "dbc": ("dbc", "write the CAN link's DBC file, or its bus budget"),
     "warm-up": ("warm_up", "compile all that runs call, so that the first one starts at once"),
     "doctor": ("doctor", "check this machine's fitness for real time, and say what to improve"),
-    "schema": ("schema", "write the JSON schema of a scenario, law or campaign file, for editors"),
+    "schema": ("schema", "write the JSON schema of a scenario, law or other file, for editors"),
     "scenarios": ("scenarios", "list the scenarios that ship"),
     "keys": ("keys", "make a key pair per role, for ZeroMQ between two machines"),
     "deploy": ("deploy", "write service units, container files and the tuning script to a folder"),

@@ -1,4 +1,5 @@
-"""gfmhil schema: what a scenario, law, inner stage or campaign file may hold, as JSON Schema."""
+"""gfmhil schema: what a scenario, law, inner stage, campaign or test file may hold, as JSON
+Schema."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from pydantic import TypeAdapter
 from gfm_hil.core.files import write_text
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
+from gfm_hil.studies.conformity.model import Test, UnderTest
 from gfm_runtime.inner_file import InnerSpec
 from gfm_runtime.lawfile import LawFile
 
@@ -20,10 +22,16 @@ MODELS: dict[str, TypeAdapter[Any]] = {
     "law": TypeAdapter(LawFile),
     "inner": TypeAdapter(InnerSpec),
     "campaign": TypeAdapter(CampaignFile),
+    "conformity": TypeAdapter(Test),
+    "converter": TypeAdapter(UnderTest),
 }
 
 
-_NAMES = {"inner": "inner stage"}
+_NAMES = {
+    "inner": "inner stage",
+    "conformity": "conformity test",
+    "converter": "converter under test",
+}
 
 
 def add(command: argparse.ArgumentParser) -> None:

@@ -80,7 +80,8 @@ def draw_matrix(
     cells: Mapping[tuple[str, str], str],
 ) -> None:
     """Draw laws × tests, each cell with the colour and the sign of its verdict."""
-    figure = Figure(figsize=(2.2 + 0.34 * len(tests), 1.9 + 0.24 * len(laws)), layout="constrained")
+    size = 3.0 + 0.3 * len(tests), 3.2 + 0.3 * len(laws)
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     for row, law in enumerate(laws):
         for column, test in enumerate(tests):
@@ -97,6 +98,7 @@ def draw_matrix(
     axes.set_ylim(len(laws) - 0.5, -0.5)
     axes.set_xticks(range(len(tests)), tests, rotation=60, ha="left", fontsize=8)
     axes.set_yticks(range(len(laws)), laws, fontsize=8)
+    axes.set_aspect("equal")
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
     for side in axes.spines.values():

@@ -53,7 +53,8 @@ def load_cases(names: Sequence[str]) -> list[Case]:
     """The tests of sets, in order, each once.
 
     Args:
-        names: shipped sets, ``all`` of them, folders of test files, or test files.
+        names: shipped sets, ``all`` of them, shipped tests such as ``miso/2-rocof``, folders of
+            test files, or test files.
 
     Raises:
         UserError: one line per mistake.
@@ -68,6 +69,10 @@ def load_cases(names: Sequence[str]) -> list[Case]:
 
 def _files(name: str, shipped: Mapping[str, Path]) -> list[Path]:
     folder = shipped.get(name, Path(name))
+    chosen, _, test = name.partition("/")
+    if chosen in shipped and test:
+        one = shipped[chosen] / f"{test.removesuffix('.toml')}.toml"
+        folder = one if one.is_file() else folder
     if folder.is_file():
         return [folder]
     files = sorted(folder.glob("*.toml")) if folder.is_dir() else []
@@ -75,8 +80,8 @@ def _files(name: str, shipped: Mapping[str, Path]) -> list[Path]:
         known = [ALL, *shipped]
         raise UserError(
             printable(
-                f"--against {name}: must be one of {known}, a folder with tests in TOML, or such a "
-                f"file{meant(name, known)}"
+                f"--against {name}: must be one of {known}, a test such as miso/2-rocof, or a "
+                f"path of tests in TOML{meant(name, known)}"
             )
         )
     return files
