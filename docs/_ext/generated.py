@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from _ext import (
+    conformity_pages,
     connect_pages,
     design_pages,
     law_pages,
@@ -28,6 +29,9 @@ MAKERS: dict[str, Callable[..., str]] = {
     "design-weights": design_pages.weights,
     "law-overview": law_pages.overview,
     "law-catalogue": law_pages.catalogue,
+    "conformity-tests": conformity_pages.tests,
+    "conformity-keys": conformity_pages.keys,
+    "conformity-criteria": conformity_pages.criteria,
     "inner-keys": scenario_pages.inner_tables,
     "network-keys": scenario_pages.network_tables,
     "law-keys": scenario_pages.law_tables,

@@ -310,6 +310,25 @@ def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> Non
                 assert made.plant.modulation == "space-vector"
 
 
+@pytest.mark.full  # compiles the loop of two converters
+def test_twins_share_what_the_last_machine_gave_by_their_equal_droop() -> None:
+    """Both answer by the same x in p.u. of their own rating, and the balance of powers gives x: the
+    load is a series R-L, which draws P at nominal voltage and frequency, and V is at the terminal
+    behind 0.15 p.u., so that the load's own voltage lies within 5 % of it."""
+    found = gfmhil.conform("vsg-2", "miso/1-loss-of-last-machine", inner="virtual-stator")
+    parts = {f.part: f for f in found.of("vsg-2", "miso/1-loss-of-last-machine")}
+    for name, before, twin, load in (
+        ("1-charging", -0.5, -0.5, 0.5),
+        ("3-balance", 0.5, 0.5, 0.75),
+    ):
+        verdicts = {v.kind: v for v in parts[name].verdicts}
+        assert {v.verdict for v in verdicts.values()} == {PASS}
+        settled = verdicts["settles"]
+        assert settled.low is not None and settled.high is not None
+        x = (load - before - 0.5 * twin) / 1.5
+        assert (settled.low + settled.high) / 2 == pytest.approx(before + x, abs=0.05)
+
+
 LAB = """
 title = "a small jump"
 f_n = 50.0
@@ -382,6 +401,18 @@ def test_command_writes_report_results_and_junit(
     assert "is not empty" in capsys.readouterr().err
 
 
+@pytest.mark.processes
+def test_two_workers_find_what_one_does(lab: Path) -> None:
+    (lab / "strict.toml").write_text(STRICT)
+    found = []
+    for workers in ("1", "2"):
+        out = lab.parent / workers
+        arguments = ["--law", "droop-3", "--law", "vsg-2", "--against", str(lab), "-o", str(out)]
+        assert main(["conform", *arguments, "--workers", workers, "--no-figures", "--quiet"]) == 1
+        found.append(json.loads((out / "results.json").read_text("utf-8"))["laws"])
+    assert found[0] == found[1]
+
+
 def test_exit_code_is_1_if_a_clause_fails_or_cannot_be_judged(
     lab: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -426,10 +457,12 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
     [
         ('kind = "no_trip"', 'kind = "no_tripp"', "no_tripp"),
         ("f_n = 50.0", "f_n = 50.0\nvolts = 3", "volts"),
-        ("duration = 1.5", "duration = -1.5", "duration"),
+        ("duration = 1.5", "duration = -1.5", "scenario.duration"),
+        ("least = 0.05", "least = 0.05\nwindow = [0.0, 2.0]\nat = [0.5]", "window to 2"),
+        ("f_n = 50.0", 'f_n = 50.0\njudged = "twin"', "judged: 'twin'"),
         ("duration = 1.5", 'duration = 1.5\nlaw = "vsg-2"', "scenario.law"),
         ('known = "own"', 'known = "rumour"', "rumour"),
-        ("least = 0.05", "least = 0.05\nat = [7.0]", "at = [7.0]"),
+        ("least = 0.05", "least = 0.05\nat = [7.0]", "at = 7"),
     ],
 )
 def test_wrong_test_files_are_told_in_one_line(

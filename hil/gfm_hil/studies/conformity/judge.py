@@ -190,7 +190,7 @@ class _Judge:
         start, stop = self.first * self.T_s, self.last * self.T_s
         return Verdict(
             self.c.clause, self.c.kind, signal, round(start, 9), round(stop, 9),
-            PASS if ok else FAIL, value, unit, limit, text, low, high, limited,
+            PASS if ok else FAIL, value, unit, limit, f"{text.rstrip('.')}.", low, high, limited,
         )  # fmt: skip
 
     def _cannot(self, reason: str) -> Verdict:

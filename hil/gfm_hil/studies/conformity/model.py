@@ -180,8 +180,8 @@ class Test(_Model):
     title: str = Field(min_length=1, description="of tables and figures")
     description: str = Field("", description="what is done, and what of it is our choice")
     source: Source = Field(description="where the test comes from")
-    f_n: float = Field(gt=0, le=1000, description="nominal frequency, Hz; the converter follows it")
-    ratings: dict[str, float] = Field(
+    f_n: float = Field(ge=1, le=1000, description="nominal frequency, Hz; the converter follows it")
+    ratings: dict[str, Annotated[float, Field(ge=1e-3, le=1e3)]] = Field(
         {}, description="in a network: rating of a converter over that under test"
     )
     judged: str | None = Field(

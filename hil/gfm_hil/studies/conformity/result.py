@@ -23,8 +23,8 @@ from gfm_hil.studies.conformity.sets import Case
 
 _STYLE = """
 .pass{background:#00734f} .fail{background:#b34500} .cannot{background:#777}
-td .status{padding:0 .4rem;white-space:nowrap} .scroll.text td{text-align:left;white-space:normal}
-.scroll.text td.number{white-space:nowrap}
+td .status{padding:0 .4rem;white-space:nowrap}
+.scroll.text :is(th,td):not(:first-child){text-align:left;white-space:normal}
 .matrix td,.matrix th{padding:.1rem .35rem;text-align:center}
 .matrix th:first-child{text-align:left} .matrix a{color:inherit;text-decoration:none}
 .matrix th.tall{writing-mode:vertical-rl;transform:rotate(180deg);text-align:left}

@@ -93,15 +93,34 @@ def _load_case(path: Path) -> Case:
     for part in test.runs():
         if part.cannot is None:
             content = _content(case, part, {})
-            bare = Scenario.model_validate
-            _checked(path, Scenario, partial(bare, content))
-            wrong = [a for c in (*test.criteria, *part.criteria) for a in c.at or []]
-            duration = content["duration"]
-            if any(not 0 < a < duration for a in wrong):
-                raise UserError(
-                    f"{path}: criteria.at = {wrong}: must lie in the run, (0, {duration:g}) s"
-                )
+            made = partial(Scenario.model_validate, content)
+            _checked(path, Scenario, made, "scenario.")
+            wrong = _mistakes(test, part, content)
+            if wrong:
+                raise UserError("\n".join(printable(f"{path}: {line}") for line in wrong))
     return case
+
+
+def _mistakes(test: Test, part: Part, content: Mapping[str, Any]) -> list[str]:
+    """What does not fit together in a part, one line each."""
+    found = []
+    members = [*(content.get("network") or {}).get("converters", {})]
+    for key, names in (("ratings", [*test.ratings]), ("judged", [test.judged or ""])):
+        found += [
+            f"{key}: {name!r}: must be one of {members}"
+            for name in names
+            if name and name not in members
+        ]
+    duration = content["duration"]
+    for c in (*test.criteria, *part.criteria):
+        window = getattr(c, "window", None) or (0.0, 0.0)
+        for at in c.at or []:
+            if not 0 < at + window[1] <= duration or at >= duration:
+                found.append(
+                    f"criteria: {c.kind}: at = {at:g}, window to {window[1]:g}: must lie in the "
+                    f"run, which ends at {duration:g} s"
+                )
+    return found
 
 
 def load_under_test(given: str | Path | None) -> UnderTest:
@@ -134,11 +153,12 @@ def _read(path: Path, model: type[Any]) -> Any:
     return _checked(path, model, partial(model.model_validate, content))
 
 
-def _checked(path: Path, model: type[BaseModel], make: Any) -> Any:
+def _checked(path: Path, model: type[BaseModel], make: Any, table: str = "") -> Any:
     try:
         return make()
     except ValidationError as problem:
-        raise UserError("\n".join(f"{path}: {line}" for line in lines(problem, model))) from None
+        told = [f"{path}: {table}{line}" for line in lines(problem, model)]
+        raise UserError("\n".join(told)) from None
 
 
 def scenario_of(

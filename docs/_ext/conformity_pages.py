@@ -1,0 +1,51 @@
+"""The page on conformity: the shipped tests and their sources, and the keys of a test file."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+from _ext.scenario_pages import table
+
+from gfm_hil.core.terminal import markdown
+from gfm_hil.studies.conformity import model
+from gfm_hil.studies.conformity.sets import load_cases
+
+
+def tests() -> str:
+    """One row a test: what it asks, where that is from, and how the source is known."""
+    rows = []
+    for case in load_cases(["all"]):
+        test, runs = case.test, len(case.test.runs())
+        asked = [c for part in test.runs() for c in (*test.criteria, *part.criteria)]
+        clauses = ", ".join(dict.fromkeys(c.clause for c in asked)) or "cannot be run yet"
+        source = f"{test.source.words()}; {model.KNOWN[test.source.known]}"
+        rows.append((f"`{case.id}`", test.title, str(runs), f"{test.f_n:g}", clauses, source))
+    heads = ("test", "what happens", "runs", "Hz", "asked", "source")
+    return markdown(heads, [[cell.replace("|", "\\|") for cell in row] for row in rows])
+
+
+def keys() -> str:
+    """The tables of a test file and of a converter under test."""
+    tables = (
+        ("top level", model.Test),
+        ("[source]", model.Source),
+        ("[[parts]]", model.Part),
+        ("the file of the converter under test", model.UnderTest),
+    )
+    return "\n".join(
+        f"**{f'`{title}`' if title[0] == '[' else title}**\n\n{table(of)}\n" for title, of in tables
+    )
+
+
+def criteria() -> str:
+    """One table a kind of criterion; ``clause`` and ``at`` are common to all."""
+    kinds = get_args(get_args(model.Criterion)[0])
+    common = ("kind", "clause", "at", "window")
+    text = []
+    for kind in kinds:
+        (name,) = get_args(kind.model_fields["kind"].annotation)
+        words = " ".join((kind.__doc__ or "").split())
+        own = [key for key in kind.model_fields if key not in common]
+        text.append(f"**`{name}`** — {words}\n")
+        text.append(table(kind, common) + "\n" if own else "")
+    return "\n".join(text)
