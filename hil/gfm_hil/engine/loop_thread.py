@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,58 +25,67 @@ _LOOK_S = 0.05
 
 def run_loop(
     role: Role,
-    bench: Bench,
-    link: Link,
-    part: Part,
-    timeline: Timeline,
+    benches: Sequence[Bench],
+    links: Sequence[Link],
+    parts: Sequence[Part],
+    timelines: Sequence[Timeline],
     t0_ns: int,
     stopped: Callable[[], bool],
     flags: NDArray[np.int64] | None = None,
-) -> FrameReader:
-    """Run one side of a scenario after the handshake; returns its frame counters.
+) -> list[FrameReader]:
+    """Run one side of a scenario after the handshakes; returns its frame counters.
 
     The thread inherits processor and priority from the caller. The caller then steps back to
     ordinary priority and only looks, a few times a second, whether to stop and what to write down.
     A link without a port gets a thread that pumps its messages.
 
     Args:
+        benches, links, parts, timelines: of the controller one each; of the plant one for each
+            converter.
         flags: shape (FLAGS,), what other threads tell the loop, see
             ``gfm_hil.engine.loop_records``.
     """
     if flags is None:
         flags = np.zeros(FLAGS, np.int64)
-    link = ported(link)
-    start, stop = (getattr(link, name, _nothing) for name in ("start", "stop"))
-    start()
+    links = [ported(link) for link in links]
+    for link in links:
+        getattr(link, "start", _nothing)()
     found: list[FrameReader] = []
     failed: list[BaseException] = []
 
     def work() -> None:
         try:
-            drive = drive_plant if role == "plant" else drive_controller
-            found.append(drive(bench, link, part, timeline, t0_ns, flags))
+            if role == "plant":
+                found.extend(drive_plant(benches, links, parts, timelines, t0_ns, flags))
+            else:
+                one = benches[0], links[0], parts[0], timelines[0]
+                found.append(drive_controller(*one, t0_ns, flags))
         except BaseException as problem:  # the caller's thread raises it
             failed.append(problem)
 
-    timeline.put_off = True
+    for timeline in timelines:
+        timeline.put_off = True
     thread = threading.Thread(target=work, name=f"{role}-loop", daemon=True)
     thread.start()
     stand_back()
     try:
         while thread.is_alive():
             thread.join(_LOOK_S)
-            timeline.flush()
-            flags[STOP] = stopped() or bool(timeline.failed)
+            for timeline in timelines:
+                timeline.flush()
+            flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
         while thread.is_alive():
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
-        timeline.put_off = False
-        stop()
+        for timeline in timelines:
+            timeline.put_off = False
+        for link in links:
+            getattr(link, "stop", _nothing)()
     if failed:
         raise failed[0]
-    return found[0]
+    return found
 
 
 def _nothing() -> None:

@@ -16,8 +16,10 @@ _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 _before: set[int] = set()  # processors that this process could use before it chose one
 
 
-def ask_for_real_time(role: Role) -> dict[str, Any]:
+def ask_for_real_time(role: Role, place: int = 0) -> dict[str, Any]:
     """Request a processor, a real-time priority and locked memory for this thread.
+
+    ``place``: of a controller, among those of the same plant.
 
     Threads that it starts later inherit processor and priority, so call this before the link is
     opened. The loops sleep in every tick: the kernel throttles a SCHED_FIFO thread that only
@@ -29,13 +31,14 @@ def ask_for_real_time(role: Role) -> dict[str, Any]:
     """
     return {
         "policy": _fifo() or ordinary_priority(),
-        "processor": own_processor(role),
+        "processor": own_processor(role, place),
         "memory_locked": _lock_memory(),
     }
 
 
-def own_processor(role: Role) -> int | None:
-    """The controller takes the last processor that it may use, the plant the first.
+def own_processor(role: Role, place: int = 0) -> int | None:
+    """The controller takes the last processor that it may use, the plant the first; the next
+    controller of the same plant (``place``) the one before the last, until they share.
 
     A link's I/O thread shares the processor, so that a round trip does not wait for a migration.
     """
@@ -43,7 +46,8 @@ def own_processor(role: Role) -> int | None:
         return None
     allowed = sorted(os.sched_getaffinity(0))
     _before.update(allowed)
-    mine = allowed[-1] if role == "controller" else allowed[0]
+    others = allowed[1:] or allowed
+    mine = others[-1 - place % len(others)] if role == "controller" else allowed[0]
     os.sched_setaffinity(0, {mine})
     return mine
 
