@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,20 @@ _FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
 
 
+class Share(NamedTuple):
+    """What a role's loop has of one converter."""
+
+    bench: Bench
+    link: Link
+    part: Part
+    timeline: Timeline
+
+
 class _End:
     """One end of a link for a compiled loop, and what the loop writes there."""
 
-    def __init__(
-        self, role: Role, bench: Bench, link: Any, part: Part, t0_ns: int, flags: NDArray[np.int64]
-    ) -> None:
+    def __init__(self, role: Role, share: Share, t0_ns: int, flags: NDArray[np.int64]) -> None:
+        bench, link, part, _ = share
         assert link.port is not None
         scenario, port = bench.scenario, link.port
         plant = role == "plant"
@@ -92,35 +100,27 @@ class _End:
         part_from(self.link, self.writer, self.reader, tick, state, reason, values)
 
 
-def drive_plant(
-    benches: Sequence[Bench],
-    links: Sequence[Link],
-    parts: Sequence[Part],
-    timelines: Sequence[Timeline],
-    t0_ns: int,
-    flags: NDArray[np.int64],
-) -> list[FrameReader]:
-    """Run the plant's side of a scenario after the handshakes: of each converter its bench, its
-    link, its part of the recording and its timeline; returns the frame counters of each."""
-    ends = [
-        _End("plant", bench, link, part, t0_ns, flags)
-        for bench, link, part in zip(benches, links, parts, strict=True)
-    ]
+def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -> list[FrameReader]:
+    """Run the plant's side of a scenario after the handshakes, with a share for each converter;
+    returns the frame counters of each."""
+    ends = [_End("plant", share, t0_ns, flags) for share in shares]
+    timelines = [share.timeline for share in shares]
     sides, first = tuple(end.side for end in ends), ends[0]
-    plant, ticks, alone = benches[0].plant, benches[0].scenario.ticks, len(benches) == 1
+    bench, alone = shares[0].bench, len(shares) == 1
+    ticks = bench.scenario.ticks
     for end in ends:
         end.keep_u(end.bench.u)
     while any(timeline.running for timeline in timelines):
         for timeline in timelines:
             timeline.carry_out(first.tick)
         until = min(ticks, *(timeline.next_tick() for timeline in timelines))
-        why = first.checked(plant_ticks(sides, plant.records, until))
+        why = first.checked(plant_ticks(sides, bench.plant.records, until))
         tick = first.tick
         if why == Why.RESTORE:
-            benches[0].restore_plant(tick)
-            first.keep_u(benches[0].u)
+            bench.restore_plant(tick)
+            first.keep_u(bench.u)
         if not alone:
-            take_out(plant)
+            take_out(bench.plant)
         for timeline in timelines:
             timeline.look(max(tick - 1, 0))
             if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):
@@ -145,15 +145,14 @@ def drive_plant(
     return [end.reader for end in ends]
 
 
-def drive_controller(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, flags: NDArray[np.int64]
-) -> FrameReader:
+def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> FrameReader:
     """Run the controller's side of a scenario after the handshake; returns its frame counters.
 
     The controller of a converter in a network answers on in its safe state after a trip, until the
     plant leaves.
     """
-    end, ctl = _End("controller", bench, link, part, t0_ns, flags), bench.controller.ctl
+    bench, timeline = share.bench, share.timeline
+    end, ctl = _End("controller", share, t0_ns, flags), bench.controller.ctl
     loop, own, goes_on = end.loop[0], _records(bench), bench.scenario.network is not None
     why = Why.EVENT
     loop["heard"] = max(time.monotonic_ns(), t0_ns)
@@ -200,9 +199,10 @@ def _records(bench: Bench) -> ControllerRecords:
 
 def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
-    stopped = np.ones(FLAGS, np.int64)
+    nowhere: Any = _Nowhere()
+    unused: Any = None
     ends = [
-        _End(role, bench, _Nowhere(), part, 0, stopped)
+        _End(role, Share(bench, nowhere, part, unused), 0, np.ones(FLAGS, np.int64))
         for bench, part in zip(benches, parts, strict=True)
     ]
     if role == "plant":

@@ -10,25 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.drive import drive_controller, drive_plant
+from gfm_hil.engine.drive import Share, drive_controller, drive_plant
 from gfm_hil.engine.loop_records import FLAGS, STOP
-from gfm_hil.engine.setup import Bench
-from gfm_hil.engine.timeline import Timeline
-from gfm_hil.links import Link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.links.pump import ported
 from gfm_hil.realtime.priority import stand_back
-from gfm_hil.recording.parts import Part
 
 _LOOK_S = 0.05
 
 
 def run_loop(
     role: Role,
-    benches: Sequence[Bench],
-    links: Sequence[Link],
-    parts: Sequence[Part],
-    timelines: Sequence[Timeline],
+    shares: Sequence[Share],
     t0_ns: int,
     stopped: Callable[[], bool],
     flags: NDArray[np.int64] | None = None,
@@ -40,26 +33,25 @@ def run_loop(
     A link without a port gets a thread that pumps its messages.
 
     Args:
-        benches, links, parts, timelines: of the controller one each; of the plant one for each
-            converter.
+        shares: of the controller one, of the plant one for each converter.
         flags: shape (FLAGS,), what other threads tell the loop, see
             ``gfm_hil.engine.loop_records``.
     """
     if flags is None:
         flags = np.zeros(FLAGS, np.int64)
-    links = [ported(link) for link in links]
-    for link in links:
-        getattr(link, "start", _nothing)()
+    shares = [share._replace(link=ported(share.link)) for share in shares]
+    timelines = [share.timeline for share in shares]
+    for share in shares:
+        getattr(share.link, "start", _nothing)()
     found: list[FrameReader] = []
     failed: list[BaseException] = []
 
     def work() -> None:
         try:
             if role == "plant":
-                found.extend(drive_plant(benches, links, parts, timelines, t0_ns, flags))
+                found.extend(drive_plant(shares, t0_ns, flags))
             else:
-                one = benches[0], links[0], parts[0], timelines[0]
-                found.append(drive_controller(*one, t0_ns, flags))
+                found.append(drive_controller(shares[0], t0_ns, flags))
         except BaseException as problem:  # the caller's thread raises it
             failed.append(problem)
 
@@ -81,8 +73,8 @@ def run_loop(
                 thread.join()
         for timeline in timelines:
             timeline.put_off = False
-        for link in links:
-            getattr(link, "stop", _nothing)()
+        for share in shares:
+            getattr(share.link, "stop", _nothing)()
     if failed:
         raise failed[0]
     return found

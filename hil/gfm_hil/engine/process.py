@@ -18,7 +18,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
-from gfm_hil.engine.drive import compile_loops
+from gfm_hil.engine.drive import Share, compile_loops
 from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
@@ -191,16 +191,8 @@ def _meet_and_run(
             met = {"controller": start.controller, "run": start.run, "one_clock": start.one_clock}
             side.timeline.write(0, "handshake", role=role, **met)  # so that a kill does not lose it
         with Watched(scenario, sides[0].part.progress):
-            readers = run_loop(
-                role,
-                [side.bench for side in sides],
-                [side.link for side in sides],
-                [side.part for side in sides],
-                [side.timeline for side in sides],
-                starts[0].t0_ns,
-                stopped,
-                flags,
-            )
+            shares = [Share(side.bench, side.link, side.part, side.timeline) for side in sides]
+            readers = run_loop(role, shares, starts[0].t0_ns, stopped, flags)
     for side, reader, start in zip(sides, readers, starts, strict=True):
         side.keep_counts(reader, start)
 
