@@ -104,18 +104,28 @@ def endpoints(options: argparse.Namespace) -> dict[str, str]:
     return found
 
 
-def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
+def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Scenario:
     """The scenario with its overrides; ``more`` goes to ``load_scenario``.
+
+    Args:
+        named: the command takes an endpoint for each converter, see ``endpoints``.
 
     Raises:
         UserError: as ``load_scenario``.
     """
+    ends = endpoints(options)
+    for name in ends:
+        if name and not named:
+            raise UserError(
+                f"--endpoint {name}={ends[name]}: for gfmhil plant; here a scenario names it, as"
+                f" network.converters.{name}.link.endpoint"
+            )
     return load_scenario(
         options.scenario,
         OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
         mode=options.mode,
         link__type=options.link,
-        link__endpoint=endpoints(options).get(""),
+        link__endpoint=ends.get(""),
         duration=options.duration,
         seed=options.seed,
         inner=options.inner,

@@ -42,7 +42,7 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Carry one side out; returns the exit code."""
     role: Role = options.command
-    scenario = _of_one(role, resolve(options, law=options.law), options.converter)
+    scenario = _of_one(role, resolve(options, named=True, law=options.law), options.converter)
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     given = _given(scenario, endpoints(options))

@@ -42,19 +42,24 @@ _NAP_NS = 100_000
 
 
 class Share(NamedTuple):
-    """What a role's loop has of one converter."""
+    """What a role's loop has of one converter.
+
+    Attributes:
+        crowded: other loops run on the same processor, so that this one yields it at every look.
+    """
 
     bench: Bench
     link: Link
     part: Part
     timeline: Timeline
+    crowded: bool = False
 
 
 class _End:
     """One end of a link for a compiled loop, and what the loop writes there."""
 
     def __init__(self, role: Role, share: Share, t0_ns: int, flags: NDArray[np.int64]) -> None:
-        bench, link, part, _ = share
+        bench, link, part, *_ = share
         assert link.port is not None
         scenario, port = bench.scenario, link.port
         plant = role == "plant"
@@ -65,7 +70,8 @@ class _End:
         self.loop["spin_limit"] = port.spin_limit
         w, r = self.writer, self.reader
         end = LinkEnd(
-            port.send, port.receive, port.patient or _rest, port.handle, port.spins,
+            port.send, port.receive, port.patient or _rest, port.handle,
+            0 if share.crowded else port.spins,
             (w.sequence, w.frame, w.message), (r.frame, r.message), r.record,
         )  # fmt: skip
         records = Records(

@@ -29,7 +29,12 @@ from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
 from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.realtime.prevent_idle import prevent_idle
-from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
+from gfm_hil.realtime.priority import (
+    ask_for_real_time,
+    no_collector_pauses,
+    ordinary_priority,
+    processors,
+)
 from gfm_hil.recording.log import SEVERITY, Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
@@ -165,8 +170,10 @@ def _meet_and_run(
         UserError: an endpoint cannot be opened.
     """
     scenario = sides[0].scenario
-    place = sides[0].bench.place if role == "controller" else 0
-    rights = ask_for_real_time(role, place) if scenario.mode == "realtime" else None
+    rights = None
+    if scenario.mode == "realtime":
+        several = len(scenario.converters) or 1
+        rights = ask_for_real_time(role, sides[0].bench.place, several)
 
     def stopped() -> bool:
         return interrupt.came
@@ -191,7 +198,11 @@ def _meet_and_run(
             met = {"controller": start.controller, "run": start.run, "one_clock": start.one_clock}
             side.timeline.write(0, "handshake", role=role, **met)  # so that a kill does not lose it
         with Watched(scenario, sides[0].part.progress):
-            shares = [Share(side.bench, side.link, side.part, side.timeline) for side in sides]
+            loops = 1 + len(scenario.converters)
+            crowded = loops > processors() if rights is None else rights["shared"]
+            shares = [
+                Share(side.bench, side.link, side.part, side.timeline, crowded) for side in sides
+            ]
             readers = run_loop(role, shares, starts[0].t0_ns, stopped, flags)
     for side, reader, start in zip(sides, readers, starts, strict=True):
         side.keep_counts(reader, start)

@@ -17,6 +17,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
+from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.scenario.model import Scenario
@@ -124,7 +125,7 @@ class Processes:
                     endpoints[name] = link.endpoint
                 if self.scenario.mode == "realtime":
                     keep_in_memory(self._places[name], self.scenario.ticks, self.notice)
-            self.notice("starting controller and plant …")
+            self._say_what_starts()
             self._plant = _Process("plant", "plant", self.folder, self._plant_command(endpoints))
             self._controllers = {
                 name: _Process(
@@ -146,6 +147,16 @@ class Processes:
                         process.popen.kill()
                         process.popen.wait()
         return began, self._judge()
+
+    def _say_what_starts(self) -> None:
+        loops, room = len(self._places) + 1, processors()
+        if self.scenario.mode == "realtime" and loops > max(room, 2):
+            self.notice(
+                f"{loops} loops in real time share {room} processors: they will miss more ticks"
+                " than with one for each"
+            )
+        which = f"{loops - 1} controllers" if loops > 2 else "controller"
+        self.notice(f"starting {which} and plant …")
 
     def _ours(self, role: Role, folder: Path) -> list[str]:
         """The command of a role of ours without its endpoints."""
