@@ -108,7 +108,8 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
     """The scenario with its overrides; ``more`` goes to ``load_scenario``.
 
     Args:
-        named: the command takes an endpoint for each converter, see ``endpoints``.
+        named: the command takes an endpoint for each converter, see ``endpoints``; the option
+            --converter says that the only one is that of a network's converter.
 
     Raises:
         UserError: as ``load_scenario``.
@@ -125,7 +126,7 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
         OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
         mode=options.mode,
         link__type=options.link,
-        link__endpoint=ends.get(""),
+        link__endpoint=None if named and options.converter is not None else ends.get(""),
         duration=options.duration,
         seed=options.seed,
         inner=options.inner,

@@ -49,7 +49,9 @@ def plant_ticks(sides, plant, last):
     for i in range(len(sides)):
         own = sides[i].records.loop[0]
         spins = min(spins, sides[i].end.spins)
-        patience, repeat = max(patience, own.patience), min(repeat, own.repeat)
+        patience, repeat = min(patience, own.patience), min(repeat, own.repeat)
+    if r.others != 0:  # before the other controllers miss the plant, which waits for one
+        patience //= 2
     delayed = plant_is_delayed(plant)
     # In lockstep a delayed plant sends its next frame right after an answer, so one reading of the
     # clock serves both. A reading stalls the processor: two of them took a tenth of the tick.
