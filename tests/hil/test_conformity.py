@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 import json
 import math
-from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -36,7 +36,6 @@ from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 
 Vector = NDArray[np.float64]
-Change = Callable[[dict[str, Any]], None]
 
 JUMPS = {2.0: -10.0, 7.0: 10.0, 12.0: -25.0, 17.0: 25.0}  # s: degrees
 PEAK = {10.0: 0.3, 25.0: 0.6}  # p.u.
@@ -296,6 +295,24 @@ def test_another_frequency_and_rating_keep_the_elements_per_unit() -> None:
     assert twin.C_dc * twin.V_dcref**2 / twin.S_n == pytest.approx(
         paper.C_dc * paper.V_dcref**2 / paper.S_n
     )
+
+
+def test_a_converter_of_ones_own_lies_beside_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = files("gfm_plant").joinpath("converters/paper.toml").read_text("utf-8")
+    (tmp_path / "mine.toml").write_text(text.replace("S_n = 4000.0", "S_n = 5000.0"))
+    own = 'droop = 0.05\nP_max = 1.0\nP_min = 0.0\n[plant]\nconverter = "mine.toml"\n'
+    (tmp_path / "own.toml").write_text(own)
+    monkeypatch.chdir(tmp_path.parent)
+    under = load_under_test(tmp_path / "own.toml")
+    (case,) = load_cases(["miso/2-rocof"])
+    made = scenario_of(case, case.test.parts[0], under, "droop-3", None, tmp_path / "made")
+    twin = load_converter(made.plant.converter)
+    assert (twin.S_n, twin.omega_n) == (5000.0, pytest.approx(120 * math.pi))
+    (tmp_path / "own.toml").write_text(own.replace("mine", "nobodys"))
+    with pytest.raises(UserError, match=r"plant\.converter = 'nobodys\.toml'"):
+        load_under_test(tmp_path / "own.toml")
 
 
 def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> None:
