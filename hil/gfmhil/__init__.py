@@ -21,6 +21,8 @@ _HOMES = {
     "load_scenario": "gfm_hil.scenario.model",
     "Scenario": "gfm_hil.scenario.model",
     "CampaignResult": "gfm_hil.studies.campaign.result",
+    "Identification": "gfm_hil.studies.identification",
+    "identify": "gfm_hil.studies.identification",
     "Law": "gfm_hil.studies.law",
     "laws": "gfm_hil.studies.law",
     "Loop": "gfm_hil.studies.loop",

@@ -4,6 +4,8 @@ from gfm_hil.results.run import load_run as load_run
 from gfm_hil.scenario.model import Scenario as Scenario
 from gfm_hil.scenario.model import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
+from gfm_hil.studies.identification import Identification as Identification
+from gfm_hil.studies.identification import identify as identify
 from gfm_hil.studies.law import Law as Law
 from gfm_hil.studies.law import laws as laws
 from gfm_hil.studies.loop import Loop as Loop

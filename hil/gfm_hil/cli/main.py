@@ -35,6 +35,7 @@ COMMANDS = {
     "stream": ("stream", "stream what a run records to PlotJuggler, your own tools or Prometheus"),
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
+    "identify": ("identify", "measure a converter's dq admittance, and judge grids by it"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
     "firmware": ("firmware", "export laws as C99, and check them on a processor, bit by bit"),
