@@ -34,13 +34,15 @@ _HOMES = {
     "LawError": "gfm_runtime.errors",
 }
 
-__all__ = sorted([*_HOMES, "design"])
+_MODULES = ("design", "envelopes")
+
+__all__ = sorted([*_HOMES, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for, when it is."""
-    if name == "design":
-        return import_module("gfmhil.design")
+    if name in _MODULES:
+        return import_module(f"gfmhil.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'gfmhil' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

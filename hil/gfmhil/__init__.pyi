@@ -15,3 +15,4 @@ from gfm_hil.studies.notebook import compare as compare
 from gfm_hil.studies.notebook import run as run
 from gfm_runtime.errors import LawError as LawError
 from gfmhil import design as design
+from gfmhil import envelopes as envelopes
