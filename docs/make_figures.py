@@ -14,6 +14,7 @@ from pathlib import Path
 from _ext.outputs import command
 from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
+from _figures.identification import envelope, identification
 from _figures.inner_stage import inner_stage
 from _figures.limit_cycle import limit_cycles
 from _figures.services import services
@@ -51,6 +52,8 @@ def main() -> None:
     eigenvalues.q_droop_table()
     limit_cycles()
     inner_stage()
+    identification()
+    envelope()
     failed_assertion()
     from_mf4()
     services()

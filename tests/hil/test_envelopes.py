@@ -156,7 +156,8 @@ def test_the_inertia_of_a_ramp_is_that_of_the_law_less_the_lag_of_the_line(law: 
 
 def test_a_law_makes_a_unit_of_its_converter() -> None:
     unit = measure_unit("vsg-2", plant__grid={"scr": 3.0, "x_over_r": 10.0})
-    assert [unit.D, unit.H] == pytest.approx([100.0, 8.361], rel=0.02)
+    damping, inertia = unit.D, unit.H
+    assert damping == pytest.approx(100.0, rel=0.02) and inertia == pytest.approx(8.361, rel=0.02)
     assert unit.X_eff == pytest.approx(load_converter("paper").pu()["L_f"], abs=0.005)
     more = measure_unit("vsg-2", inner="virtual-stator", plant__grid={"scr": 3.0, "x_over_r": 10.0})
     assert more.X_eff == pytest.approx(0.3, rel=0.1)  # X_v of the stage
