@@ -86,7 +86,10 @@ def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) 
     """Run several converters, each of which gets a run folder of its own."""
     for name in ("scope", "stream", "modbus"):
         if getattr(options, name) is not None:
-            raise UserError(f"--{name}: looks at one converter; a network runs without it")
+            raise UserError(
+                f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
+                " folder of a converter"
+            )
     with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
         figures = not options.no_figures
         runs = run_network(scenario, folder, progress, notice, figures=figures)
