@@ -142,6 +142,7 @@ def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["vsg-2", "--amplitude", "1"], "would move V_g by"),
         (["vsg-2", "--amplitude", "-1"], "amplitude = -1.0: must be > 0"),
         (["vsg-2", "--settle", "-1"], "settle_s = -1.0: must be >= 0 s"),
+        (["vsg-2", "--window", "99"], "window_s = 99.0: must lie in [0, 60] s"),
         (["three_share_a_load"], "identify measures one converter"),
         (["small_grid_load_step"], "plant.grid.finite: such a grid sets its own frequency"),
         (["pref_step", "--inner", "nothing"], "nothing"),
@@ -171,7 +172,7 @@ def test_an_unstable_loop_is_refused() -> None:
 
 def test_tones_have_whole_periods_in_their_window() -> None:
     for start, stop, points in ((1.0, 1000.0, 40), (0.3, 4400.0, 200), (49.0, 51.0, 5)):
-        bands = _bands(start, stop, points, 1e-4)
+        bands = _bands(start, stop, points, 1e-4, 0.2)
         hz = np.concatenate([band.hz for band in bands])
         assert len(hz) == points and (np.diff(hz) > 0).all()
         assert hz == pytest.approx(np.geomspace(start, stop, points), rel=0.2)

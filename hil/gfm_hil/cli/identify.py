@@ -15,7 +15,13 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
 from gfm_hil.scenario.model import find_scenario
-from gfm_hil.studies.identification import AMPLITUDE, POINTS, Identification, identify
+from gfm_hil.studies.identification import (
+    AMPLITUDE,
+    POINTS,
+    WINDOW_S,
+    Identification,
+    identify,
+)
 from gfm_runtime import law_names
 from gfm_runtime.toml_file import read_toml
 
@@ -45,6 +51,9 @@ def add(command: argparse.ArgumentParser) -> None:
                          help=f"of each tone, p.u. and rad; {AMPLITUDE:g} by default")  # fmt: skip
     command.add_argument("--settle", type=float, metavar="S",
                          help="time before each window, s; chosen by default")  # fmt: skip
+    command.add_argument("--window", type=float, default=WINDOW_S, metavar="S",
+                         help="least length of a window, s; a longer one averages noise out; "
+                         f"{WINDOW_S:g} by default")  # fmt: skip
     command.add_argument(
         "--grid", action="append", default=[], type=_grid, metavar="SCR:XR",
         help="judge stability on a grid of this SCR and X/R from the measured Y; may be repeated",
@@ -69,6 +78,7 @@ def call(options: argparse.Namespace) -> int:
         found = identify(
             law, scenario, inner=options.inner, start_hz=options.start, stop_hz=options.stop,
             points=options.points, amplitude=options.amplitude, settle_s=options.settle,
+            window_s=options.window,
             controller_command=shlex.split(options.controller or ""),
             tell=lambda text: bar.update(task, description=text),
         )  # fmt: skip

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
-POINTS, AMPLITUDE, SETTLE_S = 40, 1e-4, 2.0
+POINTS, AMPLITUDE, SETTLE_S, WINDOW_S = 40, 1e-4, 2.0, 0.2
 _PERIODS = 5  # of the slowest tone of a band in its window, at least
 _LINES = 40  # of the profile in a period of the fastest tone of a band, at least
 _MOST_LINES = 90_000  # of a file; a profile may have 100,000
@@ -315,6 +315,7 @@ def identify(
     points: int = POINTS,
     amplitude: float = AMPLITUDE,
     settle_s: float | None = None,
+    window_s: float = WINDOW_S,
     controller_command: Sequence[str] = (),
     tell: Callable[[str], None] = lambda text: None,
 ) -> Identification:
@@ -331,6 +332,7 @@ def identify(
         settle_s: how long each band of tones sounds before its window, s. If None, it follows from
             the slowest mode of the linear model, or is 2 s where there is none, and is doubled, up
             to 60 s, while the two ends of a window differ; noise needs a given one.
+        window_s: least length of a window, s; a longer one averages noise out.
         controller_command: program and arguments of another controller, which runs over the
             scenario's link; it has no model.
         tell: told what goes on.
@@ -352,7 +354,7 @@ def identify(
         if not foreign:
             name, Y_of, slowest = _model(scenario)
             name = law.name if isinstance(law, Law) else name
-        bands = _bands(start_hz, stop_hz, points, scenario.T_s)
+        bands = _bands(start_hz, stop_hz, points, scenario.T_s, window_s)
         given = settle_s is not None
         if settle_s is None:
             settle_s = SETTLE_S
@@ -407,7 +409,9 @@ def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float
     return name, admittance, worst.sigma
 
 
-def _bands(start_hz: float, stop_hz: float, points: int, T_s: float) -> list[_Band]:
+def _bands(
+    start_hz: float, stop_hz: float, points: int, T_s: float, window_s: float
+) -> list[_Band]:
     """The tones by decade.
 
     Raises:
@@ -421,6 +425,8 @@ def _bands(start_hz: float, stop_hz: float, points: int, T_s: float) -> list[_Ba
         )
     if not 2 <= points <= 1000:
         raise UserError(f"points = {points}: must lie in [2, 1000]")
+    if not 0.0 <= window_s <= _LONGEST_S:
+        raise UserError(f"window_s = {window_s}: must lie in [0, {_LONGEST_S:g}] s")
     wanted = np.geomspace(start_hz, stop_hz, points)
     decades = math.ceil(math.log10(stop_hz / start_hz) - 1e-9)
     decade = np.minimum(np.floor(np.log10(wanted / start_hz) + 1e-9), decades - 1)
@@ -430,7 +436,8 @@ def _bands(start_hz: float, stop_hz: float, points: int, T_s: float) -> list[_Ba
     for k in np.unique(decade):
         hz = wanted[decade == k]
         every = max(1, math.floor(1.0 / (_LINES * hz[-1] * T_s)))
-        window = math.ceil(periods / (hz[0] * T_s * every) - 1e-9) * every
+        seconds = max(periods / hz[0], window_s)
+        window = math.ceil(seconds / (T_s * every) - 1e-9) * every
         step = 1.0 / (window * T_s)
         tones = step * np.unique(np.floor(hz / step + 0.5))
         bands.append(_Band(tones, every, window))

@@ -143,7 +143,12 @@ def _bode(
     """A curve of the model and the measured points over it."""
     if model is not None:
         gain.loglog(hz, np.abs(model), color=COLOURS[1], lw=1.2, label="linear model")
-        phase.semilogx(hz, np.degrees(np.angle(model)), color=COLOURS[1], lw=1.2)
+        turn = np.degrees(np.angle(model))
+        wraps = np.flatnonzero(np.abs(np.diff(turn)) > 180.0) + 1  # where no line is drawn
+        phase.semilogx(
+            np.insert(hz, wraps, hz[wraps]), np.insert(turn, wraps, np.nan),
+            color=COLOURS[1], lw=1.2,
+        )  # fmt: skip
     gain.loglog(hz, np.abs(measured), "o", color=COLOURS[0], ms=3.5, label="measured")
     phase.semilogx(hz, np.degrees(np.angle(measured)), "o", color=COLOURS[0], ms=3.5)
     phase.set(ylim=(-190, 190), yticks=(-180, -90, 0, 90, 180))
