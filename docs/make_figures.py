@@ -1,9 +1,9 @@
-"""Figures and tables of start, experiments, cli, deploy, testing, streams: runs and writes
+"""Figures and tables of start, experiments, identification, cli and more: runs and writes
 
     docs/_static/figures/*.png    the figures
     docs/tables/*.md              the numbers that the page quotes
 
-Usage: python docs/make_figures.py    (about a minute; nothing else is needed)
+Usage: python docs/make_figures.py    (some minutes; nothing else is needed)
 """
 
 from __future__ import annotations
