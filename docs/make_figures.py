@@ -1,9 +1,9 @@
-"""Figures and tables of start, experiments, cli, deploy, testing, streams: runs and writes
+"""Figures and tables of start, experiments, identification, cli and more: runs and writes
 
     docs/_static/figures/*.png    the figures
     docs/tables/*.md              the numbers that the page quotes
 
-Usage: python docs/make_figures.py    (about a minute; nothing else is needed)
+Usage: python docs/make_figures.py    (some minutes; nothing else is needed)
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from _ext.outputs import command
 from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
+from _figures.identification import envelope, identification
 from _figures.inner_stage import inner_stage
 from _figures.limit_cycle import limit_cycles
 from _figures.services import services
@@ -51,6 +52,8 @@ def main() -> None:
     eigenvalues.q_droop_table()
     limit_cycles()
     inner_stage()
+    identification()
+    envelope()
     failed_assertion()
     from_mf4()
     services()

@@ -22,6 +22,8 @@ _HOMES = {
     "load_scenario": "gfm_hil.scenario.model",
     "Scenario": "gfm_hil.scenario.model",
     "CampaignResult": "gfm_hil.studies.campaign.result",
+    "Identification": "gfm_hil.studies.identification",
+    "identify": "gfm_hil.studies.identification",
     "Law": "gfm_hil.studies.law",
     "laws": "gfm_hil.studies.law",
     "Loop": "gfm_hil.studies.loop",
@@ -35,13 +37,15 @@ _HOMES = {
     "LawError": "gfm_runtime.errors",
 }
 
-__all__ = sorted([*_HOMES, "design"])
+_MODULES = ("design", "envelopes")
+
+__all__ = sorted([*_HOMES, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for, when it is."""
-    if name == "design":
-        return import_module("gfmhil.design")
+    if name in _MODULES:
+        return import_module(f"gfmhil.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'gfmhil' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

@@ -5,6 +5,8 @@ from gfm_hil.scenario.model import Scenario as Scenario
 from gfm_hil.scenario.model import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
 from gfm_hil.studies.conformity.result import Conformity as Conformity
+from gfm_hil.studies.identification import Identification as Identification
+from gfm_hil.studies.identification import identify as identify
 from gfm_hil.studies.law import Law as Law
 from gfm_hil.studies.law import laws as laws
 from gfm_hil.studies.loop import Loop as Loop
@@ -15,3 +17,4 @@ from gfm_hil.studies.notebook import conform as conform
 from gfm_hil.studies.notebook import run as run
 from gfm_runtime.errors import LawError as LawError
 from gfmhil import design as design
+from gfmhil import envelopes as envelopes

@@ -37,6 +37,7 @@ COMMANDS = {
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
+    "identify": ("identify", "measure a converter's dq admittance, and judge grids by it"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
     "firmware": ("firmware", "export laws as C99, and check them on a processor, bit by bit"),

@@ -92,7 +92,12 @@ def _next_frame(end, records, r, ctl, sent):
     before = now_ns()
     gap = before - sent if r.realtime and sent > 0 else 0
     if r.realtime and r.done > 0 and flags[STOP] == 0:
-        wake = min(r.t0 + (r.tick + 1) * r.T + int(r.phase) - AHEAD_NS, before + r.T)
+        due = r.t0 + (r.tick + 1) * r.T
+        wake = min(due + int(r.phase) - AHEAD_NS, before + r.T)
+        if end.spins == 0 and due > before:
+            # Others need the processor too. Without any rest the kernel would throttle all real
+            # time on it for 50 ms in each second.
+            wake = max(wake, min(before + r.T // 2, due))
         if wake > before:
             sleep_until(wake)
             slept = True

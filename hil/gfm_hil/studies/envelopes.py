@@ -1,0 +1,361 @@
+"""What a grid-forming unit of given damping, inertia and reactance is expected to do, and the fit.
+
+The unit is a voltage behind X_eff whose angle follows the swing equation 2 H w' = -P - D w, on a
+grid of reactance 1/SCR; all powers are changes, p.u. of its rating. The responses and envelopes are
+those of DyCoV (dynawo/dyn-grid-compliance-verification, RTE and AIA, MPL-2.0), `generateEnvelopes`
+for the French DTR sheet I18, written anew from its published method. They reproduce two things
+that a derivation would not give:
+
+- after a phase jump an overdamped unit has the numerator s + D/(2H), an underdamped one s + 1
+  (with D/(2H) = 9.5 1/s in DyCoV's own example this is not the same);
+- after a ramp of frequency the power settles at 2 H + D T_pll times the rate: the damping acts
+  against a PLL and not against the nominal frequency, so that no droop is known.
+
+The tolerances of DyCoV change from version to version; those here are of the curves under
+docs/GFM_envelopes_curves at its commit b7576cb0. Its envelopes for RoCoF and SCR jumps follow other
+rules in every version; here these two events have the expected response alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.studies.law import Law
+from gfm_hil.studies.notebook import run
+from gfm_plant import make_plant
+
+Vector = NDArray[np.float64]
+
+OMEGA_B = 314.0  # rad/s, as DyCoV rounds it
+_APART = 1e-5  # of the poles' size; closer ones are moved this far from each other
+_TUNNEL_S, _TUNNEL_FROM = 0.3, 0.02  # s; how the tunnel opens
+_T_90 = 0.01  # s; reactive current after a step of the grid's voltage
+_WIDE_S = 0.08  # s; until when its upper limit is wider
+_REST_S, _SAMPLES = 0.1, 4000  # before the jump of a measurement, and at most in its fit
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A grid-forming unit as the envelopes know it.
+
+    Attributes:
+        D: damping, p.u. of power per p.u. of frequency.
+        H: inertia constant, s.
+        X_eff: effective reactance, p.u. of the unit.
+    """
+
+    D: float
+    H: float
+    X_eff: float
+
+    def __post_init__(self) -> None:
+        for name in ("D", "H", "X_eff"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and (value > 0 or (name == "D" and value == 0))):
+                raise UserError(f"{name} = {value}: must be {'>= 0' if name == 'D' else '> 0'}")
+
+    def times(self, D: float, H: float) -> Unit:
+        """The unit with other damping and inertia, as factors."""
+        return Unit(self.D * D, self.H * H, self.X_eff)
+
+    def damping_ratio(self, X: float, omega_b: float = OMEGA_B) -> float:
+        """Damping ratio of the swing on a total reactance X, p.u.; omega_b in rad/s."""
+        return self.D / 2 * math.sqrt(X / (2 * self.H * omega_b))
+
+    def swing(self, X: float, omega_b: float = OMEGA_B) -> list[float]:
+        """The polynomial s^2 + D/(2H) s + omega_b/(2 H X), in falling powers of s [1/s]."""
+        return [1.0, self.D / (2 * self.H), omega_b / (2 * self.H * X)]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What an envelope allows; the defaults are those of DyCoV's published curves.
+
+    Attributes:
+        low, high: of the expected change: it may be high times as large at the start, after
+            ``start_s``, and 1 + low times.
+        ratio: factors of D, at which H is divided by the same, whose responses are allowed too.
+        part, least: the tunnel that opens around the response: a part of the first change, and
+            least p.u.
+        start_s: time until the smaller response must be there, s.
+        delay_s: by which all is late for waveforms, where power is a mean over a cycle, s.
+    """
+
+    low: float = 0.4
+    high: float = 0.4
+    ratio: tuple[float, float] = (0.85, 1.15)
+    part: float = 0.05
+    least: float = 0.02
+    start_s: float = 0.01
+    delay_s: float = 0.02
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """An expected response and the limits around it, shape (K,) each.
+
+    Attributes:
+        t: s after the event.
+        expected, lower, upper: p.u.
+    """
+
+    t: Vector
+    expected: Vector
+    lower: Vector
+    upper: Vector
+
+    def outside(self, t: Sequence[float] | Vector, x: Sequence[float] | Vector) -> Vector:
+        """By how much x [p.u.] at t [s after the event] is outside, shape (len(t),); 0 inside."""
+        low, high = (np.interp(t, self.t, limit) for limit in (self.lower, self.upper))
+        return np.asarray(np.maximum(np.maximum(low - x, np.asarray(x) - high), 0.0))
+
+
+def phase_jump(
+    unit: Unit,
+    t: Vector,
+    radians: float,
+    scr: float,
+    P_0: float,
+    tolerance: Tolerance | None = None,
+) -> Envelope:
+    """The envelope of P after the grid's angle jumps ahead.
+
+    Args:
+        t: s after the event, evenly apart, from 0 on.
+        radians: of the jump.
+        scr: short-circuit ratio.
+        P_0: power before, p.u.
+
+    Raises:
+        UserError: a value that cannot be.
+    """
+    rule, X = tolerance or Tolerance(), unit.X_eff + _reactance(scr)
+    first = abs(radians) / X
+    units = [unit, *(unit.times(k, 1 / k) for k in rule.ratio)]
+    each = [first * jump_response(one, t, X) for one in units]
+    if unit.damping_ratio(X) > 1:
+        less, more = rule.high * each[0], (1 + rule.low) * each[0]
+    else:  # around the decay of the oscillation, which both limits follow
+        decay = first * np.exp(-unit.D / (4 * unit.H) * t)
+        less, more = (1 - rule.low) * decay, (1 + rule.high) * decay
+        more = _late(t, rule.start_s, more, more[0])
+    each += [more, _late(t, rule.start_s, less, 0.0)]
+    opens = max(rule.least, rule.part * first) * (1 - np.exp((_TUNNEL_FROM - t) / _TUNNEL_S))
+    least, most = np.min(each, axis=0) - opens, np.max(each, axis=0) + opens
+    sign = math.copysign(1.0, radians)
+    curves = (P_0 - sign * x for x in (each[0], least, most))
+    expected, one, other = (_late(t, rule.delay_s, x, x[0]) for x in curves)
+    return Envelope(t, expected, np.minimum(one, other), np.maximum(one, other))
+
+
+def amplitude_step(
+    unit: Unit, t: Vector, step: float, scr: float, tolerance: Tolerance | None = None
+) -> Envelope:
+    """The envelope of the reactive current after the grid's voltage falls by ``step`` p.u.
+
+    X_eff is that against a change of voltage. Arguments and errors as for ``phase_jump``.
+    """
+    rule, X = tolerance or Tolerance(high=0.3), unit.X_eff + _reactance(scr)
+    final = step / X
+    tunnel = max(rule.least, rule.part * abs(final))
+    expected = abs(final) * (1 - np.exp(t * math.log(0.1) / _T_90))
+    least = np.minimum(expected, abs(final) - tunnel)
+    wide = abs(final) * (1 + rule.high * np.exp(-3 * t / _WIDE_S)) + tunnel
+    most = np.where(t < _WIDE_S, wide, abs(final) + tunnel)
+    sign = math.copysign(1.0, final)
+    one, other = (sign * _late(t, rule.delay_s, x, x[0]) for x in (least, most))
+    return Envelope(t, sign * expected, np.minimum(one, other), np.maximum(one, other))
+
+
+def jump_response(unit: Unit, t: Vector, X: float, omega_b: float = OMEGA_B) -> Vector:
+    """Power after a phase jump over the first power, shape as t [s]; X is the total reactance."""
+    zero = unit.D / (2 * unit.H) if unit.damping_ratio(X, omega_b) > 1 else 1.0
+    return _impulse([1.0, zero], unit.swing(X, omega_b), t)
+
+
+def rocof_response(
+    unit: Unit, t: Vector, rate: float, scr: float, T_pll: float = 0.01, lasts: float = math.inf
+) -> Vector:
+    """The expected change of P during and after a ramp of the grid's frequency, p.u.
+
+    Args:
+        t: s after the event.
+        rate: p.u. of frequency per s.
+        T_pll: time constant of the PLL against which the damping acts, s.
+        lasts: how long the ramp lasts, s.
+    """
+    X = unit.X_eff + _reactance(scr)
+    swing = unit.swing(X)
+    numerator = swing[2] * np.array([2 * unit.H * T_pll, 2 * unit.H + unit.D * T_pll])
+    poles = np.asarray(np.polymul([T_pll, 1.0, 0.0], swing), float)
+
+    def ramp(since: Vector) -> Vector:
+        return np.where(since >= 0, _impulse(numerator, poles, np.maximum(since, 0.0)), 0.0)
+
+    return np.asarray(-rate * (ramp(t) - (ramp(t - lasts) if math.isfinite(lasts) else 0.0)))
+
+
+def scr_jump_response(unit: Unit, t: Vector, before: float, after: float, P_0: float) -> Vector:
+    """The expected change of P after the short-circuit ratio jumps, p.u., shape as t [s].
+
+    Args:
+        before, after: short-circuit ratios.
+        P_0: power before, p.u.
+    """
+    X = unit.X_eff + _reactance(after)
+    first = (_reactance(before) - _reactance(after)) * P_0 / X
+    return first * _impulse([1.0, unit.D / (2 * unit.H)], unit.swing(X), t)
+
+
+def fit_jump(
+    t: Vector, change: Vector, radians: float, omega_b: float, X_grid: float, skip_s: float = 0.0
+) -> Unit:
+    """The unit whose swing equation fits a change of power after a phase jump.
+
+    The numerator is s + D/(2H) in any case, as the swing equation has it.
+
+    Args:
+        t, change: s after the jump, and p.u., shape (K,).
+        radians: by which the grid's angle jumped ahead.
+        omega_b: rad/s.
+        X_grid: reactance between the unit and the grid's voltage, p.u.; it is not part of X_eff.
+        skip_s: what is left out at the beginning, s: the circuit's own transient.
+
+    Raises:
+        UserError: nothing fits.
+    """
+    used = t >= skip_s
+    at, p = t[used], change[used]
+
+    def off(z: Vector) -> Vector:
+        X, zero, stiff = np.exp(z)
+        return -radians / X * _impulse([1.0, zero], [1.0, zero, stiff], at) - p
+
+    largest = float(np.abs(p).max())
+    if not largest > 0:
+        raise UserError("fit: the power does not change")
+    X_0 = abs(radians) / largest
+    starts = [(zero, stiff) for zero in (1.0, 10.0, 100.0) for stiff in (10.0, 300.0, 3000.0)]
+    found = [least_squares(off, np.log([X_0, *start]), x_scale=1.0) for start in starts]
+    best = min(found, key=lambda one: one.cost)
+    X, zero, stiff = (float(x) for x in np.exp(best.x))
+    rms = math.sqrt(2 * best.cost / len(p))
+    if not rms < 0.1 * largest:
+        raise UserError(f"fit: no swing equation fits: {rms:.2g} p.u. RMS are left")
+    H = omega_b / (2 * stiff * X)
+    X_eff = float(X - X_grid)
+    if X_eff <= 0:
+        raise UserError(f"fit: X = {X:.4g} p.u. in all: must be above X_grid = {X_grid:g} p.u.")
+    return Unit(2 * H * zero, H, X_eff)
+
+
+def fit_ramp(t: Vector, change: Vector, rate: float, settled_s: float) -> tuple[float, float]:
+    """D and H by the power during a ramp of the grid's frequency, once transients are gone.
+
+    Then P = -rate (D t + 2 H'), with H' = H - D^2 X / (2 omega_b) for a unit on a reactance X: the
+    angle across X lags behind the ramp.
+
+    Args:
+        t, change: s after the beginning of the ramp, and p.u., shape (K,).
+        rate: p.u. of frequency per s.
+        settled_s: from when on the power is a straight line, s.
+
+    Returns:
+        D in p.u./p.u. and H' in s.
+
+    Raises:
+        UserError: fewer than two samples are left.
+    """
+    used = t >= settled_s
+    if rate == 0.0 or np.count_nonzero(used) < 2:
+        raise UserError(
+            f"rate = {rate:g}, settled_s = {settled_s:g}: need a ramp, and samples in it"
+        )
+    slope, level = np.polyfit(t[used], change[used], 1)
+    return float(-slope / rate), float(-level / (2 * rate))
+
+
+def measure_unit(
+    law: str | Path | Law | None = None,
+    on: str | Path | Scenario = "pref_step",
+    *,
+    degrees: float = 0.5,
+    seconds: float = 4.0,
+    **changes: Any,
+) -> Unit:
+    """D, H and X_eff of a converter under a law, fitted to its power after a phase jump.
+
+    Args:
+        law: name, law file or ``Law``; the scenario's own if None.
+        on: scenario, of which no event counts; its line is not part of X_eff.
+        degrees: of the jump; a small one, so that nothing limits and nothing bends.
+        seconds: of the fit, after the jump.
+        changes: keys of the scenario, as for ``gfmhil.run``.
+
+    Raises:
+        UserError: a mistake, a run that does not complete, or no swing equation fits.
+        LawError: the law is none.
+    """
+    if not (0 < abs(degrees) <= 30 and 0.1 <= seconds <= 60):
+        raise UserError(
+            f"degrees = {degrees:g}, seconds = {seconds:g}: must lie in [-30, 30] without 0, and "
+            "in [0.1, 60]"
+        )
+    start = load_scenario(on, in_process=True, **changes)
+    kept = {"inner", "T_s", "seed", "references", "plant", "law"}
+    content = start.model_dump(mode="json", exclude_none=True, include=kept)
+    jump = {"type": "grid-phase-jump", "t": _REST_S, "degrees": degrees}
+    more = {"title": start.title, "duration": _REST_S + seconds, "events": [jump]}
+    made = run(content | more, law)
+    if made.status not in ("completed", "oscillating"):
+        reason = made.summary["reason"]
+        raise UserError(f"the run after the jump ended as {made.status}: {reason}")
+    par = make_plant(start.plant, start.T_s).par[0]
+    first, cycle = round(_REST_S / start.T_s), round(2 * math.pi / par["omega_b"] / start.T_s)
+    p = made.signals["p"]
+    # a mean over one cycle takes the offset of the line's current out of it
+    means = np.convolve(p - p[first - 1], np.ones(cycle) / cycle, "valid")[first - cycle // 2 :]
+    t = np.asarray(start.T_s * np.arange(len(means)), float)
+    every = max(1, len(t) // _SAMPLES)
+    return fit_jump(
+        t[::every], means[::every], math.radians(degrees), float(par["omega_b"]),
+        float(par["L_g"]), 1.5 * cycle * start.T_s,
+    )  # fmt: skip
+
+
+def _reactance(scr: float) -> float:
+    if not scr > 0:
+        raise UserError(f"scr = {scr}: must be > 0")
+    return 1.0 / scr
+
+
+def _impulse(
+    numerator: Sequence[float] | Vector, denominator: Sequence[float] | Vector, t: Vector
+) -> Vector:
+    """The impulse response of a strictly proper transfer function, by its residues."""
+    poles = np.roots(denominator).astype(complex)
+    size = max(float(np.abs(poles).max()), 1e-12)
+    for k in range(1, len(poles)):
+        while (np.abs(poles[k] - poles[:k]) < _APART * size).any():
+            poles[k] += 2 * _APART * size
+    out = np.zeros(len(t), complex)
+    for k, pole in enumerate(poles):
+        others = np.prod(pole - np.delete(poles, k))
+        out += np.polyval(numerator, pole) / others * np.exp(pole * t)
+    return np.asarray(out.real / denominator[0])
+
+
+def _late(t: Vector, seconds: float, x: Vector, before: float) -> Vector:
+    """x by whole samples later, and ``before`` until then."""
+    samples = int(seconds / (t[1] - t[0]))
+    return np.concatenate([np.full(samples, before), x])[: len(x)]

@@ -1,0 +1,742 @@
+"""The dq admittance of a converter with its controller, measured on the bench by injection.
+
+The grid's voltage carries small sines, once along itself (d: its length) and once across (q: its
+frequency, hence its angle); a grid profile plays them, so that any controller can be measured, and
+any link does. All tones of a decade sound together, each with a whole number of periods in the
+window of that decade, after a time in which transients decay.
+
+A run records the state of the circuit at each tick. Between two ticks the circuit is linear and
+every voltage source is a phasor that turns steadily, so the Fourier coefficients of v(t) and i_o(t)
+over the window are integrals over the continuous signals and not sums over samples: with
+w' = A w + B s, a window from t_0 of length T has
+
+    W(omega) = (j omega - A)^-1 (B S(omega) + (w(t_0) e^(-j omega t_0) - w(t_0 + T) e^(...)) / T).
+
+Nothing aliases in them, although the samples have images of the injection and of the held commands
+at multiples of the sampling frequency. That the recorded states follow this equation from tick to
+tick is checked: where a limit of the bridge acts, they do not.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.margins.admittance import (
+    GridStability,
+    eigenloci,
+    grid_stability,
+    line_impedance,
+    passivity,
+)
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
+from gfm_hil.recording.run import controlled_by
+from gfm_hil.results.run import Run
+from gfm_hil.results.runner import run_in_memory, run_scenario
+from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
+from gfm_hil.studies.law import Law
+from gfm_hil.studies.loop import scenario_loop
+from gfm_plant import NoEquilibrium, make_plant
+from gfm_plant.wiring import GRID_SOURCE
+from gfm_runtime.signals import carried
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Vector = NDArray[np.float64]
+Response = NDArray[np.complex128]
+
+POINTS, AMPLITUDE, SETTLE_S, WINDOW_S = 40, 1e-4, 2.0, 0.2
+_PERIODS = 5  # of the slowest tone of a band in its window, at least
+_LINES = 40  # of the profile in a period of the fastest tone of a band, at least
+_MOST_LINES = 90_000  # of a file; a profile may have 100,000
+_SETTLED = 3e-4  # by how much the two ends of a window may differ, over the largest deviation in it
+_FOLLOWS = 1e-9  # p.u., between a recorded state and the one that the circuit's equations give
+_ROOM = {"omega_g": 0.18, "V_g": 0.2}  # p.u.; how far the injection may lead
+_SHRINK = 1e6  # transients shrink by this factor in the time to settle, by the linear model
+_LONGEST_S = 60.0
+
+_COMMANDS = carried("u", True)
+#: columns of admittance.csv after f_hz
+_CELLS = ("dd", "dq", "qd", "qq")
+
+
+@dataclass(frozen=True, repr=False)
+class Identification:
+    """A measured admittance, the linear model's beside it, and what follows from them.
+
+    Y is that of the converter at its terminal, the filter capacitor: the current into it is Y v, in
+    the dq frame that turns steadily with the grid and lies on the converter's own frame at rest;
+    p.u. of 1/Z_b. It is the inverse of ``Loop.output_impedance``.
+
+    Attributes:
+        name: of the law, or what a controller that is not ours calls itself.
+        scenario: where it was measured.
+        frequency: Hz in the dq frame, shape (K,).
+        Y: measured, shape (K, 2, 2), rows: current, columns: voltage.
+        model: that of the linear model, shape (K, 2, 2); None for a controller that is not ours.
+        nfp: network frequency perturbation: change of the power that the converter gives over the
+            change of the grid's frequency behind the line, p.u. over p.u., shape (K,).
+        nfp_model: the same of the linear model, or None.
+        line: R and L of the grid of the measurement, p.u.
+        omega: base and grid frequency, rad/s and p.u.
+        amplitude: of each tone, p.u. and rad.
+        settle_s: time before each window, s.
+        settled: largest difference between the ends of a window, over the largest deviation in it.
+    """
+
+    name: str
+    scenario: Scenario
+    frequency: Vector
+    Y: Response
+    model: Response | None
+    nfp: Response
+    nfp_model: Response | None
+    line: tuple[float, float]
+    omega: tuple[float, float]
+    amplitude: float
+    settle_s: float
+    settled: float
+
+    @cached_property
+    def deviation(self) -> Vector | None:
+        """Of Y from the model: Frobenius norm of the difference over that of the model, (K,)."""
+        if self.model is None:
+            return None
+        norm = np.linalg.norm(self.model, axis=(1, 2))
+        return np.asarray(np.linalg.norm(self.Y - self.model, axis=(1, 2)) / norm)
+
+    @property
+    def passivity(self) -> Vector:
+        """The least eigenvalue of Y + Y^H, p.u., shape (K,): negative where Y is not passive."""
+        return passivity(self.Y)
+
+    def grid(self, scr: float, x_over_r: float) -> Response:
+        """The dq impedance of a grid, shape (K, 2, 2), p.u.
+
+        Args:
+            scr: its short-circuit ratio at the filter capacitor.
+            x_over_r: its X/R at nominal frequency.
+
+        Raises:
+            UserError: one of them is not > 0.
+        """
+        for name, value in (("scr", scr), ("x_over_r", x_over_r)):
+            if not (math.isfinite(value) and value > 0):
+                raise UserError(f"{name} = {value}: must be > 0")
+        R = 1.0 / (scr * math.hypot(1.0, x_over_r))
+        return self._impedance(R, x_over_r * R)
+
+    def stability(self, scr: float, x_over_r: float) -> GridStability:
+        """Whether the converter is stable on a grid, from the measured Y alone.
+
+        Y belongs to the operating point of the measurement, which another grid would move.
+
+        Args:
+            scr, x_over_r: as for ``grid``.
+
+        Raises:
+            UserError: as ``grid``.
+        """
+        here = self._impedance(*self.line)
+        return grid_stability(self.frequency, self.Y, self.grid(scr, x_over_r), here)
+
+    def plot(self) -> list[Axes]:
+        """Draw the four entries of Y over Hz, measured and of the model, gain and phase."""
+        from gfm_hil.studies.identification_figures import draw_admittance
+
+        return draw_admittance(self)
+
+    def plot_passivity(self) -> list[Axes]:
+        """Draw the least eigenvalue of Y + Y^H, and the deviation from the model, over Hz."""
+        from gfm_hil.studies.identification_figures import draw_passivity
+
+        return draw_passivity(self)
+
+    def plot_nfp(self) -> list[Axes]:
+        """Draw the network-frequency-perturbation plot: gain and phase over Hz."""
+        from gfm_hil.studies.identification_figures import draw_nfp
+
+        return draw_nfp(self)
+
+    def plot_nyquist(self, scr: float, x_over_r: float) -> Axes:
+        """Draw the eigenvalues of Z Y for a grid, arguments as ``grid``."""
+        from gfm_hil.studies.identification_figures import draw_nyquist
+
+        return draw_nyquist(self, scr, x_over_r)
+
+    def eigenloci(self, scr: float, x_over_r: float) -> Response:
+        """The eigenvalues of Z Y for a grid, shape (K, 2); arguments and errors as ``grid``."""
+        return eigenloci(self.Y, self.grid(scr, x_over_r))
+
+    def summary(self) -> dict[str, Any]:
+        """What was measured, and how, as plain data."""
+        p, dev = self.passivity, self.deviation
+        out: dict[str, Any] = {
+            "name": self.name,
+            "scenario": self.scenario.title,
+            "from_hz": float(self.frequency[0]),
+            "to_hz": float(self.frequency[-1]),
+            "points": len(self.frequency),
+            "amplitude": self.amplitude,
+            "settle_s": self.settle_s,
+            "settled": self.settled,
+            "line": {"R_g": self.line[0], "L_g": self.line[1]},
+            "passive": bool((p >= 0.0).all()),
+            "not_passive_hz": _stretches(self.frequency, p < 0.0),
+            "least_eigenvalue": float(p.min()),
+        }
+        if dev is not None:
+            k = int(np.argmax(dev))
+            out |= {"largest_deviation": float(dev[k]), "at_hz": float(self.frequency[k])}
+        return out
+
+    def save(self, folder: str | Path, grids: Sequence[tuple[float, float]] = ()) -> Path:
+        """Write admittance.csv, identification.json and the figures to a folder; returns it.
+
+        Args:
+            grids: (SCR, X/R) of the grids to judge.
+
+        Raises:
+            UserError: the folder holds something already, or cannot be written.
+        """
+        from gfm_hil.studies.identification_figures import save_figures
+
+        folder = Path(folder)
+        if folder.exists() and any(folder.iterdir()):
+            raise UserError(f"{folder}: is not empty; choose another folder")
+        content = self.summary() | {"grids": [self._judged(*grid) for grid in grids]}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with (folder / "admittance.csv").open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file).writerows(self.rows())
+            save_figures(self, folder, grids)
+            write_text(folder / "identification.json", json.dumps(content, indent=2) + "\n")
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem.strerror}") from None
+        return folder
+
+    def rows(self) -> Iterator[list[Any]]:
+        """The head and the lines of admittance.csv."""
+        parts: list[tuple[str, Response]] = [
+            (f"Y_{cell}", self.Y.reshape(-1, 4)[:, k]) for k, cell in enumerate(_CELLS)
+        ]
+        parts.append(("nfp", self.nfp))
+        if self.model is not None and self.nfp_model is not None:
+            flat = self.model.reshape(-1, 4)
+            parts += [(f"model_Y_{cell}", flat[:, k]) for k, cell in enumerate(_CELLS)]
+            parts.append(("model_nfp", self.nfp_model))
+        names = [f"{name}_{part}" for name, _ in parts for part in ("re", "im")]
+        dev = self.deviation
+        yield ["f_hz", *names, "least_eigenvalue", *([] if dev is None else ["deviation"])]
+        p = self.passivity
+        for k, f in enumerate(self.frequency):
+            values = [float(x) for _, column in parts for x in (column[k].real, column[k].imag)]
+            yield [float(f), *values, float(p[k]), *([] if dev is None else [float(dev[k])])]
+
+    def _judged(self, scr: float, x_over_r: float) -> dict[str, Any]:
+        found = self.stability(scr, x_over_r)
+        return {
+            "scr": scr,
+            "x_over_r": x_over_r,
+            "stable": found.stable,
+            "unstable_poles": found.unstable,
+            "margin": found.margin,
+            "margin_at_hz": found.at_hz,
+            "reason": found.reason,
+        }
+
+    def _impedance(self, R: float, L: float) -> Response:
+        return line_impedance(self.frequency, R, L, *self.omega)
+
+    def __repr__(self) -> str:
+        f, dev = self.frequency, self.deviation
+        model = "" if dev is None else f", at most {100 * dev.max():.2g} % from the model"
+        return f"<Identification {self.name}: {len(f)} points, {f[0]:g} to {f[-1]:g} Hz{model}>"
+
+
+@dataclass(frozen=True)
+class _Band:
+    """The tones of a decade.
+
+    Attributes:
+        hz: tones, multiples of the window's inverse.
+        every: ticks from one line of the profile to the next.
+        window: ticks, a multiple of ``every``.
+    """
+
+    hz: Vector
+    every: int
+    window: int
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is injected.
+
+    Attributes:
+        bands: one after the other.
+        settle: ticks before each window.
+        amplitude: of each tone, p.u.
+    """
+
+    bands: Sequence[_Band]
+    settle: Sequence[int]
+    amplitude: float
+    hz: Vector = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hz", np.concatenate([band.hz for band in self.bands]))
+
+    def starts(self) -> list[int]:
+        """The first tick of each band."""
+        lengths = [s + b.window for s, b in zip(self.settle, self.bands, strict=True)]
+        return [0, *np.cumsum(lengths).astype(int).tolist()]
+
+
+def identify(
+    law: str | Path | Law | None = None,
+    on: str | Path | Scenario = "pref_step",
+    *,
+    inner: str | None = None,
+    start_hz: float = 1.0,
+    stop_hz: float = 1000.0,
+    points: int = POINTS,
+    amplitude: float = AMPLITUDE,
+    settle_s: float | None = None,
+    window_s: float = WINDOW_S,
+    controller_command: Sequence[str] = (),
+    tell: Callable[[str], None] = lambda text: None,
+) -> Identification:
+    """Measure the dq admittance of a converter on the bench.
+
+    Args:
+        law: name, law file or ``Law``; the scenario's own if None.
+        on: scenario (name, file or ``Scenario``), of which plant, references, sampling time and
+            inner stage count, but no event.
+        inner: inner stage, in place of the law's own.
+        start_hz, stop_hz, points: the frequencies, evenly apart on a logarithmic axis; each is
+            moved to the nearest multiple of the inverse of its window.
+        amplitude: of each tone, p.u. of the grid's voltage, and rad of its angle.
+        settle_s: how long each band of tones sounds before its window, s. If None, it follows from
+            the slowest mode of the linear model, or is 2 s where there is none, and is doubled, up
+            to 60 s, while the two ends of a window differ; noise needs a given one.
+        window_s: least length of a window, s; a longer one averages noise out.
+        controller_command: program and arguments of another controller, which runs over the
+            scenario's link; it has no model.
+        tell: told what goes on.
+
+    Raises:
+        UserError: a value out of range, no operating point, a loop that is unstable, a run that
+            does not complete, or a window whose ends still differ.
+        LawError: the law is none.
+    """
+    with tempfile.TemporaryDirectory(prefix="gfmhil-identify-") as place:
+        file = law
+        if isinstance(law, Law):
+            file = law.save(Path(place) / "law.toml")
+        foreign = tuple(controller_command)
+        named = None if file is None else str(file)
+        scenario = load_scenario(on, in_process=not foreign, law=named, inner=inner)
+        _check(scenario, bool(foreign))
+        name, Y_of, slowest = controlled_by({"controller": ""}), None, None
+        if not foreign:
+            name, Y_of, slowest = _model(scenario)
+            name = law.name if isinstance(law, Law) else name
+        bands = _bands(start_hz, stop_hz, points, scenario.T_s, window_s)
+        given = settle_s is not None
+        if settle_s is None:
+            settle_s = SETTLE_S
+            if slowest is not None:
+                settle_s = min(max(math.log(_SHRINK) / -slowest, 0.2), _LONGEST_S)
+        while True:
+            plan = _plan(bands, amplitude, settle_s, scenario)
+            sides = []
+            for axis in "dq":
+                run = _run(scenario, plan, axis, Path(place), foreign, tell)
+                sides.append(_Spectra.of(run, plan))
+                if foreign:
+                    name = controlled_by(run.summary)
+            settled = max(side.ends for side in sides)
+            if given or settled <= _SETTLED:
+                break
+            if 2.0 * settle_s > _LONGEST_S:
+                raise UserError(
+                    f"after {settle_s:g} s the ends of a window still differ by {settled:.1e} of "
+                    f"the deviation, allowed is {_SETTLED:g}; the loop is too slow, or noise or "
+                    "rounding hides the tones: raise amplitude, and give settle_s"
+                )
+            settle_s *= 2.0
+        return _found(name, scenario, plan, settle_s, settled, sides, Y_of)
+
+
+def _check(scenario: Scenario, foreign: bool) -> None:
+    if scenario.network is not None:
+        raise UserError("network: identify measures one converter on its line to the grid")
+    if scenario.plant.grid.finite is not None:
+        raise UserError("plant.grid.finite: such a grid sets its own frequency; leave it out")
+    if foreign and scenario.link.type == INPROC:
+        raise UserError(f"link.type = {INPROC!r}: another controller needs a link, e.g. zmq")
+
+
+def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float]:
+    """The name of the law, its admittance by the linear model, and its slowest mode, 1/s."""
+    try:
+        loop, name = scenario_loop(scenario)
+    except NoEquilibrium as problem:
+        raise UserError(str(problem)) from None
+    worst = loop.modes()[0]
+    if worst.sigma >= 0.0:
+        raise UserError(
+            f"{name} is unstable on this grid: a mode at {worst.frequency_hz:.4g} Hz grows with "
+            f"{worst.sigma:.4g} 1/s; nothing can be measured"
+        )
+
+    def admittance(hz: Vector) -> Response:
+        return np.asarray(np.linalg.inv(loop.output_impedance(2 * np.pi * hz)), complex)
+
+    return name, admittance, worst.sigma
+
+
+def _bands(
+    start_hz: float, stop_hz: float, points: int, T_s: float, window_s: float
+) -> list[_Band]:
+    """The tones by decade.
+
+    Raises:
+        UserError: a value that cannot be.
+    """
+    top = 0.45 / T_s
+    if not 0.01 <= start_hz < stop_hz <= top:
+        raise UserError(
+            f"start_hz = {start_hz:g}, stop_hz = {stop_hz:g}: must be 0.01 <= start_hz < stop_hz "
+            f"<= {top:g} Hz"
+        )
+    if not 2 <= points <= 1000:
+        raise UserError(f"points = {points}: must lie in [2, 1000]")
+    if not 0.0 <= window_s <= _LONGEST_S:
+        raise UserError(f"window_s = {window_s}: must lie in [0, {_LONGEST_S:g}] s")
+    wanted = np.geomspace(start_hz, stop_hz, points)
+    decades = math.ceil(math.log10(stop_hz / start_hz) - 1e-9)
+    decade = np.minimum(np.floor(np.log10(wanted / start_hz) + 1e-9), decades - 1)
+    ratio = (stop_hz / start_hz) ** (1.0 / (points - 1))
+    periods = max(_PERIODS, math.ceil(1.0 / (ratio - 1.0)))
+    bands = []
+    for k in np.unique(decade):
+        hz = wanted[decade == k]
+        every = max(1, math.floor(1.0 / (_LINES * hz[-1] * T_s)))
+        seconds = max(periods / hz[0], window_s)
+        window = math.ceil(seconds / (T_s * every) - 1e-9) * every
+        step = 1.0 / (window * T_s)
+        tones = step * np.unique(np.floor(hz / step + 0.5))
+        bands.append(_Band(tones, every, window))
+    return bands
+
+
+def _plan(bands: Sequence[_Band], amplitude: float, settle_s: float, scenario: Scenario) -> _Plan:
+    """Raises UserError if settling or the injection cannot be so large."""
+    if not (math.isfinite(settle_s) and settle_s >= 0.0):
+        raise UserError(f"settle_s = {settle_s}: must be >= 0 s")
+    if not (math.isfinite(amplitude) and amplitude > 0.0):
+        raise UserError(f"amplitude = {amplitude}: must be > 0")
+    settle = [math.ceil(settle_s / scenario.T_s / band.every) * band.every for band in bands]
+    plan = _Plan(bands, settle, amplitude)
+    for axis, name in (("d", "V_g"), ("q", "omega_g")):
+        largest = max(np.abs(_sines(plan, k, axis, scenario)).max() for k in range(len(bands)))
+        if largest > _ROOM[name]:
+            raise UserError(
+                f"amplitude = {amplitude:g}: would move {name} by {largest:.3g} p.u., allowed is "
+                f"{_ROOM[name]:g} p.u.: at most {amplitude * _ROOM[name] / largest:.2g}"
+            )
+    return plan
+
+
+def _sines(plan: _Plan, k: int, axis: str, scenario: Scenario) -> Vector:
+    """The injection of band k at the lines of its profile: of V_g, or for q of omega_g, p.u.
+
+    The phases are those of Schroeder, which keep the sum of the tones low (IEEE Trans. Inf. Theory
+    16, 1970).
+    """
+    band = plan.bands[k]
+    t = np.arange(0, plan.settle[k] + band.window + 1, band.every) * scenario.T_s
+    n, out = len(band.hz), np.zeros(len(t))
+    omega_b = _omega_b(scenario)
+    for j, hz in enumerate(band.hz):
+        size = plan.amplitude * (2 * np.pi * hz / omega_b if axis == "q" else 1.0)
+        out += size * np.cos(2 * np.pi * hz * t - np.pi * j * (j + 1) / n)
+    rise = 0.5 * plan.settle[k] * scenario.T_s  # smoothly, which excites slow modes least
+    if rise > 0.0:
+        out *= np.sin(0.5 * np.pi * np.minimum(t / rise, 1.0)) ** 2
+    return out
+
+
+def _omega_b(scenario: Scenario) -> float:
+    return float(make_plant(scenario.plant, scenario.T_s).net[0]["omega_b"])
+
+
+def _run(
+    scenario: Scenario,
+    plan: _Plan,
+    axis: str,
+    place: Path,
+    foreign: tuple[str, ...],
+    tell: Callable[[str], None],
+) -> Run:
+    """Play the injection of one axis.
+
+    Raises:
+        UserError: the run did not complete.
+    """
+    grid, T_s = scenario.plant.grid, scenario.T_s
+    starts, events = plan.starts(), []
+    for k, band in enumerate(plan.bands):
+        wave = _sines(plan, k, axis, scenario)
+        t = np.arange(len(wave)) * band.every * T_s
+        omega_g = grid.omega_g + (wave if axis == "q" else 0.0 * wave)
+        V_g = grid.V_g + (wave if axis == "d" else 0.0 * wave)
+        lines = np.column_stack([t, omega_g, V_g])
+        for first in range(0, len(lines) - 1, _MOST_LINES):
+            part = lines[first : first + _MOST_LINES + 1].copy()
+            part[:, 0] -= part[0, 0]
+            file = place / f"{axis}-{k}-{first}.csv"
+            np.savetxt(file, part, "%.17g", ",", header="t,omega_g,V_g", comments="")
+            tick = starts[k] + first * band.every
+            events.append({"type": "grid-profile", "tick": tick, "file": str(file)})
+    kept = {"law", "inner", "T_s", "seed", "references", "plant", "link", "late_policy"}
+    content = scenario.model_dump(mode="json", exclude_none=True, include=kept)
+    content |= {
+        "title": f"{scenario.title}: injection along {axis}",
+        "duration": (starts[-1] + 1) * T_s,  # with the state at the end of the last window
+        "mode": "lockstep",
+        "expect_ripple": 1000.0,  # the injection is one
+        "events": events,
+    }
+    tell(f"injection along {axis}: {starts[-1] * T_s:.1f} s simulated")
+    made = load_scenario(content, in_process=not foreign)
+    if foreign:
+        folder = place / f"run-{axis}-{starts[-1]}"
+        run = run_scenario(made, folder, figures=False, controller_command=foreign)
+    else:
+        run = run_in_memory(made)
+    if run.status != "completed":
+        raise UserError(
+            f"the run with the injection along {axis} ended as {run.status}: "
+            f"{run.summary['reason']}; a smaller amplitude, or another grid, may help"
+        )
+    return run
+
+
+@dataclass(frozen=True)
+class _Spectra:
+    """Fourier coefficients of one run in the dq frame, at the plan's tones; p.u.
+
+    Attributes:
+        v, i_o, v_g: shape (K, 2): voltage of the capacitor, current to the grid, grid's voltage.
+        rest: means of v, i_o and v_g as complex numbers d + jq.
+        ends: largest difference between the ends of a window over the largest deviation in it.
+    """
+
+    v: Response
+    i_o: Response
+    v_g: Response
+    rest: tuple[complex, complex, complex]
+    ends: float
+
+    @classmethod
+    def of(cls, run: Run, plan: _Plan) -> _Spectra:
+        """Those of a run.
+
+        Raises:
+            UserError: the circuit's states do not follow the commands: a limit acts.
+        """
+        path = _Path.of(run)
+        parts, ends = [], 0.0
+        for first, settle, band in zip(plan.starts(), plan.settle, plan.bands, strict=False):
+            start = first + settle
+            window = slice(start, start + band.window)
+            path.check(window)
+            parts.append(path.coefficients(window, band.hz))
+            apart = np.abs(path.w[window.stop] - path.w[start])
+            swing = np.abs(path.w[window] - path.w[window].mean(axis=0)).max(axis=0)
+            ends = max(ends, float((apart / swing).max()))
+        turn = np.exp(-1j * path.angle(window))
+        rest = [complex(x[window].mean() * turn) for x in (path.w[:, 1], path.w[:, 2], path.v_g)]
+        v, i_o, v_g = np.concatenate(parts, axis=1)
+        return cls(v, i_o, v_g, (rest[0], rest[1], rest[2]), ends)
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A run as a path of the circuit: its states at the ticks and its sources in between.
+
+    All space vectors are in the frame that turns steadily with the grid. A source is a phasor at
+    the beginning of each stretch of a period, and the speed at which it turns, rad/s.
+
+    Attributes:
+        T_s: s.
+        w: (i_f, v, i_o) at each tick, shape (N, 3).
+        v_g: grid's voltage at each tick, shape (N,).
+        delta: angle of the converter's frame, shape (N,), rad.
+        stretches: of a period: its begin and length, s, and the bridge's and the grid's phasors and
+            speeds, shape (N, 2) each.
+        rates, states, modes, drive: of the circuit, see ``gfm_plant.circuit.Modes``, the rates in
+            that frame and the drive of bridge and grid alone.
+    """
+
+    T_s: float
+    w: Response
+    v_g: Response
+    delta: Vector
+    stretches: list[tuple[float, float, Response, Vector]]
+    rates: Response
+    states: Response
+    modes: Response
+    drive: Response
+
+    @classmethod
+    def of(cls, run: Run) -> _Path:
+        scenario, signals = run.scenario, run.signals
+        T_s, plant = scenario.T_s, make_plant(scenario.plant, scenario.T_s)
+        omega_b, omega_0 = float(plant.net[0]["omega_b"]), scenario.plant.grid.omega_g
+        steady = omega_b * (omega_0 - 1.0)  # speed of the frame against the common one
+        back = np.exp(-1j * steady * T_s * np.arange(run.ticks))
+        v = signals["v_re"] + 1j * signals["v_im"]
+        i_o = np.conj((signals["p"] + 1j * signals["q"]) / v)
+        w = np.column_stack([signals["i_re"] + 1j * signals["i_im"], v, i_o]) * back[:, None]
+        speed_g = omega_b * (signals["omega_g"] - omega_0)
+        theta = np.concatenate([[0.0], np.cumsum(speed_g[:-1] * T_s)])
+        v_g = signals["V_g"] * np.exp(1j * theta)
+        delta = signals["delta"] + theta
+        u = {name: _through_dac(signals, name, plant.par[0]) for name in _COMMANDS[1:]}
+        bridge, speed_u = u["E_u"] + 1j * u["E_q"], omega_b * (u["omega_u"] - omega_0)
+        delay, part = scenario.plant.delay.samples, scenario.plant.delay.fraction
+        stretches, angle = [], delta
+        for begin, end, age in ((0.0, part, delay + 1), (part, 1.0, delay)):
+            if end == begin:
+                continue
+            E, speed = np.roll(bridge, age), np.roll(speed_u, age)
+            at = np.column_stack([E * np.exp(1j * angle), v_g * np.exp(1j * speed_g * begin * T_s)])
+            speeds = np.column_stack([speed, speed_g])
+            stretches.append((begin * T_s, (end - begin) * T_s, at, speeds))
+            angle = angle + speed * (end - begin) * T_s
+        modes, sources = plant.wiring.modes(frozenset(), False)
+        drive = modes.drive[:, [sources.index(plant.wiring.units[0].bridge),
+                                sources.index(GRID_SOURCE)]]  # fmt: skip
+        rates = modes.rates - 1j * steady
+        return cls(T_s, w, v_g, delta, stretches, rates, modes.states, modes.modes, drive)
+
+    def angle(self, window: slice) -> float:
+        """Mean angle of the converter's frame, rad."""
+        return float(self.delta[window].mean())
+
+    def check(self, window: slice) -> None:
+        """Compare each state with what the circuit makes of the one before.
+
+        Raises:
+            UserError: they differ: a limit of the bridge acts.
+        """
+        z = self.w[window] @ self.modes.T
+        for _, length, at, speeds in self.stretches:
+            z = z * np.exp(self.rates * length)
+            for k in range(2):
+                # (e^(j Omega h) - e^(lambda h)) / (j Omega - lambda); no speed is a mode's own rate
+                x = 1j * speeds[window, k, None]
+                gain = (np.exp(x * length) - np.exp(self.rates * length)) / (x - self.rates)
+                z = z + self.drive[:, k] * gain * at[window, k, None]
+        then = self.w[window.start + 1 : window.stop + 1]
+        off = float(np.abs(z @ self.states.T - then).max())
+        if off > _FOLLOWS:
+            raise UserError(
+                f"the bridge's voltage is not the controller's (the circuit is off by {off:.1e} "
+                "p.u.): plant.i_peak or plant.modulation acts; measure where no limit acts"
+            )
+
+    def coefficients(self, window: slice, hz: Vector) -> Response:
+        """Those of v, i_o and v_g at hz, shape (3, K, 2), in the converter's frame at rest."""
+        first, last = window.start, window.stop
+        t = self.T_s * np.arange(first, last)
+        T = (last - first) * self.T_s
+        z_0, z_1 = self.modes @ self.w[first], self.modes @ self.w[last]
+        both = []
+        for omega in 2 * np.pi * np.concatenate([hz, -hz]):
+            S = np.zeros(2, complex)
+            for begin, length, at, speeds in self.stretches:
+                x = 1j * (speeds[window] - omega) * length
+                whole = np.where(
+                    np.abs(x) > 1e-6, np.expm1(x) / np.where(x == 0, 1.0, x), 1 + x / 2
+                )
+                S += length * np.exp(-1j * omega * (t + begin)) @ (at[window] * whole) / T
+            ends = z_0 * np.exp(-1j * omega * t[0]) - z_1 * np.exp(-1j * omega * (t[0] + T))
+            W = self.states @ ((self.drive @ S + ends / T) / (1j * omega - self.rates))
+            both.append([W[1], W[2], S[1]])
+        x = np.array(both).T * np.exp(-1j * self.angle(window))
+        plus, minus = x[:, : len(hz)], x[:, len(hz) :].conj()
+        return np.stack([(plus + minus) / 2, (plus - minus) / 2j], axis=-1)
+
+
+def _through_dac(signals: Any, name: str, par: Any) -> Vector:
+    """A command after the D/A, as ``gfm_plant.quantise`` rounds it."""
+    j = _COMMANDS.index(name)
+    column = f"u_{name}"
+    value = signals[column] if column in signals else np.zeros(len(signals["t"]))
+    lo, hi, lsb = (float(par[key][j]) for key in ("dac_lo", "dac_hi", "dac_lsb"))
+    value = np.clip(value, lo, hi)
+    return np.asarray(lo + lsb * np.floor((value - lo) / lsb + 0.5) if lsb > 0.0 else value)
+
+
+def _found(
+    name: str,
+    scenario: Scenario,
+    plan: _Plan,
+    settle_s: float,
+    settled: float,
+    sides: Sequence[_Spectra],
+    Y_of: Callable[[Vector], Response] | None,
+) -> Identification:
+    """The result of an injection along d and one along q."""
+    hz, (d, q) = plan.hz, sides
+    volts, amps = (np.stack([getattr(d, x), getattr(q, x)], axis=-1) for x in ("v", "i_o"))
+    par = make_plant(scenario.plant, scenario.T_s).par[0]
+    line = float(par["R_g"]), float(par["L_g"])
+    omega = float(par["omega_b"]), float(scenario.plant.grid.omega_g)
+    model = nfp_model = None
+    nfp = _power(q.v, q.i_o, q.rest) / _frequency(q.v_g, hz, q.rest[2], omega[0])
+    if Y_of is not None:
+        model = Y_of(hz)
+        Z = line_impedance(hz, *line, *omega)
+        v = np.linalg.solve(np.eye(2) + Z @ model, q.v_g[..., None])
+        answer = _power(np.asarray(v[..., 0]), np.asarray(-(model @ v)[..., 0]), q.rest)
+        nfp_model = answer / _frequency(q.v_g, hz, q.rest[2], omega[0])
+    return Identification(
+        name, scenario, hz, -amps @ np.linalg.inv(volts), model, nfp, nfp_model, line, omega,
+        plan.amplitude, settle_s, settled,
+    )  # fmt: skip
+
+
+def _power(v: Response, i_o: Response, rest: tuple[complex, complex, complex]) -> Response:
+    """The change of p = v_d i_od + v_q i_oq, to the first order."""
+    v_0, i_0 = (np.array([x.real, x.imag]) for x in rest[:2])
+    return np.asarray(i_o @ v_0 + v @ i_0)
+
+
+def _frequency(v_g: Response, hz: Vector, at: complex, omega_b: float) -> Response:
+    """The change of the grid's frequency, p.u.: what its voltage does across itself."""
+    across = np.array([-at.imag, at.real]) / abs(at) ** 2
+    return np.asarray(2j * np.pi * hz * (v_g @ across) / omega_b)
+
+
+def _stretches(hz: Vector, where: NDArray[np.bool_]) -> list[list[float]]:
+    """The first and the last frequency of each stretch in which ``where`` holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
+    return [[float(hz[a]), float(hz[b - 1])] for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,154 @@
+"""Figures of a measured admittance: its entries, passivity, NFP plot, and eigenloci on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.results.figures import COLOURS, dress
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from gfm_hil.studies.identification import Identification
+
+_GREY = "#888888"
+_CELLS = ("dd", "dq", "qd", "qq")
+_NYQUIST = 3.0  # half a side of the figure
+
+
+def draw_admittance(of: Identification) -> list[Axes]:
+    """Gain and phase of the four entries: two rows of panels a row of Y."""
+    from matplotlib import pyplot
+
+    figure, panels = pyplot.subplots(
+        4, 2, sharex=True, figsize=(9.2, 8.6), layout="constrained",
+        gridspec_kw={"height_ratios": [3, 2, 3, 2]},
+    )  # fmt: skip
+    for k, cell in enumerate(_CELLS):
+        row, column = divmod(k, 2)
+        gain, phase = panels[2 * row, column], panels[2 * row + 1, column]
+        measured = of.Y[:, row, column]
+        model = None if of.model is None else of.model[:, row, column]
+        _bode(gain, phase, of.frequency, measured, model)
+        dress(gain, f"Y_{cell}: |Y| [p.u.], phase [°]")
+        dress(phase)
+    for axes in panels[-1]:
+        axes.set_xlabel("frequency in the dq frame [Hz]", fontsize=9.5)
+    panels[0, 0].legend(fontsize=8, frameon=False)
+    figure.suptitle(
+        f"{of.name}: admittance at the filter capacitor", fontsize=11, x=0.01, ha="left"
+    )
+    return list(panels.ravel())
+
+
+def draw_passivity(of: Identification) -> list[Axes]:
+    """The least eigenvalue of Y + Y^H, and the deviation of Y from the model."""
+    from matplotlib import pyplot
+
+    dev = of.deviation
+    rows = 1 if dev is None else 2
+    _, found = pyplot.subplots(
+        rows, 1, sharex=True, squeeze=False, figsize=(7.6, 2.9 * rows), layout="constrained"
+    )
+    panels = list(found[:, 0])
+    least = of.passivity
+    panels[0].semilogx(of.frequency, least, "o-", color=COLOURS[0], ms=3.5, lw=1.0)
+    panels[0].axhline(0.0, color="k", lw=0.8)
+    panels[0].fill_between(
+        of.frequency, least, 0.0, where=least < 0.0, color=COLOURS[1], alpha=0.25, lw=0
+    )
+    panels[0].set_yscale("symlog", linthresh=1.0)
+    dress(panels[0], f"{of.name}: least eigenvalue of Y + Yᴴ [p.u.], negative: not passive")
+    if dev is not None:
+        panels[1].loglog(of.frequency, 100 * dev, "o-", color=COLOURS[0], ms=3.5, lw=1.0)
+        dress(panels[1], "deviation of the measured Y from the linear model [%]")
+    panels[-1].set_xlabel("frequency in the dq frame [Hz]", fontsize=9.5)
+    return panels
+
+
+def draw_nfp(of: Identification) -> list[Axes]:
+    """Gain and phase of the change of p over that of the grid's frequency."""
+    from matplotlib import pyplot
+
+    _, (gain, phase) = pyplot.subplots(2, 1, sharex=True, figsize=(7.6, 5.6), layout="constrained")
+    _bode(gain, phase, of.frequency, of.nfp, of.nfp_model)
+    dress(gain, f"{of.name}: network frequency perturbation, |Δp / Δω_g| [p.u./p.u.]")
+    dress(phase, "phase [°]")
+    gain.legend(fontsize=8, frameon=False)
+    phase.set_xlabel("frequency of the perturbation [Hz]", fontsize=9.5)
+    return [gain, phase]
+
+
+def draw_nyquist(of: Identification, scr: float, x_over_r: float) -> Axes:
+    """The eigenvalues of Z Y, over positive frequencies, near -1."""
+    from matplotlib import pyplot
+
+    found = of.stability(scr, x_over_r)
+    _, axes = pyplot.subplots(figsize=(5.6, 5.6), layout="constrained")
+    for k, locus in enumerate(of.eigenloci(scr, x_over_r).T):
+        colour = COLOURS[k]
+        axes.plot(
+            locus.real, locus.imag, "o-", color=colour, ms=2.5, lw=1.0, label=f"λ{k + 1}(Z Y)"
+        )
+    axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
+    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
+    circle = -1.0 + found.margin * turn
+    axes.plot(circle.real, circle.imag, color=_GREY, lw=0.7, ls=(0, (4, 3)), label="margin")
+    axes.set(xlim=(-_NYQUIST, _NYQUIST), ylim=(-_NYQUIST, _NYQUIST), aspect="equal")
+    axes.set(xlabel="Re", ylabel="Im")
+    verdict = {True: "stable", False: "unstable", None: "cannot be judged"}[found.stable]
+    dress(axes, f"{of.name}, SCR {scr:g}, X/R {x_over_r:g}: {verdict}, margin {found.margin:.2g}")
+    axes.legend(fontsize=8, frameon=False, loc="upper right")
+    return axes
+
+
+def save_figures(of: Identification, folder: Path, grids: Sequence[tuple[float, float]]) -> None:
+    """All figures as PNG."""
+    import matplotlib
+    from matplotlib import pyplot
+
+    matplotlib.use("Agg")
+    for name, draw in (
+        ("admittance", draw_admittance),
+        ("passivity", draw_passivity),
+        ("nfp", draw_nfp),
+    ):
+        draw(of)
+        _keep(folder / f"{name}.png")
+    for scr, x_over_r in grids:
+        draw_nyquist(of, scr, x_over_r)
+        _keep(folder / f"nyquist_scr_{scr:g}_xr_{x_over_r:g}.png")
+    pyplot.close("all")
+
+
+def _keep(path: Path) -> None:
+    from matplotlib import pyplot
+
+    pyplot.savefig(path, dpi=110)
+    pyplot.close()
+
+
+def _bode(
+    gain: Axes,
+    phase: Axes,
+    hz: NDArray[np.float64],
+    measured: NDArray[np.complex128],
+    model: NDArray[np.complex128] | None,
+) -> None:
+    """A curve of the model and the measured points over it."""
+    if model is not None:
+        gain.loglog(hz, np.abs(model), color=COLOURS[1], lw=1.2, label="linear model")
+        turn = np.degrees(np.angle(model))
+        wraps = np.flatnonzero(np.abs(np.diff(turn)) > 180.0) + 1  # where no line is drawn
+        phase.semilogx(
+            np.insert(hz, wraps, hz[wraps]), np.insert(turn, wraps, np.nan),
+            color=COLOURS[1], lw=1.2,
+        )  # fmt: skip
+    gain.loglog(hz, np.abs(measured), "o", color=COLOURS[0], ms=3.5, label="measured")
+    phase.semilogx(hz, np.degrees(np.angle(measured)), "o", color=COLOURS[0], ms=3.5)
+    phase.set(ylim=(-190, 190), yticks=(-180, -90, 0, 90, 180))

@@ -1,0 +1,27 @@
+"""Envelopes of a grid-forming unit's answer, and the unit that a law makes of a converter."""
+
+from gfm_hil.studies.envelopes import (
+    Envelope,
+    Tolerance,
+    Unit,
+    amplitude_step,
+    fit_jump,
+    fit_ramp,
+    measure_unit,
+    phase_jump,
+    rocof_response,
+    scr_jump_response,
+)
+
+__all__ = [
+    "Envelope",
+    "Tolerance",
+    "Unit",
+    "amplitude_step",
+    "fit_jump",
+    "fit_ramp",
+    "measure_unit",
+    "phase_jump",
+    "rocof_response",
+    "scr_jump_response",
+]

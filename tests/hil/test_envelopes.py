@@ -1,0 +1,179 @@
+"""Envelopes against DyCoV's published curves, and the fit against swing equations and laws.
+
+The curves are a few lines of the CSV files of https://github.com/dynawo/dyn-grid-compliance-
+verification (c) RTE and Grupo AIA, MPL-2.0, commit b7576cb0: docs/GFM_envelopes_curves/Envelopes
+and tests/dycov/gfm/resources. Their columns: time, expected, and the two limits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfmhil
+from gfm_plant import load_converter
+from gfmhil.envelopes import (
+    Envelope,
+    Unit,
+    amplitude_step,
+    fit_jump,
+    fit_ramp,
+    measure_unit,
+    phase_jump,
+    rocof_response,
+    scr_jump_response,
+)
+
+T = np.linspace(0.0, 5.0, 3000)
+OMEGA_B = 100 * math.pi
+OVERDAMPED, UNDERDAMPED = Unit(200.0, 5.0, 0.27), Unit(95.0, 5.0, 0.27)
+JUMP = 0.3 * (0.27 + 0.1)  # rad, at SCR 10
+
+#: S_VolAngStep1, OC2
+OVER = """
+0.000e+00;2.000e-01;4.986e-01;8.138e-02
+2.001e-02;2.000e-01;4.987e-01;8.131e-02
+2.668e-02;2.008e-01;3.792e-01;8.196e-02
+8.169e-02;2.340e-01;3.943e-01;1.250e-01
+1.667e-01;3.137e-01;5.141e-01;2.322e-01
+4.201e-01;4.549e-01;5.404e-01;4.223e-01
+6.602e-01;4.894e-01;5.214e-01;4.607e-01
+"""
+UNDER = """
+0.000e+00;2.000e-01;4.986e-01;8.138e-02
+2.001e-02;2.043e-01;4.987e-01;8.126e-02
+2.668e-02;2.213e-01;3.192e-01;8.079e-02
+1.000e-01;3.955e-01;4.304e-01;1.999e-01
+2.501e-01;5.713e-01;5.822e-01;3.445e-01
+5.002e-01;5.151e-01;5.529e-01;4.400e-01
+6.602e-01;4.887e-01;5.129e-01;4.618e-01
+"""
+#: S_VolAmpStep1, OC1
+AMPLITUDE = """
+0.000e+00;0.000e+00;2.150e-01;0.000e+00
+1.667e-03;4.782e-02;2.150e-01;0.000e+00
+2.001e-02;1.485e-01;2.123e-01;4.782e-02
+2.668e-02;1.497e-01;2.029e-01;1.280e-01
+9.670e-02;1.500e-01;1.724e-01;1.300e-01
+9.837e-02;1.500e-01;1.700e-01;1.300e-01
+"""
+
+
+def lines(text: str) -> list[list[float]]:
+    return [[float(x) for x in line.split(";")] for line in text.split()]
+
+
+@pytest.mark.parametrize(
+    ("made", "curve"),
+    [
+        (lambda: phase_jump(OVERDAMPED, T, JUMP, 10.0, 0.5), OVER),
+        (lambda: phase_jump(UNDERDAMPED, T, JUMP, 10.0, 0.5), UNDER),
+        (lambda: amplitude_step(OVERDAMPED, T, 0.15 * 0.37, 10.0), AMPLITUDE),
+    ],
+    ids=["overdamped", "underdamped", "amplitude"],
+)
+def test_envelopes_are_the_published_ones_to_their_digits(made, curve) -> None:
+    found: Envelope = made()
+    for t, expected, *limits in lines(curve):
+        k = round(t / (T[1] - T[0]))
+        for value, printed in zip(
+            (found.expected[k], found.lower[k], found.upper[k]),
+            (expected, min(limits), max(limits)),
+            strict=True,
+        ):
+            assert value == pytest.approx(printed, abs=5.1e-5)  # half of the last digit
+
+
+def test_a_ramp_of_frequency_is_the_published_one() -> None:
+    # S_Rocof1, OC1: 0.5 Hz/s at SCR 2; each value is late by 9 samples of 2 ms
+    t = np.linspace(-1.0, 5.0, 3000)
+    p = rocof_response(OVERDAMPED, t, 0.5 / 50, 2.0)
+    for at, printed in ((4.635e-2, -1.513e-3), (1.004e-1, -9.768e-3), (2.504e-1, -3.923e-2),
+                        (5.005e-1, -7.444e-2), (7.006e-1, -9.127e-2)):  # fmt: skip
+        k = round((at + 1.0) / (t[1] - t[0])) - 9
+        assert p[k] == pytest.approx(printed, rel=5e-4)
+
+
+def test_a_step_of_scr_is_the_published_one() -> None:
+    # SCRJump_S_SCRup1_OC1: at 0.2 s, with 20 ms of delay
+    unit = Unit(133.0, 10.0, 0.25)
+    at = np.array([0.2501, 0.3001, 0.3501, 0.3741])
+    p = 0.5 + scr_jump_response(unit, at - 0.22, 2.0, 10.0, 0.5)
+    assert p == pytest.approx([1.061, 1.004, 0.9151, 0.8667], abs=5.1e-4)
+
+
+def test_a_ramp_ends_where_inertia_and_damping_lead() -> None:
+    unit = Unit(80.0, 6.0, 0.3)
+    t = np.linspace(0.0, 20.0, 2000)
+    p = rocof_response(unit, t, 0.02, 5.0, T_pll=0.02, lasts=10.0)
+    assert p[999] == pytest.approx(-0.02 * (2 * 6.0 + 80.0 * 0.02), rel=1e-3)
+    assert abs(p[-1]) < 1e-4
+
+
+def test_a_response_is_judged_against_its_envelope() -> None:
+    found = phase_jump(OVERDAMPED, T, JUMP, 10.0, 0.5)
+    assert found.outside(T, found.expected).max() == 0.0
+    assert found.outside([1.0], [0.7])[0] == pytest.approx(0.7 - np.interp(1.0, T, found.upper))
+
+
+@pytest.mark.parametrize(("D", "H", "X"), [(60.0, 4.0, 0.3), (20.0, 6.0, 0.15), (300.0, 2.0, 0.5)])
+def test_the_fit_finds_a_swing_equation_again(D: float, H: float, X: float) -> None:
+    jump = math.radians(5.0)
+
+    def swing(t: float, z: np.ndarray) -> list[float]:
+        angle, omega = z
+        return [OMEGA_B * omega, (-(angle - jump) / X - D * omega) / (2 * H)]
+
+    t = np.arange(0.0, 3.0, 1e-3)
+    solved = solve_ivp(swing, (0.0, 3.0), [0.0, 0.0], t_eval=t, rtol=1e-10, atol=1e-12)
+    found = fit_jump(t, (solved.y[0] - jump) / X, jump, OMEGA_B, 0.05)
+    assert [found.D, found.H, found.X_eff] == pytest.approx([D, H, X - 0.05], rel=0.01)
+
+
+@pytest.mark.parametrize("law", ["vsg-1", "vsg-2", "droop-5"])
+def test_the_inertia_of_a_ramp_is_that_of_the_law_less_the_lag_of_the_line(law: str) -> None:
+    rate = 0.02  # Hz/s
+    run = gfmhil.run(
+        {
+            "title": "ramp",
+            "duration": 6.0,
+            "plant": {"delay": {"samples": 1}, "sensors": {"bandwidth_hz": 300.0}},
+            "events": [{"type": "grid-frequency", "t": 0.5, "f_hz": 50.2, "rate": rate}],
+        },
+        law,
+    )
+    t, p = run.signals["t"] - 0.5, run.signals["p"]
+    D, H = fit_ramp(t, p - p[4999], rate / 50, 3.0)
+    gains, pu = gfmhil.Law.load(law).gains, load_converter("paper").pu()
+    lag = gains.get("T") or 1 / gains["k_22"]
+    assert gains["D_p"] * D == pytest.approx(1.0, rel=1e-3)
+    H_law, X = lag / (2 * gains["D_p"]), pu["L_f"] + pu["L_g"]
+    assert abs(H - (H_law - D**2 * X / (2 * OMEGA_B))) <= 0.05
+
+
+def test_a_law_makes_a_unit_of_its_converter() -> None:
+    unit = measure_unit("vsg-2", plant__grid={"scr": 3.0, "x_over_r": 10.0})
+    damping, inertia = unit.D, unit.H
+    assert damping == pytest.approx(100.0, rel=0.02) and inertia == pytest.approx(8.361, rel=0.02)
+    assert unit.X_eff == pytest.approx(load_converter("paper").pu()["L_f"], abs=0.005)
+    more = measure_unit("vsg-2", inner="virtual-stator", plant__grid={"scr": 3.0, "x_over_r": 10.0})
+    assert more.X_eff == pytest.approx(0.3, rel=0.1)  # X_v of the stage
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Unit(100.0, 0.0, 0.3), "H = 0.0: must be > 0"),
+        (lambda: Unit(-1.0, 2.0, 0.3), "D = -1.0: must be >= 0"),
+        (lambda: phase_jump(OVERDAMPED, T, 0.1, 0.0, 0.5), "scr = 0.0: must be > 0"),
+        (lambda: fit_jump(T, 0.0 * T, 0.1, OMEGA_B, 0.1), "the power does not change"),
+        (lambda: fit_ramp(T, 0.0 * T, 0.01, 9.0), "need a ramp, and samples in it"),
+        (lambda: measure_unit("vsg-2", degrees=0.0), "must lie in"),
+    ],
+)
+def test_mistakes(call, message: str) -> None:
+    with pytest.raises(gfmhil.UserError, match=message):
+        call()
