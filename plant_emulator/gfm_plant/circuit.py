@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,8 @@ def find_modes(
     order: Sequence[str],
     shunts: Sequence[Shunt] = (),
 ) -> Modes:
-    """Return the modes of a circuit.
+    """Return the modes of a circuit; those of the last circuits are kept, so that an event of a
+    scenario that has been tried before its run costs no eigenvalues in real time.
 
     Args:
         omega_b: rad/s, also the speed of the common frame.
@@ -99,6 +101,19 @@ def find_modes(
         ValueError: an L or C is not positive, a node hangs on one branch alone, two sources or
             capacitors share a node, or the modes are too close to each other to be told apart.
     """
+    parts = tuple(branches), tuple(capacitors), tuple(sources)
+    return _find_modes(*parts, omega_b, tuple(order), tuple(shunts))
+
+
+@lru_cache(maxsize=256)
+def _find_modes(
+    branches: tuple[Branch, ...],
+    capacitors: tuple[Capacitor, ...],
+    sources: tuple[Source, ...],
+    omega_b: float,
+    order: tuple[str, ...],
+    shunts: tuple[Shunt, ...],
+) -> Modes:
     stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
     for name, value in stored.items():
         if not value > 0:
@@ -143,13 +158,15 @@ def find_modes(
     rates, X = np.linalg.eig(A)
     if not np.linalg.cond(X) < WORST_CONDITION:
         raise ValueError("the circuit's modes cannot be told apart: change one element a little")
-    at = [list(order).index(name) for name in stored]
+    at = [order.index(name) for name in stored]
     states = np.zeros((len(order), len(rates)), complex)
     modes = np.zeros((len(rates), len(order)), complex)
     states[at] = (K @ X) / root[:, None]
     modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
     drive = np.zeros((len(rates), n_s), complex)
     drive[:] = omega_b * np.linalg.solve(X, K.T @ (B / root[:, None]))
+    for array in (rates, states, modes, drive):
+        array.flags.writeable = False
     return Modes(rates, states, modes, drive)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,10 +200,11 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
             net["sensor_weights"][0, part, k] = _low_pass(float(r["omega_s"] * 2 * half))
 
 
-def _low_pass(x: float) -> list[float]:
+@lru_cache(maxsize=256)
+def _low_pass(x: float) -> tuple[float, ...]:
     """Weights of a first-order low-pass after a stretch of x time constants: of its state, and of
     its input at the beginning, the middle and the end, between which the input is a parabola."""
     A = np.diag([1.0, 1.0, 1.0], 1)
     A[0, 0] = -x
     whole, f_1, f_2, f_3 = expm(A)[0]  # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
-    return [whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)]
+    return whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)
