@@ -16,15 +16,10 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_runtime import LawSet, load_law
-from gfm_runtime.assembly import Controller
-from gfm_runtime.firmware.golden import inputs
-from gfm_runtime.inner import settle
-from gfm_runtime.signals import NU, carried, carried_rows, group, names
+from gfm_runtime.signals import carried, group, names
 from gfm_runtime.states import BAD_Y, RUNNING
-from gfm_runtime.switchover import settle_into
 
-from ..support.firmware import T_S, cc
+from ..support.firmware import T_S, accepted, bench, cc
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
 
@@ -114,27 +109,6 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return build
 
 
-def accepted(seed: int, real: str, stages: bool) -> Any:
-    """Golden references and measurements (TICKS, n) without those that are refused, float64."""
-    _, refs, ys = inputs(seed, TICKS, np.dtype(real), stages)
-    rows = (*group("ref"), *carried_rows("y", stages))
-    both = np.hstack([refs, ys])
-    low, high = np.array([[r.low for r in rows], [r.high for r in rows]])
-    both[~((both >= low) & (both <= high)).all(axis=1)] = both[0]
-    return np.split(both.astype(float), [refs.shape[1]], axis=1)
-
-
-def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controller:
-    """The controller of the bench, its outputs beginning at u."""
-    one = Controller([LawSet("x", load_law(law, inner).laws)], T_S, ref, real=real)
-    one.start(np.zeros(one.active_law.order), u[:NU])
-    own = np.array(u[:NU])
-    settle_into(one.laws[0], one.states[0], ref, y, own, np.zeros(NU))
-    if one.inner:
-        settle(one.laws[:1], one.states[:1], own, y, u[2], u[3])
-    return one
-
-
 @pytest.mark.parametrize("real", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("law", "inner"),
@@ -147,7 +121,7 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
     u = np.array([0.5, 1.0, 1.0, 0.05][: 3 + stages], real).astype(float)
     twins = []
     for seed in (1, 2):
-        refs, ys = accepted(seed, real, stages)
+        refs, ys = accepted(seed, TICKS, real, stages)
         model = Model(built(law, inner, real))
         model.start(u)
         np.testing.assert_array_equal(model.outputs[:-1], u)
@@ -169,7 +143,7 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_the_model_has_the_same_bits_under_windows(built: Any, real: str, tmp_path: Path) -> None:
     folder, u = built("vsg-2", "cascaded", real).parent, [0.5, 1.0, 1.0, 0.05, 0.0]
-    refs, ys = accepted(3, real, True)
+    refs, ys = accepted(3, TICKS, real, True)
     ticks = np.hstack([refs, ys])
     (tmp_path / "ticks.bin").write_bytes(np.array(u).tobytes() + ticks.tobytes())
     cross = ["-std=c99", "-O2", "-ffp-contract=off", "-static-libgcc", f"-I{folder}"]

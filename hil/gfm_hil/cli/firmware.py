@@ -11,11 +11,12 @@ from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
+from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_runtime import Law, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
+    FMI,
     OPTIMISED,
     REALS,
     SHIPPED,
@@ -26,6 +27,7 @@ from gfm_runtime.firmware import (
     check,
     dll_sources,
     export,
+    fmu,
     golden,
     make_modules,
 )
@@ -50,6 +52,12 @@ def add(command: argparse.ArgumentParser) -> None:
     _add_how(dll)
     dll.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
     dll.set_defaults(call=call_dll)
+    unit = kinds.add_parser("fmu", help="build a law as an FMU for co-simulation")
+    unit.add_argument("law", metavar="LAW", help="a name, or a .toml file")
+    _add_how(unit)
+    unit.add_argument("--fmi", choices=FMI, default=FMI[-1], help=f"version of FMI ({FMI[-1]})")
+    unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
+    unit.set_defaults(call=call_fmu)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
     _add_laws(vectors)
     vectors.add_argument(
@@ -104,15 +112,23 @@ def call_export(options: argparse.Namespace) -> int:
 
 def call_dll(options: argparse.Namespace) -> int:
     """Write the folder and build the library; returns the exit code."""
-    laws = _laws([options.law], options.inner)
-    if len(laws) != 1:
-        raise UserError(f"law {options.law!r}: has {len(laws)} stages; a model holds one law")
-    ((name, law),) = laws.items()
+    name, law = _one_law(options)
     files = dll_sources(name, law, options.T_s, options.real, _omega_b(options.f_n))
     options.out.mkdir(parents=True, exist_ok=True)
     for file, text in files.items():
         write_text(options.out / file, text)
     print(build_dll(options.out, name, files))
+    return 0
+
+
+def call_fmu(options: argparse.Namespace) -> int:
+    """Build the FMU; returns the exit code."""
+    name, law = _one_law(options)
+    omega_b = _omega_b(options.f_n)
+    packed = fmu(name, law, options.T_s, options.real, options.fmi, omega_b)
+    with replacing(options.out) as part:
+        part.write_bytes(packed)
+    print(options.out)
     return 0
 
 
@@ -149,6 +165,14 @@ def _laws(names: Sequence[str], inner: str | None) -> dict[str, Law]:
                 raise UserError(f"law {label!r}: is named twice")
             laws[label] = law
     return laws
+
+
+def _one_law(options: argparse.Namespace) -> tuple[str, Law]:
+    laws = _laws([options.law], options.inner)
+    if len(laws) != 1:
+        raise UserError(f"law {options.law!r}: has {len(laws)} stages; a model holds one law")
+    ((name, law),) = laws.items()
+    return name, law
 
 
 def _omega_b(f_n: float) -> float:
