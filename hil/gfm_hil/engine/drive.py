@@ -6,6 +6,7 @@ Both functions are meant for a thread of their own.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.engine.waiting import part_from
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
+from gfm_hil.models import ModelError
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import CONTROLLER_LEFT, PLANT_LEFT
 from gfm_hil.recording.parts import Part
@@ -63,7 +65,8 @@ class _Loop:
         )
         own = bench.plant.records if plant else ControllerRecords(c.ctl, c.laws, c.states, c.est)
         self._arguments = end, records, own
-        self._call = plant_ticks if plant else controller_ticks
+        ticks: Callable[..., Why] = bench.model or controller_ticks
+        self._call = plant_ticks if plant else ticks
 
     def go(self, until: int) -> Why:
         """Run until that tick, or until the loop returns for another reason.
@@ -133,6 +136,8 @@ def drive_controller(
     """Run the controller's side of a scenario after the handshake; returns its frame counters."""
     loop, ctl = _Loop("controller", bench, link, part, t0_ns, flags), bench.controller.ctl
     why = Why.EVENT
+    if bench.model is not None:
+        bench.model.last_words = lambda: loop.last_words(STOPPED, 0, bench.u)
     loop.loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running:
         event = timeline.next_tick()
@@ -142,7 +147,12 @@ def drive_controller(
         elif event <= loop.tick + 1 or why == Why.WOKEN:
             timeline.carry_out(loop.tick + 1)
             event = timeline.next_tick()
-        why = loop.go(event)
+        try:
+            why = loop.go(event)
+        except ModelError as problem:
+            timeline.end("safe", str(problem), loop.tick)
+            loop.last_words(STOPPED, 0, bench.u)
+            break
         tick = loop.tick
         if why in (Why.CHANGED, Why.EVENT) and not loop.loop["pending"][0]:
             timeline.look(max(tick, 0))

@@ -141,9 +141,16 @@ class _Heard:
 
 
 def shake_hands(
-    role: Role, link: Link, scenario: Scenario, stopped: Callable[[], bool], notice: Notice
+    role: Role,
+    link: Link,
+    scenario: Scenario,
+    stopped: Callable[[], bool],
+    notice: Notice,
+    name: str = OUR_CONTROLLER,
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
+
+    ``name`` is what a controller calls itself.
 
     ``notice`` is told, within a second and then every five, that the other side is awaited, and
     what came instead.
@@ -157,7 +164,7 @@ def shake_hands(
     if role == "plant":
         mine["run"] = secrets.token_hex(8)
     else:
-        mine["name"] = OUR_CONTROLLER
+        mine["name"] = name
     run, controller = mine.get("run"), mine.get("name")
     begin = time.monotonic_ns()
     deadline = begin + int(scenario.link.start_timeout_s * 1e9)

@@ -39,6 +39,9 @@ def run_loop(
     ordinary priority and only looks, a few times a second, whether to stop and what to write down.
     A link without a port gets a thread that pumps its messages.
 
+    Raises:
+        PeerLost: a model in place of the law does not answer; its thread is left behind.
+
     Args:
         flags: shape (FLAGS,), what other threads tell the loop, see
             ``gfm_hil.engine.loop_records``.
@@ -67,9 +70,11 @@ def run_loop(
             thread.join(_LOOK_S)
             timeline.flush()
             flags[STOP] = stopped() or bool(timeline.failed)
+            if bench.model is not None:
+                bench.model.watch(timeline, bench.scenario.link.peer_timeout_s / 2)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
-        while thread.is_alive():
+        while thread.is_alive() and not (bench.model is not None and bench.model.given_up):
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
         timeline.put_off = False

@@ -12,26 +12,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.roles import Role
+from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.drive import compile_loops
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
+from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
 from gfm_hil.links.impaired.link import ImpairedLink
+from gfm_hil.models import Model, ModelError
 from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
+from gfm_hil.scenario.events import Gains, LawChange
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 from gfm_plant import plant_command, plant_sample, plant_step
@@ -40,9 +43,18 @@ from gfm_runtime.signals import carried
 
 
 def run_role(
-    role: Role, scenario: Scenario, folder: Path, notice: Callable[[str], None] = print
+    role: Role,
+    scenario: Scenario,
+    folder: Path,
+    notice: Callable[[str], None] = print,
+    model: Model | None = None,
 ) -> Outcome:
     """Run one side of a scenario at ``scenario.link.endpoint``, which is set; record to ``folder``.
+
+    Args:
+        role, scenario, folder: which side of what, and where it records.
+        notice: told what a person should know while waiting.
+        model: of the controller: what computes u in place of the law.
 
     Returns:
         How it ended; the parts of the recording, ``events_<role>.jsonl`` and ``link_<role>.json``
@@ -53,7 +65,7 @@ def run_role(
     """
     assert scenario.link.endpoint is not None
     with Interrupt() as interrupt:
-        return _run(role, scenario, scenario.link.endpoint, folder, notice, interrupt)
+        return _run(role, scenario, scenario.link.endpoint, folder, notice, interrupt, model)
 
 
 def _run(
@@ -63,8 +75,11 @@ def _run(
     folder: Path,
     notice: Callable[[str], None],
     interrupt: Interrupt,
+    model: Model | None,
 ) -> Outcome:
     bench = make_bench(scenario)
+    if model is not None:
+        bench.model = _stepped(model, bench)
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
         write_scenario(folder, scenario)
@@ -90,6 +105,21 @@ def _run(
             timeline.close()
     assert timeline.outcome is not None
     return timeline.outcome
+
+
+def _stepped(model: Model, bench: Bench) -> SteppedModel:
+    """A model ready for tick 0 at the operating point.
+
+    Raises:
+        UserError: it refuses, or the scenario has events that are about a law.
+    """
+    for event in bench.scenario.events:
+        if isinstance(event, (LawChange, Gains)):
+            raise UserError(f"events, {event.label()}: {model.name} has a law of its own")
+    try:
+        return SteppedModel(model, bench.u)
+    except ModelError as problem:
+        raise UserError(str(problem)) from None
 
 
 def _meet_and_run(
@@ -130,7 +160,8 @@ def _meet_and_run(
             timeline.write(0, "scheduling", role=role, **rights)
         no_collector_pauses()
         notify(f"STATUS=waiting for the other side at {endpoint}")
-        start = shake_hands(role, good, scenario, stopped, notice)
+        name = OUR_CONTROLLER if bench.model is None else bench.model.name
+        start = shake_hands(role, good, scenario, stopped, notice, name)
         met = {"controller": start.controller, "run": start.run, "one_clock": start.one_clock}
         timeline.write(0, "handshake", role=role, **met)  # in the log: a kill does not lose it
         with Watched(scenario, part.progress):
@@ -138,6 +169,8 @@ def _meet_and_run(
     finally:
         resources.close()
         link.close()
+        if bench.model is not None:
+            bench.model.close()
     injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
     counted = getattr(good, "counters", {})  # of a link in several frames a message
     faults = {**reader.faults, **counted, "refused_greetings": start.refused}
