@@ -147,12 +147,15 @@ def test_no_rule_of_misra_is_broken_but_those_of_the_page(tmp_path: Path) -> Non
         folder = tmp_path / f"{style}-{real}"
         folder.mkdir()
         exported(folder, real, style, of=laws)
-        files = sorted(p.name for p in folder.glob("gfm*.c"))
-        done = cc(folder, *check_it, *files, compiler="cppcheck")
-        assert done.returncode == 0 and "noValidConfiguration" not in done.stderr
-        for line in done.stderr.splitlines():
-            for rule in re.findall(r"\[misra-c2012-([\d.]+)\]$", line):
-                found.setdefault(rule, f"{folder.name}/{line}")
+        scheduled = ["firmware", "export", "mimo-gfm-scheduled", "--style", style, "--real", real]
+        assert main([*scheduled, "-o", str(folder / "scheduled")]) == 0
+        for at in (folder, folder / "scheduled"):
+            files = sorted(p.name for p in at.glob("gfm*.c"))
+            done = cc(at, *check_it, *files, compiler="cppcheck")
+            assert done.returncode == 0 and "noValidConfiguration" not in done.stderr
+            for line in done.stderr.splitlines():
+                for rule in re.findall(r"\[misra-c2012-([\d.]+)\]$", line):
+                    found.setdefault(rule, f"{at.relative_to(tmp_path)}/{line}")
     listed = set(re.findall(r"^\| ([\d.]+) \| (?:required|advisory) \|", page, re.MULTILINE))
     assert len(found) > 5
     assert [place for rule, place in found.items() if rule not in listed] == []

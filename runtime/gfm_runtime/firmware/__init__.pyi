@@ -4,6 +4,7 @@ from .fmu import FMI, fmu
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
 from .module import REALS, STYLES, Module, Style, make_modules, sources
+from .schedule import stage_names
 
 __all__ = [
     "CHECKED",
@@ -25,4 +26,5 @@ __all__ = [
     "golden",
     "make_modules",
     "sources",
+    "stage_names",
 ]

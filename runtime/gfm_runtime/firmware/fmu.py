@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Literal, get_args
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, plain, template
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
-from gfm_runtime.firmware.module import MADE, RESULTS, Module, keys_of, make_modules, sources
-from gfm_runtime.law import Law
+from gfm_runtime.firmware.module import MADE, RESULTS, Module, keys_of
+from gfm_runtime.firmware.schedule import one_module
 from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, group, table_hash
 
 Fmi = Literal["2", "3"]
@@ -68,12 +69,11 @@ class _Variable:
         return {"unit": s.unit, "min": repr(s.low), "max": repr(s.high), **start}
 
 
-def fmu(name: str, law: Law, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
+def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
     """The FMU of a law, as the bytes of its file.
 
     Args:
-        name: of the law and the model.
-        law: with its inner stage, if it has one.
+        laws: the law, with its inner stage if it has one; or a scheduled one.
         T_s: sampling time, s.
         real: float32 or float64 inside; inputs and outputs are always 64 bits.
         fmi: which FMI.
@@ -82,8 +82,8 @@ def fmu(name: str, law: Law, T_s: float, real: str, fmi: Fmi, omega_b: float) ->
     Raises:
         LawError: as ``make_modules``; there is no gcc (the apt package is named), or it fails.
     """
-    (m,) = make_modules({name: law}, T_s, real, omega_b)
-    code, description = _sources(m, T_s, fmi)
+    m, own = one_module(laws, T_s, real, omega_b)
+    code, description = _sources(m, own, T_s, fmi)
     held: dict[str, bytes] = {"modelDescription.xml": description}
     held |= {f"sources/{file}": text.encode() for file, text in code.items()}
     if fmi == "3":
@@ -96,8 +96,11 @@ def fmu(name: str, law: Law, T_s: float, real: str, fmi: Fmi, omega_b: float) ->
     return packed.getvalue()
 
 
-def _sources(m: Module, T_s: float, fmi: Fmi) -> tuple[dict[str, str], bytes]:
-    """The sources by file name, and modelDescription.xml; the token follows from both."""
+def _sources(
+    m: Module, own: Mapping[str, str], T_s: float, fmi: Fmi
+) -> tuple[dict[str, str], bytes]:
+    """The law's ``own`` sources and the others by file name, and modelDescription.xml; the token
+    follows from both."""
     u = carried_rows("u", m.stages)
     inside = (*group("ref"), *carried_rows("y", m.stages))
     interface = template(f"fmi{fmi}.c")
@@ -114,7 +117,7 @@ def _sources(m: Module, T_s: float, fmi: Fmi) -> tuple[dict[str, str], bytes]:
         "TOKEN": "@TOKEN@",
     }
     code = {
-        **sources([m], T_s, "unrolled"),
+        **own,
         "fmu.h": filled(chosen(template("fmu.h"), m.choices), keys),
         f"fmi{fmi}.c": filled(interface, keys),
     }
