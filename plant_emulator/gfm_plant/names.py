@@ -32,9 +32,11 @@ TRIP_REASONS: dict[int, str] = {
 """What the trip code in a plant's state means."""
 
 #: the value of a trip with the code CONTROLLER, and the words for it
-SAFE_STATE, SILENT = 0.0, 1.0
+SAFE_STATE, SILENT, GONE, LEFT = 0.0, 1.0, 2.0, 3.0
 CONTROLLER_SAFE = "the controller is in its safe state"
 NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
+CONTROLLER_GONE = "the controller's process is gone"
+CONTROLLER_LEFT = "the controller was stopped"
 
 SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
 """Indices of the y that pass the sensors; omega_u is a command and known exactly."""

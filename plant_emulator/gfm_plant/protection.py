@@ -15,10 +15,15 @@ import numpy as np
 from gfm_plant.names import (
     BAD_COMMAND,
     CONTROLLER,
+    CONTROLLER_GONE,
+    CONTROLLER_LEFT,
     CONTROLLER_SAFE,
     DIVERGED,
+    GONE,
+    LEFT,
     NO_FRESH_U,
     OVERLOAD,
+    SAFE_STATE,
     SILENT,
     TRIP_REASONS,
     TRIPS,
@@ -27,6 +32,12 @@ from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecords
 from gfm_plant.solution import I_F, V, circuit, enter, own
 from gfm_runtime.compiled import compiled
 
+_BLOCKED = {
+    SAFE_STATE: CONTROLLER_SAFE,
+    SILENT: NO_FRESH_U,
+    GONE: CONTROLLER_GONE,
+    LEFT: CONTROLLER_LEFT,
+}
 _LEAST_V = 0.2  # p.u.; a smaller voltage has no angle that a relay could read
 
 
@@ -129,7 +140,7 @@ def trip_reason(plant: PlantRecords, k: int = 0) -> str:
     if code == BAD_COMMAND:
         return f"command not finite: u held {value} {at}"
     if code == CONTROLLER:
-        return NO_FRESH_U if value == SILENT else CONTROLLER_SAFE
+        return _BLOCKED[value]
     if code == OVERLOAD:
         ticks = r["trip_ticks"][N_TRIPS:]
         step = np.flatnonzero((ticks >= 0) & (s["crossed"][N_TRIPS:] > ticks))[0]

@@ -237,7 +237,8 @@ def _loop(place: Path, role: Any) -> Iterator[tuple[str, list[bool]]]:
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        with CommandServer(role, bench, timeline, place, bell.set, lambda: stopped.append(True)):
+        of = [(place, bench)], [timeline]
+        with CommandServer(role, *of, bell.set, lambda: stopped.append(True)):
             found = json.loads(announcement(place, role).read_text())
             yield found["endpoint"], stopped
         assert thread.is_alive()

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.drive import Share
 from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
@@ -107,7 +108,7 @@ def lied_to(
     name, options = LINKS[link]
     endpoint = link_kind(name).fresh(folder)
     bench, part = make_bench(scenario), Part.create(folder, role, scenario.ticks)
-    compile_role(role, bench, part)
+    compile_role(role, [bench], [part])
     ends = {s: open_link(name, s, endpoint, options) for s in ROLES}
     liar = Liar(ends[OTHER[role]], OTHER[role])
     timeline = Timeline(bench, folder / "events.jsonl", (role,))
@@ -121,7 +122,8 @@ def lied_to(
         thread.start()
         assert ends[role].wait(30)
         t0 = time.monotonic_ns()
-        reader = run_loop(role, bench, ends[role], part, timeline, t0, stopped)
+        share = Share(bench, ends[role], part, timeline)
+        (reader,) = run_loop(role, [share], t0, stopped)
         liar.over.set()
         thread.join()
         give_up = time.monotonic() + LIMIT_S

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.drive import Share
 from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
@@ -238,7 +239,7 @@ def alone(
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
     bench = make_bench(scenario)
     part = Part.create(folder, role, scenario.ticks, bench.inner)
-    compile_role(role, bench, part)
+    compile_role(role, [bench], [part])
     ends = {s: open_link(link, s, endpoint) for s in ROLES}
     other: Role = "plant" if role == "controller" else "controller"
     timeline = Timeline(bench, folder / "events.jsonl", (role,))
@@ -247,7 +248,8 @@ def alone(
             assert ends[other].send(message)
         assert not heard or ends[role].wait(30)
         t0 = time.monotonic_ns()
-        reader = run_loop(role, bench, ends[role], part, timeline, t0, stopped)
+        share = Share(bench, ends[role], part, timeline)
+        (reader,) = run_loop(role, [share], t0, stopped)
         answers = FrameReader("u" if role == "controller" else "y", bench.inner)
         values, said = np.zeros(len(carried(answers.group, bench.inner))), []
         while ends[other].wait(0.05):

@@ -148,7 +148,13 @@ def test_a_run_on_disk_is_that_in_memory(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"link": {"type": "shm"}}, "link.type = 'shm': a network runs in one process"),
+        ({"network": {"converters": {"A": {**BUS, "link": {"type": "shm"}}, "B": BUS}}},
+         "network.converters: link.type is 'inproc' of some and not of others"),
+        ({"link": {"type": "zmq", "endpoint": "ipc:///tmp/x"}},
+         "network.converters: 2 have the link.endpoint 'ipc:///tmp/x'; each needs one of its own"),
+        ({"network": {"converters": {"A": {**BUS, "link": {"type": "smh"}}}}},
+         "network.converters.A.link: type = 'smh': must be one of"),
+        ({"mode": "realtime"}, "link.type = 'inproc': runs in lockstep only"),
         ({"after_trip": "wait"}, "after_trip = 'wait': a network has no reset yet"),
         ({"events": [{"type": "breaker", "name": "stop", "t": 0.1, "closed": True}]},
          r"events.0: name = 'stop': must be one of \['A', 'B', 'base', 'step'\]"),

@@ -33,7 +33,7 @@ class Ends:
         self.timeline = Timeline(bench, folder / "events_controller.jsonl", ("controller",))
         self.stops, self.tick = 0, 0
         self.server = CommandServer(
-            "controller", bench, self.timeline, folder, self.wake, self.stop
+            "controller", [(folder, bench)], [self.timeline], self.wake, self.stop
         )
 
     def wake(self) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.drive import Share
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_role
@@ -145,7 +146,7 @@ def run_pair(
     benches = {role: make_bench(scenario) for role in ROLES}
     parts = {role: Part.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES}
     for role in ROLES:
-        compile_role(role, benches[role], parts[role])
+        compile_role(role, [benches[role]], [parts[role]])
     pair = Pair()
 
     def call(role: Role) -> None:
@@ -157,7 +158,8 @@ def run_pair(
             used = ImpairedLink(end, impairment, role)  # compiles: before START
         try:
             t0 = shake_hands(role, end, scenario, lambda: False, lambda text: None).t0_ns
-            reader = run_loop(role, bench, touch(role, used), part, timeline, t0, stopped)
+            share = Share(bench, touch(role, used), part, timeline)
+            (reader,) = run_loop(role, [share], t0, stopped)
             pair.faults[role] = dict(reader.faults)
             pair.counters[role] = dict(getattr(end, "counters", {}))
             if isinstance(used, ImpairedLink):

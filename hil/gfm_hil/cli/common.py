@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -50,7 +51,11 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     command.add_argument("--mode", choices=["lockstep", "realtime"], help="override mode")
     command.add_argument("--link", help="override link.type: zmq, inproc or another link there is")
-    command.add_argument("--endpoint", help="override link.endpoint, e.g. tcp://127.0.0.1:5555")
+    command.add_argument(
+        "--endpoint", action="append", default=[],
+        help="override link.endpoint, e.g. tcp://127.0.0.1:5555; of the plant of a network once for"
+        " each converter, as NAME=ENDPOINT",
+    )  # fmt: skip
     command.add_argument(
         "--option", action="append", default=[], metavar="KEY=VALUE", type=_link_option,
         help="override a key of link.options, e.g. curve=keys; may be repeated",
@@ -91,18 +96,45 @@ def window(text: str) -> list[float]:
     return [start, stop]
 
 
-def resolve(options: argparse.Namespace, **more: Any) -> Scenario:
+def endpoints(options: argparse.Namespace) -> dict[str, str]:
+    """The endpoints that --endpoint names, by converter, "" for one without a name.
+
+    Raises:
+        UserError: one is given twice.
+    """
+    found: dict[str, str] = {}
+    for text in options.endpoint:
+        named = re.fullmatch(r"([A-Za-z_][A-Za-z0-9_-]*)=(.+)", text)
+        name, endpoint = named.groups() if named else ("", text)
+        if name in found:
+            raise UserError(f"--endpoint {text}: given twice{name and f' for {name}'}")
+        found[name] = endpoint
+    return found
+
+
+def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Scenario:
     """The scenario with its overrides; ``more`` goes to ``load_scenario``.
+
+    Args:
+        named: the command takes an endpoint for each converter, see ``endpoints``; the option
+            --converter says that the only one is that of a network's converter.
 
     Raises:
         UserError: as ``load_scenario``.
     """
+    ends = endpoints(options)
+    for name in ends:
+        if name and not named:
+            raise UserError(
+                f"--endpoint {name}={ends[name]}: for gfmhil plant; here a scenario names it, as"
+                f" network.converters.{name}.link.endpoint"
+            )
     return load_scenario(
         options.scenario,
         OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
         mode=options.mode,
         link__type=options.link,
-        link__endpoint=options.endpoint,
+        link__endpoint=None if named and options.converter is not None else ends.get(""),
         duration=options.duration,
         seed=options.seed,
         inner=options.inner,

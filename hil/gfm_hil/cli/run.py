@@ -119,7 +119,10 @@ def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) 
         raise UserError("--controller: controls one converter; a network runs without it")
     for name in ("scope", "stream", "modbus"):
         if getattr(options, name) is not None:
-            raise UserError(f"--{name}: looks at one converter; a network runs without it")
+            raise UserError(
+                f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
+                " folder of a converter"
+            )
     with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
         figures = not options.no_figures
         runs = run_network(scenario, folder, progress, notice, figures=figures)

@@ -63,3 +63,11 @@ def present(folder: Path) -> list[Role]:
         UserError: a file or process cannot be examined.
     """
     return [role for role in ROLES if announced(folder, role) is not None]
+
+
+def not_running(folder: Path) -> UserError:
+    """The error that no run is going on in a folder."""
+    of = sorted(path.parent.name for path in folder.glob("*/scenario.toml"))
+    if of and (folder / "scenario.toml").is_file():
+        return UserError(f"{folder}: is of a network; name the folder of a converter: one of {of}")
+    return UserError(f"{folder}: no run is going on there")

@@ -14,7 +14,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,10 @@ class CommandServer:
     """One role's command server; use it as a context manager around the run.
 
     Args:
-        role, bench, timeline: of the run.
-        folder: the run folder, to announce the socket in.
+        role: of the run.
+        places: the run folder, to announce the socket in, with its bench; of the plant of a
+            network one for each converter.
+        timelines: of each.
         wake: tells the loop that the timeline has something new.
         stop: ends the run as Ctrl-C would.
     """
@@ -63,14 +65,13 @@ class CommandServer:
     def __init__(
         self,
         role: Role,
-        bench: Bench,
-        timeline: Timeline,
-        folder: Path,
+        places: Sequence[tuple[Path, Bench]],
+        timelines: Sequence[Timeline],
         wake: Callable[[], None],
         stop: Callable[[], None],
     ) -> None:
-        self._role, self._bench, self._timeline = role, bench, timeline
-        self._announcement = announcement(folder, role)
+        self._role, self._places, self._timelines = role, places, timelines
+        self._bench, self._timeline = places[0][1], timelines[0]
         self._wake, self._stop = wake, stop
         self._rate = Rate("all operators together", _PER_S, _BURST)
         self._over = threading.Event()
@@ -98,22 +99,25 @@ class CommandServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._announcement.unlink(missing_ok=True)
+        for folder, _bench in self._places:
+            announcement(folder, self._role).unlink(missing_ok=True)
         self._over.set()
         self._thread.join()
         self._resources.close()
 
     def _announce(self) -> None:
         """Write down where the socket is, and to which laws the recording's law indices refer."""
-        c = self._bench.controller
-        content = {"endpoint": self._endpoint, "T_s": c.T_s, "names": list(c.sets)}
-        content["laws"] = [
-            {"label": label, "name": name, "gains": gains}
-            for label, name, gains in zip(c.labels, c.names, c.changed, strict=True)
-        ]
-        new = self._announcement.with_suffix(".new")
-        new.write_text(json.dumps(content), encoding="utf-8")
-        new.replace(self._announcement)
+        for folder, of in self._places:
+            c = of.controller
+            content = {"endpoint": self._endpoint, "T_s": c.T_s, "names": list(c.sets)}
+            content["laws"] = [
+                {"label": label, "name": name, "gains": gains}
+                for label, name, gains in zip(c.labels, c.names, c.changed, strict=True)
+            ]
+            place = announcement(folder, self._role)
+            new = place.with_suffix(".new")
+            new.write_text(json.dumps(content), encoding="utf-8")
+            new.replace(place)
 
     def _serve(self) -> None:
         while not self._over.is_set():
@@ -128,7 +132,8 @@ class CommandServer:
                 raise ValueError("a command must be an object")
             by = Identity.model_validate(content.pop("by", _UNKNOWN))
             if content == {"type": "stop"}:  # always passes
-                self._timeline.stopped_by = by.plain()
+                for timeline in self._timelines:
+                    timeline.stopped_by = by.plain()
                 self._stop()
                 return {"ok": True}
             self._rate.take()
@@ -169,7 +174,7 @@ class CommandServer:
         return event
 
     def _carry_out(self, event: Any, by: Identity) -> dict[str, Any]:
-        ticket = self._timeline.insert(event, by.plain())
+        ticket = self._timeline.insert(event, by.plain(), self._timelines[1:])
         self._wake()
         until = time.monotonic() + _TAKEN_OVER_S
         while not ticket.done.wait(_LOOK_MS * 1e-3):

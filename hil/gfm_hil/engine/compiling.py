@@ -6,7 +6,8 @@ run of an installation on a machine compiles for minutes, and those after it onl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
-from gfm_hil.scenario.model import INPROC, Scenario
+from gfm_hil.scenario.model import Scenario
 
 #: a name for people, and what compiles the functions, or loads them from the cache
 Set = tuple[str, Callable[[], object]]
@@ -73,38 +74,43 @@ def compiled_bench(
     """
     found: list[Bench] = []
     sets: list[Set] = [("the operating point", lambda: found.append(make_bench(scenario)))]
-    link = scenario.link
-    if link.type == INPROC:
-        sets.append(_both(found))
-    else:
-        sets += [_role(role, found) for role in roles]
-        sets.append(_link(link.type, link.options, scenario.has_inner))
-        if link.impairment is not None:
-            sets.append(("the link's impairment", impaired.warm_up))
-        if scenario.mode == "realtime":
-            sets.append(_IDLE)
+    sets.extend(_loops(scenario, found, roles))
     compile_sets(sets, notice)
     return found[0]
 
 
-def compiled_benches(scenario: Scenario, notice: Callable[[str], None]) -> list[Bench]:
+def compiled_benches(
+    scenario: Scenario, notice: Callable[[str], None], roles: Iterable[Role] = ROLES
+) -> list[Bench]:
     """The benches of a network's converters, with everything compiled that a tick calls.
 
     Args:
-        scenario, notice: as for ``compiled_bench``.
+        scenario, notice, roles: as for ``compiled_bench``.
 
     Raises:
         UserError: as ``make_benches``.
     """
     found: list[Bench] = []
-    compile_sets(
-        [
-            ("the operating point", lambda: found.extend(make_benches(scenario))),
-            ("the loop of several converters", lambda: compile_loop(found)),
-        ],
-        notice,
-    )
+    sets: list[Set] = [("the operating point", lambda: found.extend(make_benches(scenario)))]
+    sets.extend(_loops(scenario, found, roles))
+    compile_sets(sets, notice)
     return found
+
+
+def _loops(scenario: Scenario, found: list[Bench], roles: Iterable[Role]) -> Iterator[Set]:
+    """The loops of the benches that will be ``found``, and what they call."""
+    if scenario.in_process:
+        yield _both(found)
+        return
+    for role in roles:
+        yield _role(role, found)
+    links = {json.dumps([link.type, link.options]): link for link in scenario.links}
+    for link in links.values():
+        yield _link(link.type, link.options, scenario.has_inner)
+    if any(link.impairment is not None for link in links.values()):
+        yield "the link's impairment", impaired.warm_up
+    if scenario.mode == "realtime":
+        yield _IDLE
 
 
 def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
@@ -165,13 +171,13 @@ _IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)
 
 
 def _both(found: list[Bench]) -> Set:
-    return "the loop of both sides", lambda: compile_loop(found[:1])
+    return "the loop of both sides", lambda: compile_loop(found)
 
 
 def _role(role: Role, found: list[Bench], which: str = "") -> Set:
     def compile_it() -> None:
-        plant, controller = buffers(1, found[0].inner)
-        compile_role(role, found[0], plant if role == "plant" else controller)
+        parts = [buffers(1, bench.inner)[role == "controller"] for bench in found]
+        compile_role(role, found, parts)
 
     return f"the {role}{which}", compile_it
 

@@ -160,7 +160,7 @@ def _next_frame(end, records, r, ctl, sent):
             return Why.WOKEN
         if size <= 0:
             between_looks(looks, end.spins)
-    if reader[0].state == SAFE and not r.waits:
+    if reader[0].state == SAFE and not r.goes_on:
         return Why.PEER_SAFE
     if reader[0].state == STOPPED:
         return Why.PEER_STOPPED

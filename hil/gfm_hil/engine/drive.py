@@ -6,8 +6,8 @@ Both functions are meant for a thread of their own.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from gfm_hil.engine.loop_records import (
     ControllerRecords,
     LinkEnd,
     Records,
+    Side,
     Why,
     make_loop,
 )
@@ -31,59 +32,69 @@ from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.models import ModelError
 from gfm_hil.realtime.clock import now_ns, sleep_until
-from gfm_hil.recording.log import CONTROLLER_LEFT, PLANT_LEFT
+from gfm_hil.recording.log import PLANT_LEFT
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.expectation import CONTROLLER_GONE
-from gfm_plant import NO_FRESH_U
+from gfm_plant import NO_FRESH_U, take_out
+from gfm_plant.names import CONTROLLER_GONE, CONTROLLER_LEFT
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
 _FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
 
 
-class _Loop:
-    """One side's compiled loop with everything that its calls have in common."""
+class Share(NamedTuple):
+    """What a role's loop has of one converter.
 
-    def __init__(
-        self, role: Role, bench: Bench, link: Any, part: Part, t0_ns: int, flags: NDArray[np.int64]
-    ) -> None:
+    Attributes:
+        crowded: other loops run on the same processor, so that this one yields it at every look.
+    """
+
+    bench: Bench
+    link: Link
+    part: Part
+    timeline: Timeline
+    crowded: bool = False
+
+
+class _End:
+    """One end of a link for a compiled loop, and what the loop writes there."""
+
+    def __init__(self, role: Role, share: Share, t0_ns: int, flags: NDArray[np.int64]) -> None:
+        bench, link, part, *_ = share
         assert link.port is not None
-        scenario, port, c = bench.scenario, link.port, bench.controller
+        scenario, port = bench.scenario, link.port
         plant = role == "plant"
-        self.link = link
+        self.bench, self.link = bench, link
         self.writer = FrameWriter("y" if plant else "u", bench.inner)
         self.reader = FrameReader.of(role, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
         self.loop["spin_limit"] = port.spin_limit
         w, r = self.writer, self.reader
         end = LinkEnd(
-            port.send, port.receive, port.patient or _rest, port.handle, port.spins,
+            port.send, port.receive, port.patient or _rest, port.handle,
+            0 if share.crowded else port.spins,
             (w.sequence, w.frame, w.message), (r.frame, r.message), r.record,
         )  # fmt: skip
         records = Records(
             self.loop, flags, bench.y, bench.u, part.signals, part.times, part.progress
         )
-        own = bench.plant.records if plant else ControllerRecords(c.ctl, c.laws, c.states, c.est)
-        self._arguments = end, records, own
-        ticks: Callable[..., Why] = bench.model or controller_ticks
-        self._call = plant_ticks if plant else ticks
-
-    def go(self, until: int) -> Why:
-        """Run until that tick, or until the loop returns for another reason.
-
-        Raises:
-            PeerLost: the link is gone.
-        """
-        why: Why = self._call(*self._arguments, until)
-        if why == Why.GONE:
-            self.link.receive()  # raises and says more
-            raise PeerLost("the link is gone")
-        return why
+        self.side = Side(end, records)
 
     @property
     def tick(self) -> int:
         """Plant: the next tick; controller: the last one received."""
         return int(self.loop["tick"][0])
+
+    def checked(self, why: Why) -> Why:
+        """Why the loop returned.
+
+        Raises:
+            PeerLost: the link is gone.
+        """
+        if why == Why.GONE:
+            self.link.receive()  # raises and says more
+            raise PeerLost("the link is gone")
+        return why
 
     def keep_u(self, u: NDArray[np.float64]) -> None:
         """Take u as the two newest that came."""
@@ -96,90 +107,126 @@ class _Loop:
         part_from(self.link, self.writer, self.reader, tick, state, reason, values)
 
 
-def drive_plant(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, flags: NDArray[np.int64]
-) -> FrameReader:
-    """Run the plant's side of a scenario after the handshake; returns its frame counters."""
-    loop, ticks = _Loop("plant", bench, link, part, t0_ns, flags), bench.scenario.ticks
-    loop.keep_u(bench.u)
-    waits = bench.scenario.after_trip == "wait"
-    while timeline.running:
-        timeline.carry_out(loop.tick)
-        why = loop.go(min(timeline.next_tick(), ticks))
-        tick = loop.tick
+def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -> list[FrameReader]:
+    """Run the plant's side of a scenario after the handshakes, with a share for each converter;
+    returns the frame counters of each."""
+    ends = [_End("plant", share, t0_ns, flags) for share in shares]
+    timelines = [share.timeline for share in shares]
+    sides, first = tuple(end.side for end in ends), ends[0]
+    bench, alone = shares[0].bench, len(shares) == 1
+    ticks = bench.scenario.ticks
+    for end in ends:
+        end.keep_u(end.bench.u)
+    while any(timeline.running for timeline in timelines):
+        for timeline in timelines:
+            timeline.carry_out(first.tick)
+        until = min(ticks, *(timeline.next_tick() for timeline in timelines))
+        why = first.checked(plant_ticks(sides, bench.plant.records, until))
+        tick = first.tick
         if why == Why.RESTORE:
             bench.restore_plant(tick)
-            loop.keep_u(bench.u)
-        timeline.look(max(tick - 1, 0))
-        if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):
-            timeline.finish(tick)
-        elif why == Why.STOPPED_HERE:
-            timeline.end("interrupted", "stopped by the operator", tick)
-        elif why == Why.PEER_SAFE:
-            timeline.end("safe", REASONS[loop.reader.reason], tick)
-        elif why == Why.PEER_STOPPED:
-            timeline.end("interrupted", CONTROLLER_LEFT, tick)
-        elif why == Why.SILENT:
-            timeline.end("safe", CONTROLLER_GONE, tick)
-        elif why == Why.LATE:
-            timeline.end("safe", NO_FRESH_U, tick)
-    assert timeline.outcome is not None
-    status = timeline.outcome.status
-    state = SAFE if status == "tripped" and not waits else STOPPED
-    loop.last_words(state, int(status != "completed" and loop.tick < ticks), bench.y)
-    return loop.reader
+            first.keep_u(bench.u)
+        if not alone:
+            take_out(bench.plant)
+        for timeline in timelines:
+            timeline.look(max(tick - 1, 0))
+            if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):
+                timeline.finish(tick)
+            elif why == Why.STOPPED_HERE:
+                timeline.end("interrupted", "stopped by the operator", tick)
+            elif why == Why.PEER_SAFE:
+                timeline.end("safe", REASONS[first.reader.reason], tick)
+            elif why == Why.PEER_STOPPED:
+                timeline.end("interrupted", CONTROLLER_LEFT, tick)
+            elif why == Why.SILENT:
+                timeline.end("safe", CONTROLLER_GONE, tick)
+            elif why == Why.LATE:
+                timeline.end("safe", NO_FRESH_U, tick)
+    for end, timeline in zip(ends, timelines, strict=True):
+        assert timeline.outcome is not None
+        status, goes_on = timeline.outcome.status, end.bench.scenario.survives_trips
+        state = SAFE if status == "tripped" and not goes_on else STOPPED
+        early = status != "completed" and end.tick < ticks
+        if not end.loop["lost"][0]:
+            end.last_words(state, int(early), end.bench.y)
+    return [end.reader for end in ends]
 
 
-def drive_controller(
-    bench: Bench, link: Link, part: Part, timeline: Timeline, t0_ns: int, flags: NDArray[np.int64]
-) -> FrameReader:
-    """Run the controller's side of a scenario after the handshake; returns its frame counters."""
-    loop, ctl = _Loop("controller", bench, link, part, t0_ns, flags), bench.controller.ctl
-    why = Why.EVENT
+def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> FrameReader:
+    """Run the controller's side of a scenario after the handshake; returns its frame counters.
+
+    The controller of a converter in a network answers on in its safe state after a trip, until the
+    plant leaves.
+    """
+    bench, timeline = share.bench, share.timeline
+    end, ctl = _End("controller", share, t0_ns, flags), bench.controller.ctl
+    loop, own, goes_on = end.loop[0], _records(bench), bench.scenario.network is not None
+    why, ticks = Why.EVENT, _ticks(bench)
     if bench.model is not None:
-        bench.model.last_words = lambda: loop.last_words(STOPPED, 0, bench.u)
-    loop.loop["heard"] = max(time.monotonic_ns(), t0_ns)
-    while timeline.running:
+        bench.model.last_words = lambda: end.last_words(STOPPED, 0, bench.u)
+    loop["heard"] = max(time.monotonic_ns(), t0_ns)
+    while timeline.running or goes_on:
         event = timeline.next_tick()
-        if loop.loop["pending"][0]:  # the frame of the event's own tick was lost
-            timeline.carry_out(loop.tick)
+        if loop["pending"]:  # the frame of the event's own tick was lost
+            timeline.carry_out(end.tick)
             event = timeline.next_tick()
-        elif event <= loop.tick + 1 or why == Why.WOKEN:
-            timeline.carry_out(loop.tick + 1)
+        elif event <= end.tick + 1 or why == Why.WOKEN:
+            timeline.carry_out(end.tick + 1)
             event = timeline.next_tick()
         try:
-            why = loop.go(event)
+            why = end.checked(ticks(*end.side, own, event))
         except ModelError as problem:
-            timeline.end("safe", str(problem), loop.tick)
-            loop.last_words(STOPPED, 0, bench.u)
+            timeline.end("safe", str(problem), end.tick)
+            end.last_words(STOPPED, 0, bench.u)
             break
-        tick = loop.tick
-        if why in (Why.CHANGED, Why.EVENT) and not loop.loop["pending"][0]:
+        tick = end.tick
+        if why in (Why.CHANGED, Why.EVENT) and not loop["pending"]:
             timeline.look(max(tick, 0))
         if why == Why.STOPPED_HERE:
             timeline.end("interrupted", "stopped by the operator", tick)
-            loop.last_words(STOPPED, 0, bench.u)
-        elif why == Why.PEER_SAFE:
+            end.last_words(STOPPED, 0, bench.u)
+            break
+        if why == Why.PEER_SAFE:
             timeline.end("tripped", REASONS[PLANT_TRIP], tick)
-            loop.last_words(SAFE, PLANT_TRIP, bench.u)
-        elif why == Why.PEER_STOPPED:
-            if loop.reader.reason:
+            end.last_words(SAFE, PLANT_TRIP, bench.u)
+            break
+        if why == Why.PEER_STOPPED:
+            if end.reader.reason:
                 timeline.end("interrupted", PLANT_LEFT, tick)
             else:
                 timeline.finish(tick)
-            loop.last_words(STOPPED, 0, bench.u)
-        elif why == Why.SILENT:
+            end.last_words(STOPPED, 0, bench.u)
+            break
+        if why == Why.SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
-            loop.last_words(SAFE, LOST_PEER, bench.u)
-        elif not timeline.running:  # ``timeline.look`` found a safe state and wrote it down
-            loop.last_words(SAFE, int(ctl["reason"][0]), bench.u)
-    return loop.reader
+            end.last_words(SAFE, LOST_PEER, bench.u)
+            break
+        if not timeline.running and not goes_on:  # ``timeline.look`` found a safe state
+            end.last_words(SAFE, int(ctl["reason"][0]), bench.u)
+    return end.reader
 
 
-def compile_loops(role: Role, bench: Bench, part: Part) -> None:
+def _ticks(bench: Bench) -> Callable[..., Why]:
+    return bench.model or controller_ticks
+
+
+def _records(bench: Bench) -> ControllerRecords:
+    c = bench.controller
+    return ControllerRecords(c.ctl, c.laws, c.states, c.est)
+
+
+def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
-    loop = _Loop(role, bench, _Nowhere(), part, 0, np.ones(FLAGS, np.int64))
-    loop.go(_FAR if role == "controller" else 0)
+    nowhere: Any = _Nowhere()
+    unused: Any = None
+    ends = [
+        _End(role, Share(bench, nowhere, part, unused), 0, np.ones(FLAGS, np.int64))
+        for bench, part in zip(benches, parts, strict=True)
+    ]
+    if role == "plant":
+        plant_ticks(tuple(end.side for end in ends), benches[0].plant.records, 0)
+    else:
+        _ticks(benches[0])(*ends[0].side, _records(benches[0]), _FAR)
 
 
 @port_function

@@ -1,9 +1,9 @@
 """The start: each side says what it is about to run, and refuses a peer that runs something else.
 
-The plant sends HELLO every 100 ms until the controller answers with a HELLO of its own. Then the
-plant sends START with the time of tick 0. Messages are JSON, and frames begin only after START.
-The plant sends START once: if the link loses it, the controller takes the time of tick 0 from the
-plant's first frame.
+The plant sends HELLO every 100 ms until the controller answers with a HELLO of its own. Then, or
+when all its controllers have answered, the plant sends START with the time of tick 0. Messages are
+JSON, and frames begin only after START. The plant sends START once: if the link loses it, the
+controller takes the time of tick 0 from the plant's first frame.
 
 The plant's HELLO carries a number that it draws for this run, by which the recordings of both sides
 are put together later. The controller's HELLO may carry a name, so that a report can say who
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ _PREFIX = b"GFMHIL "
 _REPEAT_NS = 100_000_000
 _AGAIN_NS = 2_000_000_000  # after which a link that knows how reaches out anew
 _LEAD_NS = 20_000_000  # from START to tick 0
+_LEAD_OF_SEVERAL_NS = 3 * _REPEAT_NS  # where START waits for a repetition
 _MOST_LEAD_NS = 10_000_000_000  # of a plant that is not ours
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux; CLOCK_MONOTONIC counts from that boot
 
@@ -109,6 +111,32 @@ class Start:
     controller: str | None
 
 
+class Meeting:
+    """Of a plant with several controllers: they begin together, when the last one has come.
+
+    Args:
+        controllers: how many there are.
+    """
+
+    def __init__(self, controllers: int = 1) -> None:
+        self.run = secrets.token_hex(8)
+        self._missing, self._t0_ns = controllers, 0
+        self._lead_ns = _LEAD_NS if controllers == 1 else _LEAD_OF_SEVERAL_NS
+        self._lock = threading.Lock()
+
+    def come(self) -> None:
+        """One more is there."""
+        with self._lock:
+            self._missing -= 1
+            if self._missing == 0:
+                self._t0_ns = time.monotonic_ns() + self._lead_ns
+
+    @property
+    def t0_ns(self) -> int:
+        """Time of tick 0; 0 while one is missing."""
+        return self._t0_ns
+
+
 class _Refused(Exception):
     """A greeting that cannot be one; says why."""
 
@@ -146,28 +174,31 @@ def shake_hands(
     scenario: Scenario,
     stopped: Callable[[], bool],
     notice: Notice,
+    meeting: Meeting | None = None,
     name: str = OUR_CONTROLLER,
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
 
-    ``name`` is what a controller calls itself.
-
     ``notice`` is told, within a second and then every five, that the other side is awaited, and
     what came instead.
+
+    Args:
+        meeting: of a plant, in common to its controllers.
+        name: what a controller calls itself.
 
     Raises:
         PeerLost: no good greeting came within ``link.start_timeout_s``, or the other side runs
             something else.
     """
-    boot = _boot()
+    boot, meeting = _boot(), meeting or Meeting()
     mine = {"role": role, "boot": boot, **_what_runs(scenario)}
     if role == "plant":
-        mine["run"] = secrets.token_hex(8)
+        mine["run"] = meeting.run
     else:
         mine["name"] = name
     run, controller = mine.get("run"), mine.get("name")
     begin = time.monotonic_ns()
-    deadline = begin + int(scenario.link.start_timeout_s * 1e9)
+    deadline = latest = begin + int(scenario.link.start_timeout_s * 1e9)
     say_at, again_at = begin + 500_000_000, begin + _AGAIN_NS
     other = "plant" if role == "controller" else "controller"
     met = one_clock = False
@@ -196,13 +227,12 @@ def shake_hands(
                     controller = greeting.name
                 else:
                     run = greeting.run
-                if not met:  # from here on silence means that the other side is gone
-                    met, deadline = True, now + int(scenario.link.peer_timeout_s * 1e9)
-                if role == "plant":
-                    start = now + _LEAD_NS
-                    go: dict[str, Any] = {"kind": "start", "t0": start}
-                    link.send(_PREFIX + json.dumps(go).encode())
-                    return agreed(start)
+                if role == "plant" and not met:
+                    meeting.come()
+                # from here on silence means that the other side is gone
+                quiet = now + int(scenario.link.peer_timeout_s * 1e9)
+                deadline = max(deadline, min(quiet, latest)) if met else quiet
+                met = True
             elif isinstance(greeting, _Go) and met:
                 if not one_clock:
                     return agreed(now + _LEAD_NS)
@@ -216,6 +246,10 @@ def shake_hands(
                 heard.no_greeting()
         except _Refused as problem:
             heard.refuse(problem)
+        if met and role == "plant" and meeting.t0_ns:
+            go: dict[str, Any] = {"kind": "start", "t0": meeting.t0_ns}
+            link.send(_PREFIX + json.dumps(go).encode())
+            return agreed(meeting.t0_ns)
         if now >= deadline:
             break
         if now >= again_at and not met:

@@ -68,13 +68,13 @@ def stack(benches: Sequence[Bench]) -> Stack:
 
 
 @compiled
-def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, waits):
+def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, goes_on):
     """The compiled part of ``run_ticks``."""
     ctl, laws, states, est = stack.controllers
     y, u, st = stack.y, stack.u, plant.st
-    delayed, many = plant_is_delayed(plant), len(ctl) > 1
+    delayed = plant_is_delayed(plant)
     for k in range(start, stop):
-        changed, trips, tripped = False, 0, 0
+        changed, trips = False, 0
         for i in range(len(ctl)):
             before, changes, row = ctl[i].state, ctl[i].changes, plant_rows[i, k - first]
             tripped = sample(plant, i, y[i], row)
@@ -88,10 +88,9 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, wa
             plant_step(plant)
         for i in range(len(ctl)):
             state = ctl[i].state
-            # a controller in SAFE ends the run of its converter, not that of a network
-            if obey(plant, i, waits or many, state) != Why.GO_ON:
+            if obey(plant, i, goes_on, state) != Why.GO_ON:
                 return k + 1
-            if take(plant, i, u[i], 0 if many else tripped, state, True) != Why.GO_ON:
+            if take(plant, i, u[i], st[i].trip, state, True) != Why.GO_ON:
                 return k + 1
         if not delayed:
             plant_step(plant)
@@ -110,7 +109,7 @@ def run_ticks(
     start: int,
     stop: int,
     first: int = 0,
-    waits: bool = False,
+    goes_on: bool = False,
 ) -> int:
     """Run ticks [start, stop); returns the tick after the last one done.
 
@@ -121,13 +120,10 @@ def run_ticks(
         plant, controllers: at tick ``start``.
         plant_rows, controller_rows: shape (N, ticks, columns), of every tick from ``first`` on,
             columns as ``signals_of`` says.
-        waits: a tripped plant waits for a reset.
+        goes_on: the run does after a trip.
     """
-    return int(
-        _run_ticks(
-            plant, controllers, plant_rows, controller_rows, start, stop, first, waits
-        )
-    )  # fmt: skip
+    rows = plant_rows, controller_rows
+    return int(_run_ticks(plant, controllers, *rows, start, stop, first, goes_on))
 
 
 def run_inproc(
@@ -140,7 +136,7 @@ def run_inproc(
     """Run a whole scenario: of each converter its bench, its parts of the recording, and its
     timeline. ``go_on`` gets the ticks done and returns whether to go on."""
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
-    waits, single = bench.scenario.after_trip == "wait", len(benches) == 1
+    goes_on, single = bench.scenario.survives_trips, len(benches) == 1
     controllers = stack(benches)
     plant_rows, controller_rows = _rows(plant_parts, ticks), _rows(controller_parts, ticks)
     while k < ticks and any(timeline.running for timeline in timelines):
@@ -149,7 +145,7 @@ def run_inproc(
         stop = min(k + CHUNK, ticks, *(timeline.next_tick() for timeline in timelines))
         begin = 0 if single else k
         done = run_ticks(
-            bench.plant.records, controllers, plant_rows, controller_rows, k, stop, begin, waits
+            bench.plant.records, controllers, plant_rows, controller_rows, k, stop, begin, goes_on
         )
         if not single:
             take_out(bench.plant)

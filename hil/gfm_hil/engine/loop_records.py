@@ -54,7 +54,12 @@ loop_dtype = np.dtype(
         ("pending", "i8"),  # the controller took a frame and has not computed its tick yet
         ("done", "i8"),  # ticks computed
         ("woken", "i8"),  # ``flags[WAKE]`` as last seen
-        ("waits", "i8"),  # after a trip or in SAFE: for a reset, instead of ending the run
+        ("goes_on", "i8"),  # after a trip or in SAFE, instead of ending the run
+        ("others", "i8"),  # plant: it has other converters, which go on if this controller is lost
+        ("came", "i8"),  # plant: what came of u[k]
+        ("tripped", "i8"),  # plant: the converter's trip when y[k] was measured
+        ("unseen", "i8"),  # plant: a tick whose arrival of u the next reading of the clock gives
+        ("lost", "f8"),  # plant: 0, or for which trip its controller is not waited for any more
         ("seen", "i8"),  # controller: the state with which it last returned
         ("u_last", "f8", (NU_INNER,)),  # the two newest u that came in time
         ("u_before", "f8", (NU_INNER,)),
@@ -104,6 +109,13 @@ class Records(NamedTuple):
     progress: NDArray[np.int64]
 
 
+class Side(NamedTuple):
+    """What the plant's loop has of one converter: its end of the link, and what it writes."""
+
+    end: LinkEnd
+    records: Records
+
+
 class ControllerRecords(NamedTuple):
     """The controller's records, see ``gfm_runtime.controller``."""
 
@@ -122,7 +134,8 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
     link, policy = scenario.link, scenario.late_policy
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
-    loop["waits"], loop["seen"] = scenario.after_trip == "wait", RUNNING
+    loop["goes_on"], loop["others"] = scenario.survives_trips, scenario.network is not None
+    loop["seen"], loop["unseen"] = RUNNING, -1
     loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
     loop["T"] = round(scenario.T_s * 1e9)
     loop["patience"], loop["repeat"] = int(link.peer_timeout_s * 1e9), int(link.repeat_s * 1e9)

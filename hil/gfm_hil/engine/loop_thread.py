@@ -4,36 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.drive import drive_controller, drive_plant
+from gfm_hil.engine.drive import Share, drive_controller, drive_plant
 from gfm_hil.engine.loop_records import FLAGS, STOP
-from gfm_hil.engine.setup import Bench
-from gfm_hil.engine.timeline import Timeline
-from gfm_hil.links import Link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.links.pump import ported
 from gfm_hil.realtime.priority import stand_back
-from gfm_hil.recording.parts import Part
 
 _LOOK_S = 0.05
 
 
 def run_loop(
     role: Role,
-    bench: Bench,
-    link: Link,
-    part: Part,
-    timeline: Timeline,
+    shares: Sequence[Share],
     t0_ns: int,
     stopped: Callable[[], bool],
     flags: NDArray[np.int64] | None = None,
-) -> FrameReader:
-    """Run one side of a scenario after the handshake; returns its frame counters.
+) -> list[FrameReader]:
+    """Run one side of a scenario after the handshakes; returns its frame counters.
 
     The thread inherits processor and priority from the caller. The caller then steps back to
     ordinary priority and only looks, a few times a second, whether to stop and what to write down.
@@ -43,45 +36,54 @@ def run_loop(
         PeerLost: a model in place of the law does not answer; its thread is left behind.
 
     Args:
+        shares: of the controller one, of the plant one for each converter.
         flags: shape (FLAGS,), what other threads tell the loop, see
             ``gfm_hil.engine.loop_records``.
     """
     if flags is None:
         flags = np.zeros(FLAGS, np.int64)
-    link = ported(link)
-    start, stop = (getattr(link, name, _nothing) for name in ("start", "stop"))
-    start()
+    shares = [share._replace(link=ported(share.link)) for share in shares]
+    timelines = [share.timeline for share in shares]
+    model = shares[0].bench.model if role == "controller" else None
+    for share in shares:
+        getattr(share.link, "start", _nothing)()
     found: list[FrameReader] = []
     failed: list[BaseException] = []
 
     def work() -> None:
         try:
-            drive = drive_plant if role == "plant" else drive_controller
-            found.append(drive(bench, link, part, timeline, t0_ns, flags))
+            if role == "plant":
+                found.extend(drive_plant(shares, t0_ns, flags))
+            else:
+                found.append(drive_controller(shares[0], t0_ns, flags))
         except BaseException as problem:  # the caller's thread raises it
             failed.append(problem)
 
-    timeline.put_off = True
+    for timeline in timelines:
+        timeline.put_off = True
     thread = threading.Thread(target=work, name=f"{role}-loop", daemon=True)
     thread.start()
     stand_back()
     try:
         while thread.is_alive():
             thread.join(_LOOK_S)
-            timeline.flush()
-            flags[STOP] = stopped() or bool(timeline.failed)
-            if bench.model is not None:
-                bench.model.watch(timeline, bench.scenario.link.peer_timeout_s / 2)
+            for timeline in timelines:
+                timeline.flush()
+            flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
+            if model is not None:
+                model.watch(timelines[0], shares[0].bench.scenario.link.peer_timeout_s / 2)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
-        while thread.is_alive() and not (bench.model is not None and bench.model.given_up):
+        while thread.is_alive() and not (model is not None and model.given_up):
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
-        timeline.put_off = False
-        stop()
+        for timeline in timelines:
+            timeline.put_off = False
+        for share in shares:
+            getattr(share.link, "stop", _nothing)()
     if failed:
         raise failed[0]
-    return found[0]
+    return found
 
 
 def _nothing() -> None:

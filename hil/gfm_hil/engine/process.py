@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Callable
-from contextlib import ExitStack
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +18,26 @@ from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
-from gfm_hil.engine.drive import compile_loops
-from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.drive import Share, compile_loops
+from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.sd_notify import Watched, notify
-from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
 from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.models import Model, ModelError
 from gfm_hil.realtime.prevent_idle import prevent_idle
-from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, ordinary_priority
-from gfm_hil.recording.log import Outcome
+from gfm_hil.realtime.priority import (
+    ask_for_real_time,
+    no_collector_pauses,
+    ordinary_priority,
+    processors,
+)
+from gfm_hil.recording.log import SEVERITY, Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario.events import Gains, LawChange
@@ -46,65 +52,41 @@ def run_role(
     role: Role,
     scenario: Scenario,
     folder: Path,
+    endpoints: Mapping[str, str] = MappingProxyType({}),
     notice: Callable[[str], None] = print,
     model: Model | None = None,
 ) -> Outcome:
-    """Run one side of a scenario at ``scenario.link.endpoint``, which is set; record to ``folder``.
+    """Run one side of a scenario at its endpoints; record to ``folder``.
+
+    The plant of a network records each converter to a folder of its own in ``folder``.
 
     Args:
-        role, scenario, folder: which side of what, and where it records.
-        notice: told what a person should know while waiting.
+        endpoints: by converter, where the scenario's links name none.
         model: of the controller: what computes u in place of the law.
 
     Returns:
-        How it ended; the parts of the recording, ``events_<role>.jsonl`` and ``link_<role>.json``
-        (frame counters) are in ``folder``.
+        How it ended, of several converters the weightiest; the parts of the recording,
+        ``events_<role>.jsonl`` and ``link_<role>.json`` (frame counters) are in the folders.
 
     Raises:
-        UserError: the endpoint cannot be opened, or the scenario has no operating point.
+        UserError: an endpoint cannot be opened, or the scenario has no operating point.
     """
-    assert scenario.link.endpoint is not None
-    with Interrupt() as interrupt:
-        return _run(role, scenario, scenario.link.endpoint, folder, notice, interrupt, model)
-
-
-def _run(
-    role: Role,
-    scenario: Scenario,
-    endpoint: str,
-    folder: Path,
-    notice: Callable[[str], None],
-    interrupt: Interrupt,
-    model: Model | None,
-) -> Outcome:
-    bench = make_bench(scenario)
-    if model is not None:
-        bench.model = _stepped(model, bench)
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
-        write_scenario(folder, scenario)
-    if scenario.mode == "realtime":
-        keep_in_memory(folder, scenario.ticks, notice, bench.inner)
-    part = Part.create(folder, role, scenario.ticks, bench.inner)
-    compile_role(role, bench, part)
-    timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
-    flags = np.zeros(FLAGS, np.int64)
-
-    def wake() -> None:
-        flags[WAKE] += 1
-
-    # the command server first: its threads must not inherit the loop's priority
-    with CommandServer(role, bench, timeline, folder, wake, interrupt.ask):
-        try:
-            seen = _meet_and_run(role, bench, endpoint, part, timeline, flags, interrupt, notice)
-            with contextlib.suppress(OSError):  # a full disk costs these counts and nothing else
-                write_text(folder / f"link_{role}.json", json.dumps({"role": role, **seen}))
-        except PeerLost as problem:
-            timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
-        finally:
-            timeline.close()
-    assert timeline.outcome is not None
-    return timeline.outcome
+    with Interrupt() as interrupt, ExitStack() as stack:
+        benches = make_benches(scenario) if scenario.parts else [make_bench(scenario)]
+        sides = []
+        if model is not None:
+            benches[0].model = _stepped(model, benches[0])
+            stack.callback(benches[0].model.close)
+        _begin(folder, scenario)
+        for bench in benches:
+            name = bench.scenario.converter or ""
+            place = folder / name if scenario.parts else folder
+            if name in endpoints:
+                link = bench.scenario.link.model_copy(update={"endpoint": endpoints[name]})
+                bench.scenario = bench.scenario.model_copy(update={"link": link})
+            sides.append(_Side(role, bench, place, stack, notice))
+        compile_role(role, benches, [side.part for side in sides])
+        return _run(role, sides, notice, interrupt)
 
 
 def _stepped(model: Model, bench: Bench) -> SteppedModel:
@@ -122,63 +104,171 @@ def _stepped(model: Model, bench: Bench) -> SteppedModel:
         raise UserError(str(problem)) from None
 
 
+def _begin(folder: Path, scenario: Scenario) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "scenario.toml").exists():  # started alone: observers read here what it runs
+        write_scenario(folder, scenario)
+
+
+class _Side:
+    """A role's side of one converter: its bench, its recording and its log."""
+
+    def __init__(
+        self,
+        role: Role,
+        bench: Bench,
+        folder: Path,
+        stack: ExitStack,
+        notice: Callable[[str], None],
+    ) -> None:
+        self.role, self.bench, self.folder = role, bench, folder
+        self.scenario = scenario = bench.scenario
+        _begin(folder, scenario)
+        if scenario.mode == "realtime":
+            keep_in_memory(folder, scenario.ticks, notice, bench.inner)
+        self.part = Part.create(folder, role, scenario.ticks, bench.inner)
+        self.timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
+        stack.callback(self.timeline.close)
+
+    def open(self, stack: ExitStack) -> None:
+        """Open the link.
+
+        Raises:
+            UserError: the endpoint cannot be opened.
+        """
+        given = self.scenario.link
+        assert given.endpoint is not None
+        self.good = open_link(
+            given.type, self.role, given.endpoint, given.options, self.bench.inner
+        )  # fmt: skip
+        self.link: Link = self.good
+        if given.impairment is not None and given.impairment.hits(self.role):
+            self.link = ImpairedLink(self.good, given.impairment, self.role)  # compiles: now
+        stack.callback(self.link.close)
+
+    def keep_counts(self, reader: FrameReader, start: Start) -> None:
+        """Write down what this end of the link counted."""
+        link = self.link
+        injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
+        counted = getattr(self.good, "counters", {})  # of a link in several frames a message
+        faults = {**reader.faults, **counted, "refused_greetings": start.refused}
+        seen = {"role": self.role, "faults": faults, "e2e": reader.e2e, **injected}
+        with suppress(OSError):  # a full disk costs these counts and nothing else
+            write_text(self.folder / f"link_{self.role}.json", json.dumps(seen))
+
+
+def _run(
+    role: Role, sides: list[_Side], notice: Callable[[str], None], interrupt: Interrupt
+) -> Outcome:
+    flags = np.zeros(FLAGS, np.int64)
+
+    def wake() -> None:
+        flags[WAKE] += 1
+
+    # the command server first: its threads must not inherit the loop's priority
+    timelines = [side.timeline for side in sides]
+    places = [(side.folder, side.bench) for side in sides]
+    with CommandServer(role, places, timelines, wake, interrupt.ask):
+        try:
+            _meet_and_run(role, sides, flags, notice, interrupt)
+        except PeerLost as problem:
+            for timeline in timelines:
+                timeline.end("interrupted" if interrupt.came else "safe", str(problem), 0)
+    outcomes = [timeline.outcome for timeline in timelines if timeline.outcome is not None]
+    assert len(outcomes) == len(sides)
+    return max(outcomes, key=lambda outcome: SEVERITY.index(outcome.status))
+
+
 def _meet_and_run(
     role: Role,
-    bench: Bench,
-    endpoint: str,
-    part: Part,
-    timeline: Timeline,
+    sides: list[_Side],
     flags: NDArray[np.int64],
-    interrupt: Interrupt,
     notice: Callable[[str], None],
-) -> dict[str, Any]:
-    """Open the link, meet the other side, run; returns what the link counted.
+    interrupt: Interrupt,
+) -> None:
+    """Open the links, meet the other sides, run, and keep what the links counted.
 
     Raises:
-        PeerLost: the other side did not come.
-        UserError: the endpoint cannot be opened.
+        PeerLost: another side did not come.
+        UserError: an endpoint cannot be opened.
     """
-    scenario = bench.scenario
-    rights = ask_for_real_time(role) if scenario.mode == "realtime" else None
-    kind, options = scenario.link.type, scenario.link.options
-    good: Link = open_link(kind, role, endpoint, options, bench.inner)
-    link = good
+    scenario = sides[0].scenario
+    rights = None
+    if scenario.mode == "realtime":
+        several = len(scenario.converters) or 1
+        rights = ask_for_real_time(role, sides[0].bench.place, several)
 
     def stopped() -> bool:
         return interrupt.came
 
-    resources = ExitStack()
-    try:
-        if scenario.link.impairment is not None and scenario.link.impairment.hits(role):
-            link = ImpairedLink(good, scenario.link.impairment, role)  # compiles: before START
+    with ExitStack() as resources:
+        for side in sides:
+            side.open(resources)
         if rights is not None:
-            if good.port is None:  # a thread in Python pumps its messages, and hardly ever sleeps
+            if any(side.good.port is None for side in sides):
+                # a thread in Python pumps its messages, and hardly ever sleeps
                 rights["policy"] = ordinary_priority()
             else:
                 busy = prevent_idle(rights["processor"], scenario.prevent_idle)
                 rights["idle_prevented"] = resources.enter_context(busy)
-            timeline.write(0, "scheduling", role=role, **rights)
+            for side in sides:
+                side.timeline.write(0, "scheduling", role=role, **rights)
         no_collector_pauses()
-        notify(f"STATUS=waiting for the other side at {endpoint}")
-        name = OUR_CONTROLLER if bench.model is None else bench.model.name
-        start = shake_hands(role, good, scenario, stopped, notice, name)
-        met = {"controller": start.controller, "run": start.run, "one_clock": start.one_clock}
-        timeline.write(0, "handshake", role=role, **met)  # in the log: a kill does not lose it
-        with Watched(scenario, part.progress):
-            reader = run_loop(role, bench, link, part, timeline, start.t0_ns, stopped, flags)
-    finally:
-        resources.close()
-        link.close()
-        if bench.model is not None:
-            bench.model.close()
-    injected = {"injected": link.injected} if isinstance(link, ImpairedLink) else {}
-    counted = getattr(good, "counters", {})  # of a link in several frames a message
-    faults = {**reader.faults, **counted, "refused_greetings": start.refused}
-    return {"faults": faults, "e2e": reader.e2e, **injected}
+        where = ", ".join(str(side.scenario.link.endpoint) for side in sides)
+        notify(f"STATUS=waiting for the other side at {where}")
+        starts = _meet(role, sides, stopped, notice)
+        for side, start in zip(sides, starts, strict=True):
+            met = {"controller": start.controller, "run": start.run, "one_clock": start.one_clock}
+            side.timeline.write(0, "handshake", role=role, **met)  # so that a kill does not lose it
+        with Watched(scenario, sides[0].part.progress):
+            loops = 1 + len(scenario.converters)
+            crowded = loops > processors() if rights is None else rights["shared"]
+            shares = [
+                Share(side.bench, side.link, side.part, side.timeline, crowded) for side in sides
+            ]
+            readers = run_loop(role, shares, starts[0].t0_ns, stopped, flags)
+    for side, reader, start in zip(sides, readers, starts, strict=True):
+        side.keep_counts(reader, start)
 
 
-def compile_role(role: Role, bench: Bench, part: Part) -> None:
+def _meet(
+    role: Role, sides: list[_Side], stopped: Callable[[], bool], notice: Callable[[str], None]
+) -> list[Start]:
+    """Shake hands over all links at a time: the controllers of a plant may come in any order.
+
+    Raises:
+        PeerLost: one did not come.
+    """
+    meeting, failed = Meeting(len(sides)), threading.Event()
+    model = sides[0].bench.model
+
+    def meet(side: _Side) -> Start:
+        try:
+            return shake_hands(
+                role, side.good, side.scenario, lambda: stopped() or failed.is_set(), notice,
+                meeting, OUR_CONTROLLER if model is None else model.name,
+            )  # fmt: skip
+        except PeerLost as problem:
+            if len(sides) > 1 and not failed.is_set():
+                problem = PeerLost(f"{side.scenario.converter}: {problem}")
+            failed.set()
+            raise problem from None
+
+    if len(sides) == 1:
+        return [meet(sides[0])]
+    with ThreadPoolExecutor(len(sides)) as pool:
+        found = [pool.submit(meet, side) for side in sides]
+        wait(found)
+    problems = [str(one.exception()) for one in found if one.exception() is not None]
+    if problems:
+        said = [text for text in problems if not text.startswith("interrupted")]
+        raise PeerLost("; ".join(said or problems[:1]))
+    return [one.result() for one in found]
+
+
+def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
+    bench, part = benches[0], parts[0]
     plant, y, u = bench.plant.copy().records, bench.y.copy(), bench.u.copy()
     plant_sample(plant, 0, y)
     plant_step(plant)
@@ -189,7 +279,7 @@ def compile_role(role: Role, bench: Bench, part: Part) -> None:
         reader, writer = FrameReader(group, bench.inner), FrameWriter(group, bench.inner)
         reader.unpack(writer.pack(0, 0, 0, values), values)
         judge(reader.record, False, False)
-    compile_loops(role, bench, part)
+    compile_loops(role, benches, parts)
     pump.warm_up()
     if role == "plant":
         record_sample(part.signals[0].copy(), y, plant, 0)

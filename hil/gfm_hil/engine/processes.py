@@ -1,4 +1,4 @@
-"""Starts controller and plant as processes, watches them to their end, and leaves none behind."""
+"""Starts controllers and plant as processes, watches them to their end, and leaves none behind."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from pathlib import Path
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
+from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.scenario.model import Scenario
@@ -29,12 +30,64 @@ _GRACE_S = 2.0  # time that a side gets to end, beyond link.peer_timeout_s
 
 
 @dataclass
+class _Process:
+    """One role as a process: of the controllers of a network one for each converter.
+
+    Attributes:
+        name: for messages.
+        folder: which has its log.
+    """
+
+    role: Role
+    name: str
+    folder: Path
+    command: list[str]
+    told: bool = False  # by a signal of ours to end
+
+    @property
+    def log(self) -> Path:
+        """What it prints."""
+        return self.folder / f"{self.role}.log"
+
+    def start(self) -> None:
+        """Start it.
+
+        Raises:
+            UserError: that is not possible.
+        """
+        with self.log.open("wb") as log:
+            try:
+                # a session of its own: Ctrl-C reaches the process through us, once
+                self.popen = subprocess.Popen(
+                    self.command, stdout=log, stderr=log, start_new_session=True
+                )
+            except OSError as problem:
+                text = f"{self.command[0]}: cannot be started: {problem.strerror}"
+                raise UserError(text) from None
+
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal while it lives."""
+        if self.popen.poll() is None:
+            self.told = True
+            self.popen.send_signal(number)
+
+    @property
+    def crash(self) -> str:
+        """How it ended, if not by itself."""
+        code = self.popen.returncode
+        if code < 0:
+            return f"the {self.name} was ended by {signal.Signals(-code).name}"
+        return f"the {self.name} failed, see {self.log}" if code not in (0, 2) else ""
+
+
+@dataclass
 class Processes:
-    """One run's two processes.
+    """One run's processes: the plant, and a controller for each converter.
 
     Args:
-        scenario: checked; its resolved form lies in ``folder``/scenario.toml.
-        folder: where both record.
+        scenario: checked; its resolved form lies in ``folder``/scenario.toml, and in the folders
+            of the converters of a network.
+        folder: where they record.
         progress, notice: as for ``run_scenario``.
         interrupt: set when the operator wants it to end.
         controller_command: program and arguments to start as the controller; ours if empty.
@@ -49,86 +102,112 @@ class Processes:
     interrupt: Interrupt
     controller_command: tuple[str, ...] = ()
 
-    def run(self) -> tuple[float, Outcome | None]:
-        """Start both, watch them to their end.
+    def run(self) -> tuple[float, dict[str, Outcome]]:
+        """Start all, watch them to their end.
 
         Returns:
-            When the first tick ran (``time.monotonic``), and how a killed side ended that could not
-            say so itself.
+            When the first tick ran (``time.monotonic``), and how the run of a converter ended where
+            a killed process could not say so itself, by the converter's name ("" without a
+            network).
 
         Raises:
-            UserError: a side refused to start, for example because the endpoint is occupied.
+            UserError: a process refused to start, for example because the endpoint is occupied.
         """
+        self._places = {name: self.folder / name for name in self.scenario.parts or [""]}
         with contextlib.ExitStack() as stack:
-            endpoint = self.scenario.link.endpoint
-            if endpoint is None:  # a Unix socket's path may hold 107 bytes, so not the run folder
-                place = stack.enter_context(scratch.temporary("gfmhil-run-"))
-                endpoint = link_kind(self.scenario.link.type).fresh(place)
-            if self.scenario.mode == "realtime":
-                keep_in_memory(self.folder, self.scenario.ticks, self.notice)
-            self.notice("starting controller and plant …")
-            self._told: set[Role] = set()  # by a signal of ours to end
-            self._roles = {role: self._start(role, endpoint) for role in ROLES}
+            endpoints = {}
+            for name in self._places:
+                link = (self.scenario.of(name) if name else self.scenario).link
+                if link.endpoint is None:  # a Unix socket's path may hold 107 bytes
+                    fresh = stack.enter_context(scratch.temporary("gfmhil-run-"))
+                    endpoints[name] = link_kind(link.type).fresh(fresh)
+                else:
+                    endpoints[name] = link.endpoint
+                if self.scenario.mode == "realtime":
+                    keep_in_memory(self._places[name], self.scenario.ticks, self.notice)
+            self._say_what_starts()
+            self._plant = _Process("plant", "plant", self.folder, self._plant_command(endpoints))
+            self._controllers = {
+                name: _Process(
+                    "controller", f"controller of {name}" if name else "controller", place,
+                    self._controller_command(place, endpoints[name]),
+                )
+                for name, place in self._places.items()
+            }  # fmt: skip
+            self._all = [*self._controllers.values(), self._plant]
+            started: list[_Process] = []
             try:
+                for process in self._all:
+                    process.start()
+                    started.append(process)
                 began = self._watch()
             finally:
-                for process in self._roles.values():
-                    if process.poll() is None:
-                        process.kill()
-                        process.wait()
+                for process in started:
+                    if process.popen.poll() is None:
+                        process.popen.kill()
+                        process.popen.wait()
         return began, self._judge()
 
-    @property
-    def _interrupted(self) -> Outcome:
-        return Outcome("interrupted", "stopped by the operator", 0)
+    def _say_what_starts(self) -> None:
+        loops, room = len(self._places) + 1, processors()
+        if self.scenario.mode == "realtime" and loops > max(room, 2):
+            self.notice(
+                f"{loops} loops in real time share {room} processors: they will miss more ticks"
+                " than with one for each"
+            )
+        which = f"{loops - 1} controllers" if loops > 2 else "controller"
+        self.notice(f"starting {which} and plant …")
 
-    def _start(self, role: Role, endpoint: str) -> subprocess.Popen[bytes]:
-        folder = self.folder.absolute()  # a name such as "--" must not look like an option
-        scenario = str(folder / "scenario.toml")
+    def _ours(self, role: Role, folder: Path) -> list[str]:
+        """The command of a role of ours without its endpoints."""
+        folder = folder.absolute()  # a name such as "--" must not look like an option
         # -P: a file of the operator's folder must not stand in for a module
-        command = [sys.executable, "-P", "-m", "gfm_hil", role, scenario]
-        command += ["--endpoint", endpoint, "--out", str(folder), "--quiet"]
-        command += ["--part", str(os.getpid())]
-        if role == "controller" and self.controller_command:
-            command = [
-                argument.replace("{endpoint}", endpoint).replace("{scenario}", scenario)
-                for argument in self.controller_command
-            ]
-        with self._log(role).open("wb") as log:
-            try:
-                # a session of its own: Ctrl-C reaches the process through us, once
-                return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-            except OSError as problem:
-                raise UserError(f"{command[0]}: cannot be started: {problem.strerror}") from None
+        command = [sys.executable, "-P", "-m", "gfm_hil", role, str(folder / "scenario.toml")]
+        return [*command, "--out", str(folder), "--quiet", "--part", str(os.getpid())]
 
-    def _log(self, role: Role) -> Path:
-        return self.folder / f"{role}.log"
+    def _plant_command(self, endpoints: dict[str, str]) -> list[str]:
+        command = self._ours("plant", self.folder)
+        for name, endpoint in endpoints.items():
+            command += ["--endpoint", f"{name}={endpoint}" if name else endpoint]
+        return command
+
+    def _controller_command(self, folder: Path, endpoint: str) -> list[str]:
+        scenario = str(folder.absolute() / "scenario.toml")
+        if not self.controller_command:
+            return [*self._ours("controller", folder), "--endpoint", endpoint]
+        return [
+            argument.replace("{endpoint}", endpoint).replace("{scenario}", scenario)
+            for argument in self.controller_command
+        ]
 
     def _watch(self) -> float:
-        """Wait until both have ended; stop and then kill a side that takes too long.
+        """Wait until all have ended; stop and then kill a process that takes too long.
 
         A side ends by itself when the other one says goodbye or falls silent, but not while it
-        still waits for its handshake.
+        still waits for its handshake. The plant of a network goes on without a controller.
         """
         part, began = None, time.monotonic()
         stop_at = kill_at = float("inf")
-        ended: list[Role] = []
+        ended: list[_Process] = []
         told = False
-        while len(ended) < len(self._roles):
+        first = next(iter(self._places.values()))
+        while len(ended) < len(self._all):
             time.sleep(_LOOK_S)
             now = time.monotonic()
-            part = part or Part.open(self.folder, "plant")
+            part = part or Part.open(first, "plant")
             if part is not None:
                 if int(part.progress[0]) == 0:
                     began = now
                 self.progress(int(part.progress[0]), int(part.progress[1]))
-            for role, process in self._roles.items():
-                if role not in ended and process.poll() is not None:
-                    ended.append(role)
-                    if self._crash(role) and not self.interrupt.came:
-                        self.notice(self._crash(role))
-                    wait = self.scenario.link.peer_timeout_s + _GRACE_S
-                    stop_at = min(stop_at, now + wait if process.returncode <= 0 else now)
+            for process in self._all:
+                if process not in ended and process.popen.poll() is not None:
+                    ended.append(process)
+                    if process.crash and not self.interrupt.came:
+                        self.notice(process.crash)
+                    at_once, rests = self._ends_all(process, part)
+                    if at_once or rests:
+                        wait = self.scenario.link.peer_timeout_s + _GRACE_S
+                        stop_at = min(stop_at, now if at_once else now + wait)
             if not told and (self.interrupt.came or now >= stop_at):
                 self._send(signal.SIGINT)
                 told, kill_at = True, now + _GRACE_S
@@ -136,30 +215,33 @@ class Processes:
                 self._send(signal.SIGKILL)
         return began
 
+    def _ends_all(self, ended: _Process, part: Part | None) -> tuple[bool, bool]:
+        """Whether the end of a process ends the run at once, or once the others had their time."""
+        code, network = ended.popen.returncode, bool(self.scenario.parts)
+        begun = part is not None and int(part.progress[0]) > 0
+        left = [process for process in self._all if process.popen.poll() is None]
+        alone = ended is self._plant or left in ([], [self._plant])
+        return code == 2 or (code > 0 and not network), alone or not begun
+
     def _send(self, number: signal.Signals) -> None:
-        for role, process in self._roles.items():
-            if process.poll() is None:
-                self._told.add(role)
-                process.send_signal(number)
+        for process in self._all:
+            process.send(number)
 
-    def _crash(self, role: Role) -> str:
-        """How a side ended that did not end by itself."""
-        code = self._roles[role].returncode
-        if code < 0:
-            return f"the {role} was ended by {signal.Signals(-code).name}"
-        return f"the {role} failed, see {self._log(role)}" if code not in (0, 2) else ""
-
-    def _judge(self) -> Outcome | None:
-        said = {role: self._log(role).read_text("utf-8").strip() for role in ROLES}
-        refused = [said[s] for s, process in self._roles.items() if process.returncode == 2]
+    def _judge(self) -> dict[str, Outcome]:
+        said = [(process, process.log.read_text("utf-8").strip()) for process in self._all]
+        refused = [text for process, text in said if process.popen.returncode == 2]
         if refused:
             raise UserError("\n".join(text.removeprefix("gfmhil: ") for text in refused))
-        for role, text in said.items():
+        for process, text in said:
             if not text:
-                self._log(role).unlink()
-        crashed = [role for role in ROLES if self._crash(role)]
-        first = [role for role in crashed if role not in self._told]  # not by our own signal
-        crashes = [self._crash(role) for role in first or crashed]
-        if crashes and self.interrupt.came:
-            return self._interrupted
-        return Outcome("safe", "; ".join(crashes), 0) if crashes else None
+                process.log.unlink()
+        found = {}
+        for name, controller in self._controllers.items():
+            crashed = [process for process in (controller, self._plant) if process.crash]
+            first = [process for process in crashed if not process.told]
+            crashes = [process.crash for process in first or crashed]
+            if crashes and self.interrupt.came:
+                found[name] = Outcome("interrupted", "stopped by the operator", 0)
+            elif crashes:
+                found[name] = Outcome("safe", "; ".join(crashes), 0)
+        return found

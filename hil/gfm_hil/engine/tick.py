@@ -33,14 +33,14 @@ def answer(ctl, laws, states, est, y, u, plant_tripped):
 
 
 @inlined
-def obey(plant, i, waits, state):
+def obey(plant, i, goes_on, state):
     """What the state of converter i's controller asks of the plant: PEER_SAFE or PEER_STOPPED end
     the run.
 
-    A plant that ``waits`` for a reset trips instead when the controller is in SAFE.
+    A plant that ``goes_on`` trips converter i instead when the controller is in SAFE.
     """
     if state == SAFE:
-        if not waits:
+        if not goes_on:
             return Why.PEER_SAFE
         trip(plant, i, CONTROLLER, SAFE_STATE)
     if state == STOPPED:

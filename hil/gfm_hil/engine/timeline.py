@@ -11,6 +11,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,9 +42,14 @@ _ROOM = 1 << 16  # bytes kept beside the log for its last lines
 
 @dataclass
 class Ticket:
-    """The outcome of an operator's event: its tick once ``done``, or an error."""
+    """The outcome of an operator's event: its tick once ``done``, or an error.
+
+    Attributes:
+        others: of the other converters, whose logs name the event too.
+    """
 
     operator: dict[str, Any]
+    others: Sequence[Timeline] = ()
     done: threading.Event = field(default_factory=threading.Event)
     tick: int = -1
     error: str = ""
@@ -105,14 +111,17 @@ class Timeline:
         """Tick of the next event; far away if there is none."""
         return self._todo[0][0] if self._todo else 2**62
 
-    def insert(self, event: Any, operator: dict[str, Any]) -> Ticket:
+    def insert(
+        self, event: Any, operator: dict[str, Any], others: Sequence[Timeline] = ()
+    ) -> Ticket:
         """Queue an event for the next tick; any thread may call this.
 
         Args:
             event: a checked one.
             operator: identity of the sender, for the log.
+            others: of the other converters of the plant.
         """
-        ticket = Ticket(operator)
+        ticket = Ticket(operator, others)
         self._inbox.append((event, ticket))
         return ticket
 
@@ -133,7 +142,10 @@ class Timeline:
             if not ticket.claim():
                 continue
             try:
-                self._carry_out(event, tick, by="operator", operator=ticket.operator)
+                said = {"by": "operator", "operator": ticket.operator}
+                self._carry_out(event, tick, **said)
+                for other in ticket.others:
+                    other.write(tick, event.type, label=event.label(), **said)
                 ticket.tick = tick
             except ValueError as problem:  # the plant changed after the check
                 ticket.error = str(problem)

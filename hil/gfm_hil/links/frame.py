@@ -281,7 +281,7 @@ class FrameReader:
             r["newest"] = scenario.ticks - 1
         elif not lockstep:
             r["behind"] = scenario.late_policy.hold
-        if scenario.after_trip == "wait":
+        if scenario.survives_trips:
             r["leaving"] = STOPPED
         return reader
 

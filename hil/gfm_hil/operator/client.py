@@ -11,7 +11,7 @@ import zmq
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity, local
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.announcement import LARGEST, announced, present
+from gfm_hil.engine.announcement import LARGEST, announced, not_running, present
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.scenario.events import CONTROLLER_EVENTS
 from gfm_plant import TRIP_REASONS
@@ -47,7 +47,7 @@ class Operator:
         self._folder, self._local = folder, local(through)
         self._context = zmq.Context()
         if not present(folder):
-            raise UserError(f"{folder}: no run is going on there")
+            raise not_running(folder)
 
     def close(self) -> None:
         """Close the sockets."""
@@ -72,14 +72,14 @@ class Operator:
         return self._ask("controller" if kind in _CONTROLLERS else "plant", event, by)
 
     def stop(self, by: Identity | None = None) -> None:
-        """Stop the run as Ctrl-C does.
+        """Stop the run as Ctrl-C does; with a converter of a network, all of it.
 
         Raises:
             UserError: the run does not answer.
         """
-        for role in present(self._folder):
-            self._ask(role, {"type": "stop"}, by)
-            return
+        running = present(self._folder)
+        if running:
+            self._ask("plant" if "plant" in running else running[0], {"type": "stop"}, by)
 
     def snapshot(self) -> dict[str, Any]:
         """The newest recorded tick: every column of the recording by name, codes also as words.

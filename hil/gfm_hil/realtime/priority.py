@@ -16,36 +16,48 @@ _LOCK_NOW_AND_LATER = 1 | 2  # MCL_CURRENT | MCL_FUTURE of mlockall(2)
 _before: set[int] = set()  # processors that this process could use before it chose one
 
 
-def ask_for_real_time(role: Role) -> dict[str, Any]:
+def ask_for_real_time(role: Role, place: int = 0, controllers: int = 1) -> dict[str, Any]:
     """Request a processor, a real-time priority and locked memory for this thread.
 
     Threads that it starts later inherit processor and priority, so call this before the link is
     opened. The loops sleep in every tick: the kernel throttles a SCHED_FIFO thread that only
     spins for 50 ms in each second.
 
+    Args:
+        place: of a controller, among the ``controllers`` of the same plant.
+
     Returns:
         What was granted, for the log: ``policy`` ("fifo 50", "nice -20" or "as given"),
-        ``processor`` (or None) and ``memory_locked``.
+        ``processor`` (or None), whether several controllers share it, and ``memory_locked``.
     """
     return {
         "policy": _fifo() or ordinary_priority(),
-        "processor": own_processor(role),
+        **own_processor(role, place, controllers),
         "memory_locked": _lock_memory(),
     }
 
 
-def own_processor(role: Role) -> int | None:
-    """The controller takes the last processor that it may use, the plant the first.
+def own_processor(role: Role, place: int = 0, controllers: int = 1) -> dict[str, Any]:
+    """The plant takes the first processor that it may use, the controllers the last ones, until
+    they share; returns which one, and whether controllers share it.
 
     A link's I/O thread shares the processor, so that a round trip does not wait for a migration.
     """
     if not hasattr(os, "sched_setaffinity"):
-        return None
+        return {"processor": None, "shared": False}
     allowed = sorted(os.sched_getaffinity(0))
     _before.update(allowed)
-    mine = allowed[-1] if role == "controller" else allowed[0]
+    others = allowed[1:] or allowed
+    mine = others[-1 - place % len(others)] if role == "controller" else allowed[0]
     os.sched_setaffinity(0, {mine})
-    return mine
+    return {"processor": mine, "shared": role == "controller" and controllers > len(others)}
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _fifo() -> str:

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gfm_hil.core.errors import UserError
-from gfm_plant.names import CONTROLLER_SAFE
+from gfm_plant.names import CONTROLLER_LEFT, CONTROLLER_SAFE
 from gfm_runtime.states import PLANT_TRIP, REASONS
 
 Status = Literal["completed", "oscillating", "tripped", "safe", "interrupted"]
 
 PLANT_LEFT = "the plant ended before the scenario did"
-
-CONTROLLER_LEFT = "the controller was stopped"
 
 #: reasons with which a role reports what the other role did
 _SECONDARY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)

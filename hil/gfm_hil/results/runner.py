@@ -27,7 +27,7 @@ from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.results.summary import origin, stages, summarise
-from gfm_hil.scenario.model import INPROC, Scenario
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 
 __all__ = ["Notice", "Progress", "Run", "run_scenario"]
@@ -65,15 +65,15 @@ def run_scenario(
     bench = compiled_bench(scenario, notice, ("plant",) if controller_command else ROLES)
     folder.mkdir(parents=True, exist_ok=True)
     with in_use(folder):
-        outside = None
+        outside: dict[str, Outcome] = {}
         try:
             with Interrupt() as interrupt:
                 try:
                     write_scenario(folder, scenario)
                 except OSError as problem:
                     raise UserError(f"{folder}: {problem.strerror}") from None
-                if scenario.link.type == INPROC:
-                    began = _run_here(bench, folder, progress, interrupt)
+                if scenario.in_process:
+                    began = _run_here([bench], [folder], progress, interrupt)
                 else:
                     command = tuple(controller_command)
                     both = Processes(scenario, folder, progress, notice, interrupt, command)
@@ -83,22 +83,8 @@ def run_scenario(
             shutil.rmtree(folder)
             raise
         wall_s = time.monotonic() - began
-        return finish(scenario, folder, bench.controller.labels, wall_s, figures, outside)
-
-
-def _run_here(bench: Bench, folder: Path, progress: Progress, interrupt: Interrupt) -> float:
-    """Run both sides in this process; returns when the first tick was run."""
-    parts = {role: Part.create(folder, role, bench.scenario.ticks, bench.inner) for role in ROLES}
-    timeline = Timeline(bench, folder / "events_both.jsonl", ROLES)
-    began = time.monotonic()
-
-    def go_on(ticks: int) -> bool:
-        progress(ticks, 0)
-        return not interrupt.came
-
-    run_inproc([bench], [parts["plant"]], [parts["controller"]], [timeline], go_on)
-    timeline.close()
-    return began
+        labels = bench.controller.labels
+        return finish(scenario, folder, labels, wall_s, figures, outside.get(""))
 
 
 def run_network(
@@ -122,35 +108,54 @@ def run_network(
     runs: dict[str, Run] = {}
     folder.mkdir(parents=True, exist_ok=True)
     write_scenario(folder, scenario)
+    places = [folder / name for name in names]
     with ExitStack() as stack:
-        places = [folder / name for name in names]
         for place, bench in zip(places, benches, strict=True):
             place.mkdir(parents=True, exist_ok=True)
             stack.enter_context(in_use(place))
             write_scenario(place, bench.scenario)
         interrupt = stack.enter_context(Interrupt())
-        ticks, inner = scenario.ticks, scenario.has_inner
-        plant_parts = [Part.create(place, "plant", ticks, inner) for place in places]
-        controller_parts = [Part.create(place, "controller", ticks, inner) for place in places]
-        timelines = [
-            Timeline(bench, place / "events_both.jsonl", ROLES)
-            for bench, place in zip(benches, places, strict=True)
-        ]
-        began = time.monotonic()
-
-        def go_on(ticks: int) -> bool:
-            progress(ticks, 0)
-            return not interrupt.came
-
-        run_inproc(benches, plant_parts, controller_parts, timelines, go_on)
+        outside: dict[str, Outcome] = {}
+        if scenario.in_process:
+            began = _run_here(benches, places, progress, interrupt)
+        else:
+            try:
+                began, outside = Processes(scenario, folder, progress, notice, interrupt).run()
+            except UserError:
+                for place in places:
+                    remove_parts(place)
+                shutil.rmtree(folder)
+                raise
         wall_s = time.monotonic() - began
-        for name, place, bench, timeline in zip(names, places, benches, timelines, strict=True):
-            timeline.close()
+        for name, place, bench in zip(names, places, benches, strict=True):
             labels = bench.controller.labels
-            runs[name] = finish(bench.scenario, place, labels, wall_s, figures)
+            runs[name] = finish(bench.scenario, place, labels, wall_s, figures, outside.get(name))
         whole = NetworkRun(scenario, runs, folder)
         whole.conclude(folder, figures)
     return whole
+
+
+def _run_here(
+    benches: Sequence[Bench], places: Sequence[Path], progress: Progress, interrupt: Interrupt
+) -> float:
+    """Run both sides of each converter in this process; returns when the first tick was run."""
+    ticks, inner = benches[0].scenario.ticks, benches[0].inner
+    plant_parts = [Part.create(place, "plant", ticks, inner) for place in places]
+    controller_parts = [Part.create(place, "controller", ticks, inner) for place in places]
+    timelines = [
+        Timeline(bench, place / "events_both.jsonl", ROLES)
+        for bench, place in zip(benches, places, strict=True)
+    ]
+    began = time.monotonic()
+
+    def go_on(ticks: int) -> bool:
+        progress(ticks, 0)
+        return not interrupt.came
+
+    run_inproc(benches, plant_parts, controller_parts, timelines, go_on)
+    for timeline in timelines:
+        timeline.close()
+    return began
 
 
 def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) -> Run:

@@ -9,7 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from gfm_plant.names import CONTROLLER, CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS
+from gfm_plant.names import (
+    CONTROLLER,
+    CONTROLLER_GONE,
+    CONTROLLER_LEFT,
+    CONTROLLER_SAFE,
+    NO_FRESH_U,
+    TRIP_REASONS,
+)
 from gfm_runtime.errors import meant
 from gfm_runtime.states import OK, OPERATOR, PLANT_TRIP, REASONS
 
@@ -17,7 +24,6 @@ if TYPE_CHECKING:
     from gfm_hil.recording.log import Outcome
     from gfm_hil.scenario.model import Scenario
 
-CONTROLLER_GONE = "the controller's process is gone"
 
 #: names of the possible reasons of a run's end, by its status
 END_REASONS: dict[str, tuple[str, ...]] = {
@@ -32,6 +38,7 @@ END_REASONS: dict[str, tuple[str, ...]] = {
         CONTROLLER_SAFE,
         NO_FRESH_U,
         CONTROLLER_GONE,
+        CONTROLLER_LEFT,
     ),
 }
 

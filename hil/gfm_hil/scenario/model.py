@@ -147,6 +147,10 @@ class Member(_Model):
     law: str | None = Field(None, description="catalogue name or path of a law file")
     inner: str | None = Field(None, description="inner stage of its laws")
     references: References | None = Field(None, description="references Y_ref at the start")
+    link: Link | None = Field(None, description="between the plant and its controller")
+    late_policy: LatePolicy | None = Field(
+        None, description="real time: what happens to late frames"
+    )
     plant: Plant | None = Field(None, description="converter and instruments, without a grid")
     expect: Literal["completed", "oscillating", "tripped", "safe"] | None = Field(
         None, description="status with which its part of the run counts as passed"
@@ -260,7 +264,7 @@ class Scenario(_Model):
         """The scenario as one converter of the network sees it: with its law, references and plant,
         and the events of the network and of itself."""
         assert self.network is not None
-        given = ("law", "inner", "references", "plant", "expect")
+        given = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
 
         def whole(member: Member) -> Member:
             if self.converter is not None:  # it was made whole before
@@ -279,6 +283,22 @@ class Scenario(_Model):
         copy.__dict__.pop("has_inner", None)
         return copy
 
+    @property
+    def survives_trips(self) -> bool:
+        """Whether plant and controllers go on after a trip: they wait for a reset, or there may be
+        other converters."""
+        return self.after_trip == "wait" or self.network is not None
+
+    @property
+    def in_process(self) -> bool:
+        """Whether plant and controllers run in one compiled loop, without a link."""
+        return all(link.type == INPROC for link in self.links)
+
+    @property
+    def links(self) -> list[Link]:
+        """The link of each converter that runs here."""
+        return [self.of(name).link for name in self.parts] or [self.link]
+
     def laws(self) -> list[str]:
         """Names of all laws that the run uses, each once, the initial law first."""
         changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
@@ -294,6 +314,14 @@ class Scenario(_Model):
         about = {"link", "title", "description", "compare", "waveforms"}
         about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
         content = self.model_dump(exclude={*about, "law", "inner", "events", "ready_laws"})
+        if self.network is not None:
+            members = content["network"]["converters"]
+            for name, member in members.items():
+                own = self.of(name)
+                for key in ("link", "expect", "law", "inner"):
+                    del member[key]
+                member["plant"]["converter"] = load_converter(own.plant.converter).model_dump()
+                member["laws"] = own.laws_digest()
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
         events = []
@@ -319,6 +347,37 @@ class Scenario(_Model):
             for one in each
             for name in one.laws()
         )
+
+    def _wrong_links(self) -> list[str]:
+        problems = []
+        own = dict(zip(self.parts or [""], self.links, strict=True))
+        kinds = {link.type for link in own.values()}
+        if INPROC in kinds and len(kinds) > 1:
+            problems.append(
+                f"network.converters: link.type is {INPROC!r} of some and not of others; choose"
+                " links for all, or for none"
+            )
+        if kinds == {INPROC} and self.mode == "realtime":
+            problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
+        places = [link.endpoint for link in own.values() if link.endpoint is not None]
+        for place in {place for place in places if places.count(place) > 1}:
+            problems.append(
+                f"network.converters: {places.count(place)} have the link.endpoint {place!r}; each"
+                " needs one of its own"
+            )
+        for name, link in own.items():
+            if link.type == INPROC:
+                continue
+            kind = link_kind(link.type)
+            options = kind.options.model_validate(link.options)
+            where = f"network.converters.{name}.link" if name else "link"
+            try:
+                kind.check(options.of_run(self.has_inner), self.T_s)
+            except LawError:
+                pass  # ``check_scenario`` says what is wrong with the laws
+            except ValueError as problem:
+                problems.append(f"{where}.options: {problem}")
+        return problems
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:
@@ -351,26 +410,11 @@ class Scenario(_Model):
                     f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
                     f"{meant(asked, self.converters)}"
                 )
-        if self.network is not None and self.link.type != INPROC:
-            problems.append(
-                f"link.type = {self.link.type!r}: a network runs in one process; use {INPROC!r}"
-            )
         if self.network is not None and self.after_trip == "wait":
             problems.append("after_trip = 'wait': a network has no reset yet; use 'end'")
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
-        if self.link.type == INPROC:
-            if self.mode == "realtime":
-                problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
-        else:
-            kind = link_kind(self.link.type)
-            options = kind.options.model_validate(self.link.options)
-            try:
-                kind.check(options.of_run(self.has_inner), self.T_s)
-            except LawError:
-                pass  # ``check_scenario`` says what is wrong with the laws
-            except ValueError as problem:
-                problems.append(f"link.options: {problem}")
+        problems += self._wrong_links()
         if problems:
             raise ValueError("; ".join(problems))
         return self
@@ -475,6 +519,12 @@ def load_scenario(
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
         link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
+    if in_process or chosen is not None:  # one link for all
+        network = content.get("network")
+        members = network.get("converters") if isinstance(network, dict) else None
+        for member in members.values() if isinstance(members, dict) else ():
+            if isinstance(member, dict):
+                member.pop("link", None)
     for key, value in (implied | overrides).items():
         table: Any = content
         *parents, last = key.split("__")
