@@ -18,6 +18,7 @@ from gfm_hil.results.run import Run
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import plant_sample
 from gfm_runtime.inner import settle
+from gfm_runtime.states import RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
 
 from ..support.firmware import cc
@@ -117,6 +118,22 @@ def test_our_own_model_gives_the_run_of_the_law(
             assert found.columns[name][:].tobytes() == column[:].tobytes(), name
             if inner == "none":  # else what is left of the start decays with T_off
                 np.testing.assert_allclose(column[:], near.columns[name][:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.apt
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("kind", ["dll", "fmu"])
+def test_a_reset_starts_the_model_anew(exported: Any, kind: str, tmp_path: Path) -> None:
+    """A dip to nothing trips; the run after the reset has the bits of the run from its start."""
+    falls = [{"type": "grid-voltage", "tick": 200, "V_g": 0.0}, {"type": "reset", "tick": 500}]
+    content = {"after_trip": "wait", "events": falls}
+    found = run(tmp_path, exported(kind, "vsg-2", "none"), **content)
+    state, p = found.columns["state"][:], found.columns["true_p"][:]
+    assert set(state[300:500]) == {SAFE} and set(state[502:]) == {RUNNING}
+    for name in ("true_p", "u_i_u", "u_omega_u", "u_E_u"):
+        column = found.columns[name][:]
+        np.testing.assert_array_equal(column[501:700], column[:199], err_msg=name)
+    assert np.ptp(p) > 0.4
 
 
 @pytest.mark.apt
