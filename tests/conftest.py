@@ -1,13 +1,14 @@
 """Settings for the whole suite, and its tiers.
 
 ``python -m pytest`` runs the fast tier: what needs no process of its own, in parallel. The other
-tiers are marked; the last two run one test at a time, as they measure out processors and ports:
+tiers are marked; the last two run one test at a time unless ``-n`` says otherwise:
 
 * ``full``: every law where the fast tier takes one of each structure, long computations, and
   compilers from apt,
 * ``processes``: real processes, sockets, real time,
 * ``systems``: a browser, user-mode Linux, systemd, a C compiler, kills, soaks.
 
+The mark ``alone`` is for tests of the last two that fail beside another one on two processors.
 ``--tier`` chooses tiers; a path, ``-k`` or ``-m`` on the command line chooses from all of them.
 """
 

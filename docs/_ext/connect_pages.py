@@ -159,6 +159,18 @@ def shm_layout() -> str:
         ),
         (segment.HEADS[0], 8, "int64", "head of the first ring; the controller writes it"),
         (segment.HEADS[1], 8, "int64", "head of the second ring; the plant writes it"),
+        (
+            segment.BELLS[0],
+            8,
+            "int64",
+            "bell of the first ring; the controller sets it before it sleeps",
+        ),
+        (
+            segment.BELLS[1],
+            8,
+            "int64",
+            "bell of the second ring; the plant sets it before it sleeps",
+        ),
         (segment.RINGS[0], ring.RING, "ring", "the first ring: plant to controller"),
         (segment.RINGS[1], ring.RING, "ring", "the second ring: controller to plant"),
     ]

@@ -23,7 +23,7 @@ from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 KEYS = {
     "link", "peer", "code", "mode", "load", "policy", "payload", "n", "ratio_to_baseline_p50",

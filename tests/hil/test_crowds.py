@@ -27,7 +27,7 @@ from ..support.modbus import MODELS, SCENARIO, at
 from ..support.processes import GFMHIL, PATIENCE_S, takes_commands, wait_for
 from ..support.scope import addresses, mute
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 PAGES, CONNECTIONS, DESCRIPTORS = 200, 2000, 1024
 TURN_S = 3.0

@@ -24,7 +24,7 @@ from gfm_hil.operator import Operator
 from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
 from ..support.processes import GFMHIL, running, wait_for
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from gfm_hil.modbus.image import VENDOR
 from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
 from ..support.processes import GFMHIL, PATIENCE_S, free_port, running
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 
 def test_a_folder_without_a_run(tmp_path):

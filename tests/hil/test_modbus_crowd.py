@@ -25,7 +25,7 @@ from gfm_hil.modbus.serve import Address
 from ..support.modbus import SUNS
 from ..support.modbus_device import Bench
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 PATIENCE_S = 60.0
 READ = struct.pack(">BHH", 3, SUNS, 2)

@@ -31,7 +31,7 @@ from ..support.processes import PATIENCE_S, has_run, places, roles_of, signals, 
 from ..support.scope import RIG, addresses
 from ..support.soak import MB, Clients, Sampler, ports_in
 
-pytestmark = pytest.mark.systems
+pytestmark = [pytest.mark.systems, pytest.mark.alone]
 
 SOAK_S = float(os.environ.get("GFMHIL_SOAK_S", "0"))
 CSV = os.environ.get("GFMHIL_SOAK_CSV")

@@ -40,13 +40,15 @@ from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
 _FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
+_SOON = 200  # looks
 
 
 class Share(NamedTuple):
     """What a role's loop has of one converter.
 
     Attributes:
-        crowded: other loops run on the same processor, so that this one yields it at every look.
+        crowded: there are more loops than processors. In real time this one then yields its
+            processor at every look, and in lockstep it sleeps soon.
     """
 
     bench: Bench
@@ -68,11 +70,13 @@ class _End:
         self.writer = FrameWriter("y" if plant else "u", bench.inner)
         self.reader = FrameReader.of(role, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
-        self.loop["spin_limit"] = port.spin_limit
+        realtime = scenario.mode == "realtime"
+        sleeps_soon = share.crowded and port.patient is not None
+        self.loop["spin_limit"] = _SOON if sleeps_soon else port.spin_limit
         w, r = self.writer, self.reader
         end = LinkEnd(
             port.send, port.receive, port.patient or _rest, port.handle,
-            0 if share.crowded else port.spins,
+            0 if share.crowded and realtime else port.spins,
             (w.sequence, w.frame, w.message), (r.frame, r.message), r.record,
         )  # fmt: skip
         records = Records(

@@ -6,11 +6,20 @@ the stamp of the next slot, and so waits on the cache line that brings the messa
 publishes no other position. The reader releases the head, the number of messages it has taken. The
 writer loads it only when its last copy says that the ring is full. Stamps and head are the whole
 state: a process that takes over an end continues from them.
+
+A ring may have a bell, a word by which a reader that sleeps is woken: not 0 while it sleeps. A
+writer that does not know it only lets the reader sleep for longer.
 """
 
 from __future__ import annotations
 
+import platform
+import sys
+from typing import Any
+
 import numpy as np
+from numba import types
+from numpy.typing import NDArray
 
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port, free_port_function
@@ -27,8 +36,20 @@ LENGTH_BITS = 16
 _LENGTH = (1 << LENGTH_BITS) - 1
 
 #: the handle: addresses of the ring to write and of its head (0: not open), messages sent, and
-#: the last copy of the head; addresses of the ring to read and of its head, messages taken
-OUT, OUT_HEAD, SENT, SEEN, IN, IN_HEAD, TAKEN, HANDLE = range(8)
+#: the last copy of the head; addresses of the ring to read and of its head, messages taken;
+#: addresses of the bells of both (0: it has none); the longest sleep, a struct timespec
+OUT, OUT_HEAD, SENT, SEEN, IN, IN_HEAD, TAKEN, OUT_BELL, IN_BELL, SLEEP, SLEEP_NS, HANDLE = range(
+    12
+)
+
+_LONGEST_NS = 200_000
+_WAIT, _WAKE = 0, 1  # FUTEX_WAIT and FUTEX_WAKE of linux/futex.h
+_FUTEX = {"x86_64": 202, "aarch64": 98}.get(platform.machine(), -1)  # number of the system call
+
+HAS_BELLS = _FUTEX > 0 and sys.platform == "linux"
+
+_int64 = types.int64
+_syscall: Any = types.ExternalFunction("syscall", _int64(*[_int64] * 5))
 
 
 @compiled
@@ -46,6 +67,10 @@ def put(handle, message):
     copy(slot + WORD, message.ctypes.data, size)
     handle[SENT] = sent + 1
     store_release(slot, (sent + 1) << LENGTH_BITS | size)
+    bell = handle[OUT_BELL]
+    if bell != 0 and load_acquire(bell) != 0:
+        store_release(bell, 0)
+        _syscall(_FUTEX, bell, _WAKE, 1, 0)
     return 1
 
 
@@ -71,6 +96,24 @@ def take(handle, message):
 
 
 @compiled
+def patient(handle, message):
+    """As ``take``, but sleeps for up to 0.2 ms until a message arrives.
+
+    The writer may have looked at the bell just before it was set: the reader then oversleeps the
+    message by that time.
+    """
+    size = take(handle, message)
+    bell = handle[IN_BELL]
+    if size != 0 or bell == 0:
+        return size
+    store_release(bell, 1)
+    if not waiting(handle):
+        _syscall(_FUTEX, bell, _WAIT, 1, handle.ctypes.data + WORD * SLEEP)
+    store_release(bell, 0)
+    return take(handle, message)
+
+
+@compiled
 def waiting(handle):
     """Whether a message has arrived."""
     taken = handle[TAKEN]
@@ -89,10 +132,23 @@ def port_receive(handle, message):
     return take(handle, message)
 
 
+@free_port_function
+def port_patient(handle, message):
+    return patient(handle, message)
+
+
+def make_handle() -> NDArray[np.int64]:
+    """A handle that is not open."""
+    handle = np.zeros(HANDLE, np.int64)
+    handle[SLEEP_NS] = _LONGEST_NS
+    return handle
+
+
 def warm_up() -> None:
     """Compile (or load from the cache) all functions, on a handle that is not open."""
-    handle, message = np.zeros(HANDLE, np.int64), np.zeros(1, np.uint8)
+    handle, message = make_handle(), np.zeros(1, np.uint8)
     put(handle, message)
     take(handle, message)
     waiting(handle)
-    Port(handle, port_send, port_receive, 0)
+    patient(handle, message)
+    Port(handle, port_send, port_receive, 0, port_patient)

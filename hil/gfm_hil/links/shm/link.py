@@ -34,11 +34,12 @@ class ShmLink:
     def __init__(self, role: Role, endpoint: str) -> None:
         self._role, self._endpoint = role, endpoint
         self._segment: segment.Segment | None = None
-        self._handle = np.zeros(ring.HANDLE, np.int64)
+        self._handle = ring.make_handle()
         self._message = np.empty(LONGEST, np.uint8)
         self._closed = False
         ring.warm_up()
-        self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS)
+        patient = ring.port_patient if ring.HAS_BELLS else None
+        self.port = Port(self._handle, ring.port_send, ring.port_receive, _SPINS, patient)
         self._open()
 
     def send(self, message: bytes) -> bool:
@@ -103,5 +104,7 @@ class ShmLink:
         h[ring.SENT] = stamps.max() >> ring.LENGTH_BITS
         base = words.ctypes.data
         h[ring.OUT_HEAD], h[ring.IN_HEAD] = base + np.array(segment.HEADS)[[out, into]]
+        if ring.HAS_BELLS:
+            h[ring.OUT_BELL], h[ring.IN_BELL] = base + np.array(segment.BELLS)[[out, into]]
         h[ring.OUT], h[ring.IN] = base + np.array(segment.RINGS)[[out, into]]
         self._segment = found

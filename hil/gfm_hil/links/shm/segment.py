@@ -33,6 +33,7 @@ _OWNER = struct.Struct("<8sq3q")
 _PLANT = struct.Struct("<3q")
 _PLANT_AT = 64
 HEADS = (128, 256)  # plant to controller, controller to plant
+BELLS = (384, 448)  # of the rings, in the same order; seldom written
 RINGS = (512, 512 + RING)
 SIZE = 512 + 2 * RING
 
