@@ -158,6 +158,34 @@ def step_with_inner(law, state, c):
     advance(law, state)
 
 
+@inlined
+def accept(c, y):
+    """Check y[k] and keep it in ``c.y``, and move the references by one tick.
+
+    Returns:
+        Whether y is finite and in range; else the controller is in SAFE.
+    """
+    for j in range(len(y)):
+        if not (c.y_low[j] <= y[j] <= c.y_high[j]):
+            _go_safe(c, BAD_Y, j)
+            return False
+        c.y[j] = y[j]
+    c.stale = 0
+    for j in range(NY):
+        away = c.ref_target[j] - c.ref[j]
+        if c.ref_rate[j] == 0.0 or abs(away) <= c.ref_rate[j]:
+            c.ref[j] = c.ref_target[j]
+        else:
+            c.ref[j] += math.copysign(c.ref_rate[j], away)
+    return True
+
+
+@compiled
+def bad_output(ctl, channel):
+    """SAFE, because output ``channel`` is not finite."""
+    _go_safe(ctl[0], BAD_U, channel)
+
+
 @compiled
 def control(ctl, laws, states, est, y, u):
     """One tick: y[k] in, u[k] out.
@@ -169,21 +197,9 @@ def control(ctl, laws, states, est, y, u):
         u: output, u[k], shape (3,), or (4,) with an inner stage, p.u. Unchanged in SAFE.
     """
     c = ctl[0]
-    if c.state != RUNNING:
+    if c.state != RUNNING or not accept(c, y):
         return
     inner = len(y) > NY
-    for j in range(len(y)):
-        if not (c.y_low[j] <= y[j] <= c.y_high[j]):
-            _go_safe(c, BAD_Y, j)
-            return
-        c.y[j] = y[j]
-    c.stale = 0
-    for j in range(NY):
-        away = c.ref_target[j] - c.ref[j]
-        if c.ref_rate[j] == 0.0 or abs(away) <= c.ref_rate[j]:
-            c.ref[j] = c.ref_target[j]
-        else:
-            c.ref[j] += math.copysign(c.ref_rate[j], away)
     if c.stages > 0:
         _schedule(c, est[0], c.y)
     if c.request >= 0:

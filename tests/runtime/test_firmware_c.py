@@ -25,7 +25,7 @@ from gfm_runtime.firmware import (
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
-from ..support.firmware import STAGED, T_S, cc, exported
+from ..support.firmware import SOME, STAGED, T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
@@ -128,6 +128,38 @@ def test_the_code_compiles_without_a_warning(
         sources = sorted(p.name for p in folder.glob("*.c"))
         done = cc(folder, *STRICT, "-fsyntax-only", *sources, compiler=compiler)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_no_rule_of_misra_is_broken_but_those_of_the_page(tmp_path: Path) -> None:
+    """By cppcheck's addon; and the page names no rule that is not broken."""
+    page = (PAGES / "misra.md").read_text(encoding="utf-8")
+    (macros,) = re.findall(r"-DFLT_.*?-D__GNUC__=12", page, re.DOTALL)
+    check_it = ["--addon=misra", "--enable=style", "--std=c99", "--quiet", "-j2"]
+    check_it += [flag for flag in macros.split() if flag.startswith("-D")]
+    staged = {name: law for name, law in STAGED.items() if name.startswith(("vsg-2", "threshold"))}
+    found: dict[str, str] = {}
+    for style, real, laws in (
+        ("unrolled", "float32", {name: LAWS[name] for name in SOME}),
+        ("unrolled", "float64", staged),
+        ("records", "float64", {name: LAWS[name] for name in SOME}),
+        ("records", "float32", staged),
+    ):
+        folder = tmp_path / f"{style}-{real}"
+        folder.mkdir()
+        exported(folder, real, style, of=laws)
+        scheduled = ["firmware", "export", "mimo-gfm-scheduled", "--style", style, "--real", real]
+        assert main([*scheduled, "-o", str(folder / "scheduled")]) == 0
+        for at in (folder, folder / "scheduled"):
+            files = sorted(p.name for p in at.glob("gfm*.c"))
+            done = cc(at, *check_it, *files, compiler="cppcheck")
+            assert done.returncode == 0 and "noValidConfiguration" not in done.stderr
+            for line in done.stderr.splitlines():
+                for rule in re.findall(r"\[misra-c2012-([\d.]+)\]$", line):
+                    found.setdefault(rule, f"{at.relative_to(tmp_path)}/{line}")
+    listed = set(re.findall(r"^\| ([\d.]+) \| (?:required|advisory) \|", page, re.MULTILINE))
+    assert len(found) > 5
+    assert [place for rule, place in found.items() if rule not in listed] == []
+    assert listed - found.keys() == set()
 
 
 @pytest.mark.parametrize(

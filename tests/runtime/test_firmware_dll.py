@@ -14,17 +14,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import typeof
 
 from gfm_hil.cli import main
-from gfm_runtime import LawSet, load_law
+from gfm_hil.results.runner import run_in_memory
+from gfm_hil.scenario.model import load_scenario
+from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.firmware.golden import inputs
-from gfm_runtime.inner import settle
-from gfm_runtime.signals import NU, carried, carried_rows, group, names
+from gfm_runtime.controller import control
+from gfm_runtime.firmware import STYLES
+from gfm_runtime.signals import carried, group, names
 from gfm_runtime.states import BAD_Y, RUNNING
 from gfm_runtime.switchover import settle_into
 
-from ..support.firmware import T_S, cc
+from ..support.firmware import T_S, accepted, bench, cc
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
 
@@ -114,27 +117,6 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return build
 
 
-def accepted(seed: int, real: str, stages: bool) -> Any:
-    """Golden references and measurements (TICKS, n) without those that are refused, float64."""
-    _, refs, ys = inputs(seed, TICKS, np.dtype(real), stages)
-    rows = (*group("ref"), *carried_rows("y", stages))
-    both = np.hstack([refs, ys])
-    low, high = np.array([[r.low for r in rows], [r.high for r in rows]])
-    both[~((both >= low) & (both <= high)).all(axis=1)] = both[0]
-    return np.split(both.astype(float), [refs.shape[1]], axis=1)
-
-
-def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controller:
-    """The controller of the bench, its outputs beginning at u."""
-    one = Controller([LawSet("x", load_law(law, inner).laws)], T_S, ref, real=real)
-    one.start(np.zeros(one.active_law.order), u[:NU])
-    own = np.array(u[:NU])
-    settle_into(one.laws[0], one.states[0], ref, y, own, np.zeros(NU))
-    if one.inner:
-        settle(one.laws[:1], one.states[:1], own, y, u[2], u[3])
-    return one
-
-
 @pytest.mark.parametrize("real", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("law", "inner"),
@@ -147,7 +129,7 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
     u = np.array([0.5, 1.0, 1.0, 0.05][: 3 + stages], real).astype(float)
     twins = []
     for seed in (1, 2):
-        refs, ys = accepted(seed, real, stages)
+        refs, ys = accepted(seed, TICKS, real, stages)
         model = Model(built(law, inner, real))
         model.start(u)
         np.testing.assert_array_equal(model.outputs[:-1], u)
@@ -169,7 +151,7 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_the_model_has_the_same_bits_under_windows(built: Any, real: str, tmp_path: Path) -> None:
     folder, u = built("vsg-2", "cascaded", real).parent, [0.5, 1.0, 1.0, 0.05, 0.0]
-    refs, ys = accepted(3, real, True)
+    refs, ys = accepted(3, TICKS, real, True)
     ticks = np.hstack([refs, ys])
     (tmp_path / "ticks.bin").write_bytes(np.array(u).tobytes() + ticks.tobytes())
     cross = ["-std=c99", "-O2", "-ffp-contract=off", "-static-libgcc", f"-I{folder}"]
@@ -248,11 +230,50 @@ def test_only_the_interface_is_exported(built: Any, tmp_path: Path) -> None:
         assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(built: Any, real: str) -> None:
+    """What the shipped run measured, 12 s, tick by tick, with the change of stage among them."""
+    scenario = load_scenario("weakening_grid", link__type="inproc")
+    run = run_in_memory(scenario)
+    refs = np.column_stack([run.columns[f"ref_{name}"][:] for name in names("ref")])
+    ys = np.column_stack([run.columns[f"y_{name}"][:] for name in carried("y", False)])
+    refs, ys = (np.ascontiguousarray(a.astype(real).astype(float)) for a in (refs, ys))
+    u = np.array([0.5, 1.0, 1.0])
+    model = Model(built("mimo-gfm-scheduled", "none", real))
+    assert model.info.NumDoubleStates == model.info.NumFloatStates == 0
+    model.start(u)
+    kernel = Controller([load_law("mimo-gfm-scheduled")], T_S, refs[0], real=real)
+    kernel.start(np.zeros(kernel.active_law.order), u)
+    settle_into(kernel.laws[0], kernel.states[0], refs[0], ys[0], u.copy(), np.zeros(3))
+    records = kernel.ctl, kernel.laws, kernel.states, kernel.est, ys[0], u
+    control_it = control.compile(tuple(map(typeof, records)))  # else it asks for types every tick
+    expected = u.copy()
+    for k in range(len(ys)):
+        kernel.ctl["ref"] = kernel.ctl["ref_target"] = refs[k]
+        control_it(*records[:4], ys[k], expected)
+        assert model.tick(refs[k], ys[k]) == OK
+        assert model.outputs.tobytes() == np.append(expected, 0.0).tobytes(), k
+    assert kernel.ctl["changes"][0] == 1 and kernel.active == "mimo-gfm-scheduled[1]"
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("inner", ["none", "cascaded"])
+def test_a_scheduled_law_is_exported_whole(tmp_path: Path, style: str, inner: str) -> None:
+    command = ["firmware", "export", "mimo-gfm-scheduled", "--inner", inner, "--style", style]
+    assert main([*command, "-o", str(tmp_path)]) == 0
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+    for compiler in ("gcc", "clang"):
+        done = cc(tmp_path, *strict, "-c", "gfm_mimo_gfm_scheduled.c", compiler=compiler)
+        assert (done.returncode, done.stderr) == (0, "")
+    done = cc(tmp_path, "-S", ".", "-B", "build", compiler="cmake")
+    assert done.returncode == 0 and "gfm_mimo_gfm_scheduled.c" in (
+        tmp_path / "CMakeLists.txt"
+    ).read_text(encoding="utf-8")
+
+
 def test_what_the_command_refuses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main(["firmware", "dll", "mimo-gfm-scheduled", "-o", str(tmp_path)]) == 2
-    assert "has 2 stages; a model holds one law" in capsys.readouterr().err
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["firmware", "dll", "vsg-1", "-o", str(tmp_path)]) == 2
     assert "apt-get install gcc libc6-dev" in capsys.readouterr().err

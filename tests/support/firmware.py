@@ -8,10 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gfm_runtime import Law, load_law
+import numpy as np
+
+from gfm_runtime import Law, LawSet, load_law
+from gfm_runtime.assembly import Controller
 from gfm_runtime.firmware import export
-from gfm_runtime.inner import KINDS, PRIORITIES, Inner
+from gfm_runtime.firmware.golden import inputs
+from gfm_runtime.inner import KINDS, PRIORITIES, Inner, settle
 from gfm_runtime.inner_file import NO_INNER, inner_names
+from gfm_runtime.signals import NU, carried_rows, group
+from gfm_runtime.switchover import settle_into
 
 from .laws import LAWS
 
@@ -57,3 +63,24 @@ def cc(folder: Path, *arguments: str, compiler: str = "gcc") -> subprocess.Compl
     return subprocess.run(
         [compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False
     )
+
+
+def accepted(seed: int, ticks: int, real: str, stages: bool) -> Any:
+    """Golden references and measurements (ticks, n) without those that are refused, float64."""
+    _, refs, ys = inputs(seed, ticks, np.dtype(real), stages)
+    rows = (*group("ref"), *carried_rows("y", stages))
+    both = np.hstack([refs, ys])
+    low, high = np.array([[r.low for r in rows], [r.high for r in rows]])
+    both[~((both >= low) & (both <= high)).all(axis=1)] = both[0]
+    return np.split(both.astype(float), [refs.shape[1]], axis=1)
+
+
+def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controller:
+    """The controller of the bench, its outputs beginning at u."""
+    one = Controller([LawSet("x", load_law(law, inner).laws)], T_S, ref, real=real)
+    one.start(np.zeros(one.active_law.order), u[:NU])
+    own = np.array(u[:NU])
+    settle_into(one.laws[0], one.states[0], ref, y, own, np.zeros(NU))
+    if one.inner:
+        settle(one.laws[:1], one.states[:1], own, y, u[2], u[3])
+    return one

@@ -68,6 +68,14 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
 
 
+def add_map(command: argparse.ArgumentParser, option: str) -> None:
+    """The option that goes with a model, which ``option`` gives."""
+    command.add_argument(
+        "--map", type=Path, metavar="FILE",
+        help=f"of {option}: which signals its ports are, as TOML, where names differ from ours",
+    )  # fmt: skip
+
+
 def _link_option(text: str) -> tuple[str, Any]:
     """KEY=VALUE with the value as in TOML, or as text where it is none."""
     key, equals, value = text.partition("=")

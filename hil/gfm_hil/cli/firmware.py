@@ -11,11 +11,12 @@ from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
+from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import numbers, terminal
-from gfm_runtime import Law, law_names, load_law
+from gfm_runtime import Law, LawSet, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
+    FMI,
     OPTIMISED,
     REALS,
     SHIPPED,
@@ -26,8 +27,10 @@ from gfm_runtime.firmware import (
     check,
     dll_sources,
     export,
+    fmu,
     golden,
     make_modules,
+    stage_names,
 )
 
 ALL = "all"
@@ -50,6 +53,12 @@ def add(command: argparse.ArgumentParser) -> None:
     _add_how(dll)
     dll.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
     dll.set_defaults(call=call_dll)
+    unit = kinds.add_parser("fmu", help="build a law as an FMU for co-simulation")
+    unit.add_argument("law", metavar="LAW", help="a name, or a .toml file")
+    _add_how(unit)
+    unit.add_argument("--fmi", choices=FMI, default=FMI[-1], help=f"version of FMI ({FMI[-1]})")
+    unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
+    unit.set_defaults(call=call_fmu)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
     _add_laws(vectors)
     vectors.add_argument(
@@ -93,8 +102,10 @@ def _add_how(command: argparse.ArgumentParser) -> None:
 
 def call_export(options: argparse.Namespace) -> int:
     """Write the folder; returns the exit code."""
-    laws, omega_b = _laws(options.laws, options.inner), _omega_b(options.f_n)
-    files = export(laws, options.T_s, options.real, options.style, omega_b)
+    sets = _sets(options.laws, options.inner)
+    laws, omega_b = _laws(sets), _omega_b(options.f_n)
+    scheduled = [one for one in sets if one.schedule is not None]
+    files = export(laws, options.T_s, options.real, options.style, omega_b, scheduled)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         write_text(options.out / name, text)
@@ -104,21 +115,29 @@ def call_export(options: argparse.Namespace) -> int:
 
 def call_dll(options: argparse.Namespace) -> int:
     """Write the folder and build the library; returns the exit code."""
-    laws = _laws([options.law], options.inner)
-    if len(laws) != 1:
-        raise UserError(f"law {options.law!r}: has {len(laws)} stages; a model holds one law")
-    ((name, law),) = laws.items()
-    files = dll_sources(name, law, options.T_s, options.real, _omega_b(options.f_n))
+    law = load_law(options.law, options.inner)
+    files = dll_sources(law, options.T_s, options.real, _omega_b(options.f_n))
     options.out.mkdir(parents=True, exist_ok=True)
     for file, text in files.items():
         write_text(options.out / file, text)
-    print(build_dll(options.out, name, files))
+    print(build_dll(options.out, law.name, files))
+    return 0
+
+
+def call_fmu(options: argparse.Namespace) -> int:
+    """Build the FMU; returns the exit code."""
+    law = load_law(options.law, options.inner)
+    omega_b = _omega_b(options.f_n)
+    packed = fmu(law, options.T_s, options.real, options.fmi, omega_b)
+    with replacing(options.out) as part:
+        part.write_bytes(packed)
+    print(options.out)
     return 0
 
 
 def call_golden(options: argparse.Namespace) -> int:
     """Write or print the vectors; returns the exit code."""
-    laws, omega_b = _laws(options.laws, options.inner), _omega_b(options.f_n)
+    laws, omega_b = _laws(_sets(options.laws, options.inner)), _omega_b(options.f_n)
     modules = make_modules(laws, options.T_s, options.real, omega_b)
     text = golden(modules, _ticks(options.ticks)).csv()
     if options.out is None:
@@ -138,13 +157,16 @@ def call_check(options: argparse.Namespace) -> int:
     return EXIT_OTHERWISE if any(result.differ for result in results) else 0
 
 
-def _laws(names: Sequence[str], inner: str | None) -> dict[str, Law]:
-    """Laws by name, with an inner stage in place of their own; a scheduled law in its stages."""
+def _sets(names: Sequence[str], inner: str | None) -> list[LawSet]:
+    """The laws of these names, with an inner stage in place of their own."""
+    return [load_law(name, inner) for name in (law_names() if list(names) == [ALL] else names)]
+
+
+def _laws(sets: Sequence[LawSet]) -> dict[str, Law]:
+    """Laws by name; a scheduled law in its stages."""
     laws: dict[str, Law] = {}
-    for name in law_names() if list(names) == [ALL] else names:
-        found = load_law(name, inner)
-        for k, law in enumerate(found.laws):
-            label = found.name if len(found.laws) == 1 else f"{found.name}[{k}]"
+    for found in sets:
+        for label, law in zip(stage_names(found), found.laws, strict=True):
             if label in laws:
                 raise UserError(f"law {label!r}: is named twice")
             laws[label] = law

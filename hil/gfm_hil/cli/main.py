@@ -40,7 +40,10 @@ COMMANDS = {
     "identify": ("identify", "measure a converter's dq admittance, and judge grids by it"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
-    "firmware": ("firmware", "export laws as C99, and check them on a processor, bit by bit"),
+    "firmware": (
+        "firmware",
+        "export laws as C99, FMUs and models; check them on a processor",
+    ),
     "design": ("design", "compute gamma, margins, and gains by H-infinity synthesis"),
     "dbc": ("dbc", "write the CAN link's DBC file, or its bus budget"),
     "warm-up": ("warm_up", "compile all that runs call, so that the first one starts at once"),

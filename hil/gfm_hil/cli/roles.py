@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gfm_hil.cli.common import (
+    add_map,
     add_scenario_options,
     endpoints,
     exit_code,
@@ -24,6 +25,7 @@ from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
+from gfm_hil.models import open_model, read_map
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import Scenario
@@ -36,6 +38,11 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--converter", help="of a network: the one that this controller controls")
     command.add_argument("--out", help="run folder; runs/<role>-<time> by default")
     command.add_argument("--quiet", action="store_true", help="say nothing but errors")
+    command.add_argument(
+        "--model", metavar="KIND:FILE",
+        help="of the controller: dll:FILE or fmu:FILE, which computes u in place of the law",
+    )  # fmt: skip
+    add_map(command, "--model")
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
 
 
@@ -46,12 +53,18 @@ def call(options: argparse.Namespace) -> int:
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     given = _given(scenario, endpoints(options))
+    if options.model is not None and role == "plant":
+        raise UserError("--model: the plant has no model; start the controller with it")
+    model = None
+    if options.model is not None:
+        ports = read_map(options.map)
+        model = open_model(options.model, ports, scenario.T_s, scenario.has_inner)
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
     if options.part is not None:  # of `gfmhil run`, which puts the parts together
         end_with_parent(options.part)
         with _all_in_use(places):
-            run_role(role, scenario, folder, given, notice=lambda text: None)
+            run_role(role, scenario, folder, given, lambda text: None, model)
         return 0
     check_free(folder, scenario.ticks * len(places), scenario.has_inner)
 
@@ -67,7 +80,7 @@ def call(options: argparse.Namespace) -> int:
         place.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     with _all_in_use(places):
-        run_role(role, scenario, folder, given, notice)
+        run_role(role, scenario, folder, given, notice, model)
         wall_s = time.monotonic() - began
         runs = {
             name: finish(bench.scenario, place, bench.controller.labels, wall_s)

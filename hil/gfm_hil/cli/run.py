@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import sys
 from pathlib import Path
 
 from gfm_hil.cli.common import (
+    add_map,
     add_scenario_options,
     exit_code,
     new_folder,
@@ -23,13 +25,19 @@ from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.runner import run_network, run_scenario
+from gfm_hil.engine.compiling import compile_for_model
+from gfm_hil.results.runner import Notice, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
+    command.add_argument(
+        "--controller", metavar="KIND:FILE",
+        help="dll:FILE (IEEE/CIGRE) or fmu:FILE: the controller, in place of a law of ours",
+    )  # fmt: skip
+    add_map(command, "--controller")
     command.add_argument("--out", help="run folder; runs/<scenario>-<time> by default")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -70,7 +78,9 @@ def call(options: argparse.Namespace) -> int:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
             stack.enter_context(companion("modbus", folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-            run = run_scenario(scenario, folder, progress, notice, figures=not options.no_figures)
+            command = _model_command(scenario, folder, options, notice)
+            figures = not options.no_figures
+            run = run_scenario(scenario, folder, progress, notice, figures, command)
         if options.json:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
@@ -82,8 +92,31 @@ def call(options: argparse.Namespace) -> int:
     return exit_code(run.summary)
 
 
+def _model_command(
+    scenario: Scenario, folder: Path, options: argparse.Namespace, notice: Notice
+) -> list[str]:
+    """The program that steps the model of --controller; empty without one.
+
+    Raises:
+        UserError: the run is in process, or has no operating point.
+    """
+    if options.controller is None:
+        if options.map is not None:
+            raise UserError("--map: is of a model; name it by --controller")
+        return []
+    if scenario.link.type == INPROC:
+        raise UserError("--controller: is a process, and a run in process has none; choose --link")
+    compile_for_model(scenario, notice)
+    command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
+    command += ["--endpoint", "{endpoint}", "--out", str(folder.absolute()), "--quiet"]
+    command += ["--part", str(os.getpid()), "--model", options.controller]
+    return command + (["--map", str(options.map.absolute())] if options.map else [])
+
+
 def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:
     """Run several converters, each of which gets a run folder of its own."""
+    if options.controller is not None:
+        raise UserError("--controller: controls one converter; a network runs without it")
     for name in ("scope", "stream", "modbus"):
         if getattr(options, name) is not None:
             raise UserError(

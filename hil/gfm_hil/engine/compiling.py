@@ -10,10 +10,13 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from numba.core import event
+from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.inproc import buffers, compile_loop
+from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.links import link_kind, link_names
@@ -131,6 +134,37 @@ def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
         _IDLE,
     ]
     return compile_sets(sets, notice), len(sets)
+
+
+def compile_for_model(scenario: Scenario, notice: Callable[[str], None]) -> None:
+    """Compile what a controller calls that steps a model in place of the law.
+
+    Args:
+        scenario, notice: as for ``compiled_bench``.
+
+    Raises:
+        UserError: as ``make_bench``.
+    """
+    bench = make_bench(scenario)
+    bench.model = SteppedModel(_Nothing(), bench.u)
+    compile_sets([_role("controller", [bench], " of a model")], notice)
+
+
+class _Nothing:
+    """A model that is not there."""
+
+    name = "nothing"
+
+    def start(self, u: NDArray[np.float64]) -> None:
+        """Nothing."""
+
+    def tick(
+        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
 
 
 _IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)

@@ -35,43 +35,70 @@ def controller_ticks(end, records, controller, event):
         records, controller: ``Records`` and ``ControllerRecords`` from there.
         event: tick of the next event.
     """
-    loop, _, y, u, rows, times, progress = records
+    loop, _, y, u, _, times, _ = records
     ctl, laws, states, est = controller
     r = loop[0]
-    sequence, frame, message = end.out
     sent = 0  # when the last answer left, in this call
     while True:
-        if not r.pending:
-            before = r.tick
-            why = _next_frame(end, records, r, ctl, sent)
-            if why != Why.GO_ON:
-                return why
-            if r.tick <= before:  # the plant asks again: our answer was lost
-                r.tick = before
-                pack_again(sequence, frame, message)  # a reset may have changed state and u since
-                end.send(end.handle, message)
-                continue
-            if r.tick >= event:
-                r.pending = 1
-                return Why.EVENT
-        r.pending = 0
-        k = r.tick
+        why = receive(end, records, r, ctl, event, sent)
+        if why != Why.GO_ON:
+            return why
         changes = ctl[0].changes
         answer(ctl, laws, states, est, y, u, end.reader[0].state == SAFE)
-        times[k, 2] = now_ns()
-        pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
-        end.send(end.handle, message)
-        times[k, 3] = sent = now_ns()
-        if r.realtime and end.spins == 0:
-            give_way()  # to the link's own thread: a sleep takes 9 µs before it leaves
-        record_controller(rows[k], ctl, states, est)
-        r.done += 1
-        progress[0], progress[1] = k + 1, ctl[0].reason
-        if ctl[0].state != r.seen or ctl[0].changes != changes:
-            r.seen = ctl[0].state
-            return Why.CHANGED
-        if k + 1 >= event:
+        why = reply(end, records, r, controller, event, changes)
+        if why != Why.GO_ON:
+            return why
+        sent = times[r.tick, 3]
+
+
+@inlined
+def receive(end, records, r, ctl, event, sent):
+    """Wait for the plant's next tick: GO_ON with its y in hand; or why to return.
+
+    The plant asks again where an answer was lost, and gets it again.
+    """
+    sequence, frame, message = end.out
+    while not r.pending:
+        before = r.tick
+        why = _next_frame(end, records, r, ctl, sent)
+        if why != Why.GO_ON:
+            return why
+        if r.tick <= before:
+            r.tick = before
+            pack_again(sequence, frame, message)  # a reset may have changed state and u since
+            end.send(end.handle, message)
+            continue
+        if r.tick >= event:
+            r.pending = 1
             return Why.EVENT
+        break
+    r.pending = 0
+    return Why.GO_ON
+
+
+@inlined
+def reply(end, records, r, controller, event, changes):
+    """Send u of the tick in hand and record it; GO_ON, or why to return.
+
+    ``changes`` is how often the law had changed before this tick.
+    """
+    _, _, _, u, rows, times, progress = records
+    ctl, _, states, est = controller
+    sequence, frame, message = end.out
+    k = r.tick
+    times[k, 2] = now_ns()
+    pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
+    end.send(end.handle, message)
+    times[k, 3] = now_ns()
+    if r.realtime and end.spins == 0:
+        give_way()  # to the link's own thread: a sleep takes 9 µs before it leaves
+    record_controller(rows[k], ctl, states, est)
+    r.done += 1
+    progress[0], progress[1] = k + 1, ctl[0].reason
+    if ctl[0].state != r.seen or ctl[0].changes != changes:
+        r.seen = ctl[0].state
+        return Why.CHANGED
+    return Why.EVENT if k + 1 >= event else Why.GO_ON
 
 
 @inlined

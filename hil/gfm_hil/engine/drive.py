@@ -6,7 +6,7 @@ Both functions are meant for a thread of their own.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.engine.waiting import part_from
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
+from gfm_hil.models import ModelError
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import PLANT_LEFT
 from gfm_hil.recording.parts import Part
@@ -164,7 +165,9 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
     bench, timeline = share.bench, share.timeline
     end, ctl = _End("controller", share, t0_ns, flags), bench.controller.ctl
     loop, own, goes_on = end.loop[0], _records(bench), bench.scenario.network is not None
-    why = Why.EVENT
+    why, ticks = Why.EVENT, _ticks(bench)
+    if bench.model is not None:
+        bench.model.last_words = lambda: end.last_words(STOPPED, 0, bench.u)
     loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running or goes_on:
         event = timeline.next_tick()
@@ -174,7 +177,12 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
         elif event <= end.tick + 1 or why == Why.WOKEN:
             timeline.carry_out(end.tick + 1)
             event = timeline.next_tick()
-        why = end.checked(controller_ticks(*end.side, own, event))
+        try:
+            why = end.checked(ticks(*end.side, own, event))
+        except ModelError as problem:
+            timeline.end("safe", str(problem), end.tick)
+            end.last_words(STOPPED, 0, bench.u)
+            break
         tick = end.tick
         if why in (Why.CHANGED, Why.EVENT) and not loop["pending"]:
             timeline.look(max(tick, 0))
@@ -202,6 +210,10 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
     return end.reader
 
 
+def _ticks(bench: Bench) -> Callable[..., Why]:
+    return bench.model or controller_ticks
+
+
 def _records(bench: Bench) -> ControllerRecords:
     c = bench.controller
     return ControllerRecords(c.ctl, c.laws, c.states, c.est)
@@ -218,7 +230,7 @@ def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -
     if role == "plant":
         plant_ticks(tuple(end.side for end in ends), benches[0].plant.records, 0)
     else:
-        controller_ticks(*ends[0].side, _records(benches[0]), _FAR)
+        _ticks(benches[0])(*ends[0].side, _records(benches[0]), _FAR)
 
 
 @port_function

@@ -175,6 +175,7 @@ def shake_hands(
     stopped: Callable[[], bool],
     notice: Notice,
     meeting: Meeting | None = None,
+    name: str = OUR_CONTROLLER,
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
 
@@ -183,6 +184,7 @@ def shake_hands(
 
     Args:
         meeting: of a plant, in common to its controllers.
+        name: what a controller calls itself.
 
     Raises:
         PeerLost: no good greeting came within ``link.start_timeout_s``, or the other side runs
@@ -193,7 +195,7 @@ def shake_hands(
     if role == "plant":
         mine["run"] = meeting.run
     else:
-        mine["name"] = OUR_CONTROLLER
+        mine["name"] = name
     run, controller = mine.get("run"), mine.get("name")
     begin = time.monotonic_ns()
     deadline = latest = begin + int(scenario.link.start_timeout_s * 1e9)

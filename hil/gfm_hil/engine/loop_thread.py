@@ -32,6 +32,9 @@ def run_loop(
     ordinary priority and only looks, a few times a second, whether to stop and what to write down.
     A link without a port gets a thread that pumps its messages.
 
+    Raises:
+        PeerLost: a model in place of the law does not answer; its thread is left behind.
+
     Args:
         shares: of the controller one, of the plant one for each converter.
         flags: shape (FLAGS,), what other threads tell the loop, see
@@ -41,6 +44,7 @@ def run_loop(
         flags = np.zeros(FLAGS, np.int64)
     shares = [share._replace(link=ported(share.link)) for share in shares]
     timelines = [share.timeline for share in shares]
+    model = shares[0].bench.model if role == "controller" else None
     for share in shares:
         getattr(share.link, "start", _nothing)()
     found: list[FrameReader] = []
@@ -66,9 +70,11 @@ def run_loop(
             for timeline in timelines:
                 timeline.flush()
             flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
+            if model is not None:
+                model.watch(timelines[0], shares[0].bench.scenario.link.peer_timeout_s / 2)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
-        while thread.is_alive():
+        while thread.is_alive() and not (model is not None and model.given_up):
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
         for timeline in timelines:

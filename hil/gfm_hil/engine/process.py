@@ -13,21 +13,23 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.errors import PeerLost
+from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.roles import Role
+from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.drive import Share, compile_loops
 from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
+from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
 from gfm_hil.links.impaired.link import ImpairedLink
+from gfm_hil.models import Model, ModelError
 from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import (
     ask_for_real_time,
@@ -38,6 +40,7 @@ from gfm_hil.realtime.priority import (
 from gfm_hil.recording.log import SEVERITY, Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
+from gfm_hil.scenario.events import Gains, LawChange
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 from gfm_plant import plant_command, plant_sample, plant_step
@@ -51,6 +54,7 @@ def run_role(
     folder: Path,
     endpoints: Mapping[str, str] = MappingProxyType({}),
     notice: Callable[[str], None] = print,
+    model: Model | None = None,
 ) -> Outcome:
     """Run one side of a scenario at its endpoints; record to ``folder``.
 
@@ -58,6 +62,7 @@ def run_role(
 
     Args:
         endpoints: by converter, where the scenario's links name none.
+        model: of the controller: what computes u in place of the law.
 
     Returns:
         How it ended, of several converters the weightiest; the parts of the recording,
@@ -69,6 +74,9 @@ def run_role(
     with Interrupt() as interrupt, ExitStack() as stack:
         benches = make_benches(scenario) if scenario.parts else [make_bench(scenario)]
         sides = []
+        if model is not None:
+            benches[0].model = _stepped(model, benches[0])
+            stack.callback(benches[0].model.close)
         _begin(folder, scenario)
         for bench in benches:
             name = bench.scenario.converter or ""
@@ -79,6 +87,21 @@ def run_role(
             sides.append(_Side(role, bench, place, stack, notice))
         compile_role(role, benches, [side.part for side in sides])
         return _run(role, sides, notice, interrupt)
+
+
+def _stepped(model: Model, bench: Bench) -> SteppedModel:
+    """A model ready for tick 0 at the operating point.
+
+    Raises:
+        UserError: it refuses, or the scenario has events that are about a law.
+    """
+    for event in bench.scenario.events:
+        if isinstance(event, (LawChange, Gains)):
+            raise UserError(f"events, {event.label()}: {model.name} has a law of its own")
+    try:
+        return SteppedModel(model, bench.u)
+    except ModelError as problem:
+        raise UserError(str(problem)) from None
 
 
 def _begin(folder: Path, scenario: Scenario) -> None:
@@ -217,12 +240,13 @@ def _meet(
         PeerLost: one did not come.
     """
     meeting, failed = Meeting(len(sides)), threading.Event()
+    model = sides[0].bench.model
 
     def meet(side: _Side) -> Start:
         try:
             return shake_hands(
                 role, side.good, side.scenario, lambda: stopped() or failed.is_set(), notice,
-                meeting,
+                meeting, OUR_CONTROLLER if model is None else model.name,
             )  # fmt: skip
         except PeerLost as problem:
             if len(sides) > 1 and not failed.is_set():

@@ -34,7 +34,7 @@ from gfm_hil.scenario.events import (
 from gfm_hil.scenario.profiles import Point, read_profile
 from gfm_plant import trip_reason
 from gfm_plant.names import CONTROLLER
-from gfm_runtime.signals import U_NAMES, Y_NAMES
+from gfm_runtime.signals import carried
 from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 
 _ROOM = 1 << 16  # bytes kept beside the log for its last lines
@@ -156,6 +156,8 @@ class Timeline:
             case Reference():
                 for name, value in event.values().items():
                     self._bench.controller.set(name, value, event.ramp_s)
+            case LawChange() | Gains() if self._bench.model is not None:
+                raise ValueError(f"{self._bench.model.name} has a law of its own")
             case LawChange():
                 self._bench.controller.select(event.law)
             case Gains():
@@ -266,5 +268,5 @@ class TimelineInMemory(Timeline):
 def safe_reason(ctl: Any) -> str:
     """Why the controller is in SAFE, in words."""
     reason, channel = int(ctl["reason"][0]), int(ctl["channel"][0])
-    names = {BAD_Y: Y_NAMES, BAD_U: U_NAMES}.get(reason)
+    names = {BAD_Y: carried("y", True), BAD_U: carried("u", True)}.get(reason)
     return REASONS[reason] + (f": {names[channel]}" if names else "")

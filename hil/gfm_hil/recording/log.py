@@ -84,9 +84,11 @@ def cause(reasons: list[str]) -> str:
 
 def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     """The most severe of the outcomes that the roles wrote and the one seen from ``outside``. Of
-    equally severe ones, that from outside, or that of the role where the cause occurred."""
+    equally severe ones, that from outside, or that of the role where the cause occurred, which may
+    say more."""
     ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
     found = [outside, *ends] if outside else ends
     if not found:
         return Outcome("safe", "the run was cut off: no process recorded its end", 0)
-    return max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))
+    first = max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))
+    return next((o for o in found if o.reason.startswith(f"{first.reason}: ")), first)

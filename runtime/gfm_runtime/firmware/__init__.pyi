@@ -1,11 +1,14 @@
 from .check import OPTIMISED, TARGETS, Checked, check
 from .dll import build_dll, dll_sources
+from .fmu import FMI, fmu
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
 from .module import REALS, STYLES, Module, Style, make_modules, sources
+from .schedule import stage_names
 
 __all__ = [
     "CHECKED",
+    "FMI",
     "OPTIMISED",
     "REALS",
     "SHIPPED",
@@ -19,7 +22,9 @@ __all__ = [
     "check",
     "dll_sources",
     "export",
+    "fmu",
     "golden",
     "make_modules",
     "sources",
+    "stage_names",
 ]

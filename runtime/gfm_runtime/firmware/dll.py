@@ -13,22 +13,22 @@ from pathlib import Path
 
 import numpy as np
 
+from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, identifier, plain, template
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
-from gfm_runtime.firmware.module import MADE, RESULTS, keys_of, make_modules, sources
-from gfm_runtime.law import Law
+from gfm_runtime.firmware.module import MADE, RESULTS, keys_of
+from gfm_runtime.firmware.schedule import one_module
 from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, group, table_hash
 
 _INTERFACE = "IEEE_Cigre_DLLInterface.h"
 
 
-def dll_sources(name: str, law: Law, T_s: float, real: str, omega_b: float) -> dict[str, str]:
+def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str, str]:
     """The headers and sources of a model by file name.
 
     Args:
-        name: of the law and the model.
-        law: with its inner stage, if it has one.
+        laws: the law, with its inner stage if it has one; or a scheduled one.
         T_s: sampling time, s.
         real: float32 or float64 inside; inputs and outputs are always real64.
         omega_b: base frequency of the converter, rad/s, for an inner stage.
@@ -36,17 +36,18 @@ def dll_sources(name: str, law: Law, T_s: float, real: str, omega_b: float) -> d
     Raises:
         LawError: as ``make_modules``.
     """
-    modules = make_modules({name: law}, T_s, real, omega_b)
-    m = modules[0]
+    m, code = one_module(laws, T_s, real, omega_b)
+    assert m.law is not None
+    schedule = laws.schedule is not None
     u = carried_rows("u", m.stages)
     single = m.real == np.float32
     keys = keys_of(m) | {
         "MADE": MADE,
-        "LAW_NAME": plain(name),
-        "NAME": _string(name),
+        "LAW_NAME": plain(m.name),
+        "NAME": _string(m.name),
         "VERSION": _string(f"signal table {TABLE_VERSION} ({table_hash()})"),
-        "TITLE": _string(law.title),
-        "SOURCE": _string(law.source),
+        "TITLE": _string(m.law.title),
+        "SOURCE": _string(m.law.source),
         "T_S": repr(float(T_s)),
         "FIRST_INT": "limited" if m.stages else "reason",
         "REAL64": "IEEE_Cigre_DLLInterface_DataType_real64_T",
@@ -57,17 +58,17 @@ def dll_sources(name: str, law: Law, T_s: float, real: str, omega_b: float) -> d
             + "; ".join(f"{code} {text}" for code, text in RESULTS.values() if code)
         ),
         "STATES": "FloatStates" if single else "DoubleStates",
-        "FLOATS": "REALS" if single else "0",
-        "DOUBLES": "0" if single else "REALS",
+        "FLOATS": "REALS" if single and not schedule else "0",
+        "DOUBLES": "0" if single or schedule else "REALS",
         "U_LOW": ", ".join(repr(s.low) for s in u),
         "U_HIGH": ", ".join(repr(s.high) for s in u),
         "U_START": ", ".join(repr(s.default) + "f" * single for s in u),
         "E_IN_USE": ", &u[2]" * m.stages,
     }
     return {
-        **sources(modules, T_s, "unrolled"),
+        **code,
         _INTERFACE: filled(template(_INTERFACE), keys),
-        "model.c": filled(chosen(template("model.c"), m.choices), keys),
+        "model.c": filled(chosen(template("model.c"), {**m.choices, "schedule": schedule}), keys),
     }
 
 

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from gfm_runtime.catalogue import LawSet
 from gfm_runtime.error_maps import HYBRID_ANGLE
 from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
 from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
 from gfm_runtime.firmware.report import reports
+from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.stage import SIZE
 from gfm_runtime.law import Law
 from gfm_runtime.signals import carried
 
 
 def export(
-    laws: Mapping[str, Law], T_s: float, real: str, style: Style, omega_b: float = 100 * math.pi
+    laws: Mapping[str, Law],
+    T_s: float,
+    real: str,
+    style: Style,
+    omega_b: float = 100 * math.pi,
+    scheduled: Iterable[LawSet] = (),
 ) -> dict[str, str]:
     """The files of a firmware folder by name.
 
@@ -30,18 +37,25 @@ def export(
         real: float32 or float64.
         style: see ``gfm_runtime.firmware.module``.
         omega_b: base frequency of the converter, rad/s, for an inner stage.
+        scheduled: laws whose stages, under the names of ``stage_names``, are among ``laws``.
 
     Raises:
         LawError: as ``make_modules``.
     """
     modules = make_modules(laws, T_s, real, omega_b)
+    by_name = {m.name: m for m in modules}
+    choosing: dict[str, str] = {}
+    for one in scheduled:
+        own = [by_name[name] for name in stage_names(one)]
+        choosing |= schedule_sources(one, own, T_s, omega_b, style)
     rows = golden(modules, SHIPPED)
     return {
         **sources(modules, T_s, style),
+        **choosing,
         **selftest(modules, style),
         "golden.h": _golden_header(rows, np.dtype(real)),
         "golden.csv": rows.csv(),
-        "CMakeLists.txt": _cmake(modules, style),
+        "CMakeLists.txt": _cmake(modules, style, choosing),
         **reports(modules, T_s, style),
     }
 
@@ -114,9 +128,10 @@ def _golden_header(rows: Golden, real: np.dtype[Any]) -> str:
     )
 
 
-def _cmake(modules: Sequence[Module], style: Style) -> str:
+def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -> str:
     names = [f"{m.prefix}.c" for m in modules] + ["gfm.c"] * (style == "records")
-    root = style == "records" or any(needs_sqrt(m) for m in modules)
+    names += [file for file in choosing if file.endswith(".c")]
+    root = bool(choosing) or style == "records" or any(needs_sqrt(m) for m in modules)
     keys = {"MADE": MADE, "SOURCES": " ".join(names), "LIBM": " m" if root else ""}
     return re.sub(r"@(MADE|SOURCES|LIBM)@", lambda f: keys[f[1]], template("CMakeLists.txt"))
 

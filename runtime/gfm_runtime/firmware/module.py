@@ -327,8 +327,15 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         "e": ", e" * stages,
         "E_OF": f", const {prefix}_real e[]" * stages,
         "sqrt": root,
+        **_small(real),
         "NEGLIGIBLE": literal(NEGLIGIBLE, real),
     }
+
+
+def _small(real: np.dtype[Any]) -> dict[str, str]:
+    """0 and 1 as constants of that type: MISRA C:2012, 10.3 and 10.4, asks for them."""
+    end = "f" if real == np.float32 else ""
+    return {"0": f"0.0{end}", "1": f"1.0{end}"}
 
 
 def keys_of(m: Module) -> dict[str, str]:
@@ -370,7 +377,7 @@ def _maps(names: Sequence[str], real: np.dtype[Any]) -> str:
     numbers = {"0.5": 0.5, "V_MIN": V_MIN, "R_MIN": R_MIN}
     keys = {key: literal(value, real) for key, value in numbers.items()}
     end = "f" if real == np.float32 else ""
-    keys |= {"sqrt": f"sqrt{end}", "fabs": f"fabs{end}"}
+    keys |= {"sqrt": f"sqrt{end}", "fabs": f"fabs{end}", **_small(real)}
     _, *parts = template("maps.c").split("/* @map ")
     by_name = dict(part.split("@ */\n", 1) for part in parts)
     return "".join(filled(by_name[name], keys) for name in names)

@@ -198,7 +198,9 @@ def _stage_step(m: Module, style: Style) -> str:
     if style == "records":  # it leaves these to the numbers
         choices |= {"power": choices["stage"], "threshold": choices["voltage"]}
     keys = dict.fromkeys(("LAW", "law", "P", "GUARD", "sqrt", "least_v"), "")
-    return stage_text("stage.c", choices, keys | {"sqrt": "sqrt"} | numbers_of(m.record))
+    return stage_text(
+        "stage.c", choices, keys | {"sqrt": "sqrt", "0": "0", "1": "1"} | numbers_of(m.record)
+    )
 
 
 def _page(laws: Sequence[Mapping[str, Any]], T_s: float, real: str, style: str) -> str:

@@ -60,6 +60,10 @@ class Unrolled:
         """The statements of a step."""
         return [*self._set_inputs(), *self._output(), *self._advance()]
 
+    @property
+    def _zero(self) -> str:
+        return "0.0f" if self.real == np.float32 else "0.0"
+
     def _number(self, value: Any) -> str:
         return literal(value, self.real)
 
@@ -147,7 +151,7 @@ class Unrolled:
             moved = [j for j in range(n) if law["W"][j, i] != 0]
             u = "t->omega" if self._inner and i == 1 else f"t->u[{i}]"  # the power limiter moves it
             if moved:
-                lines.append(f"if ({u} - t->raw[{i}] != 0) {{ /* back-calculation */")
+                lines.append(f"if ({u} - t->raw[{i}] != {self._zero}) {{ /* back-calculation */")
                 for j in moved:
                     term = self._product(law["W"][j, i], f"({u} - t->raw[{i}])")
                     lines.append(f"    s->x[{j}] += {term};")
@@ -161,7 +165,7 @@ class Unrolled:
             terms = self._products(law["B_r"][i], self._r)
             terms += self._measured(law["B_y"][i], "t->u[1]")
             terms += self._products(law["A"][i, :n], "s->x[{}]")
-            lines.append(f"x{i} = {_sum(terms) or '0'};")
+            lines.append(f"x{i} = {_sum(terms) or self._zero};")
         frozen = (
             [i for i in range(n) if law["row"][i] == 2] if self._inner and law["freeze"] else []
         )
@@ -189,7 +193,9 @@ class Unrolled:
                 if pair:
                     terms.append(pair[0] if len(pair) == 1 else f"({_sum(pair)})")
             total = _sum(terms)
-            lines.append(f"s->x[{i}] = {f'{total} + 0' if terms else '0'}; /* never -0 */")
+            lines.append(
+                f"s->x[{i}] = {f'{total} + {self._zero}' if terms else self._zero}; /* never -0 */"
+            )
         text = "\n".join(lines)
         unused = [
             name for name, use in (("s", "s->"), ("t", "t->"), ("u", "u[")) if use not in text

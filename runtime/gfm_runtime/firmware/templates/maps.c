@@ -26,12 +26,13 @@ static real sine_of_half(real x_a, real y_a, real x_b, real y_b)
 {
     real dot = x_a * x_b + y_a * y_b, cross = y_a * x_b - x_a * y_b;
     real length = @sqrt@(dot * dot + cross * cross), larger, sine;
-    int a_below = y_a < 0, b_below = y_b < 0;
-    if (!(length >= @R_MIN@))
-        return 0;
+    bool a_below = y_a < @0@, b_below = y_b < @0@;
+    if (!(length >= @R_MIN@)) {
+        return @0@;
+    }
     larger = @sqrt@(@0.5@ + @0.5@ * @fabs@(dot / length));
-    sine = dot >= 0 ? @0.5@ * @fabs@(cross / length) / larger : larger;
-    return (a_below == b_below ? cross < 0 : a_below) ? -sine : sine;
+    sine = dot >= @0@ ? @0.5@ * @fabs@(cross / length) / larger : larger;
+    return (a_below == b_below ? cross < @0@ : a_below) ? -sine : sine;
 }
 
 /* Column 2: sin((delta_ref - delta)/2), [Tayyebi2020hybrid] in the paper; delta is the angle across
@@ -40,6 +41,6 @@ static void hybrid_angle(real R, real X, real r[], real y[])
 {
     r[1] = sine_of_half(r[4] * r[4] - (R * r[1] + X * r[3]), X * r[1] - R * r[3],
         y[4] * y[4] - (R * y[1] + X * y[3]), X * y[1] - R * y[3]);
-    y[1] = 0;
+    y[1] = @0@;
 }
 

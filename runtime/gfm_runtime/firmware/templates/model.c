@@ -13,9 +13,18 @@ typedef @P@_t law_t;
 typedef @P@_real real;
 
 enum { NREF = @GUARD@_NREF, NY = @GUARD@_NY, NU = @GUARD@_NU };
+/* @if schedule@ */
+/* the instance as a whole, and the u in use, are kept as words */
+typedef struct {
+    law_t law;
+    real u[NU];
+} kept_t;
+enum { STARTED, KEPT, INTS = KEPT + (sizeof(kept_t) + sizeof(int32_T) - 1) / sizeof(int32_T) };
+/* @else@ */
 /* real states: those of the law, which are the first members of its instance, and the u in use */
 enum { LAW_REALS = offsetof(law_t, @FIRST_INT@) / sizeof(real), REALS = LAW_REALS + NU };
 enum { STARTED, REASON, CHANNEL, LIMITED, INTS };
+/* @end@ */
 
 static const IEEE_Cigre_DLLInterface_Signal inputs[] = {
 @INPUTS@
@@ -76,6 +85,12 @@ int32_T Model_CheckParameters(IEEE_Cigre_DLLInterface_Instance *instance)
 
 static void load(const IEEE_Cigre_DLLInterface_Instance *instance, law_t *s, real u[])
 {
+/* @if schedule@ */
+    kept_t kept;
+    memcpy(&kept, instance->IntStates + KEPT, sizeof kept);
+    *s = kept.law;
+    memcpy(u, kept.u, sizeof kept.u);
+/* @else@ */
     const real *states = instance->@STATES@;
     memcpy(s, states, LAW_REALS * sizeof(real));
     memcpy(u, states + LAW_REALS, NU * sizeof(real));
@@ -84,10 +99,17 @@ static void load(const IEEE_Cigre_DLLInterface_Instance *instance, law_t *s, rea
 /* @if stages@ */
     s->limited = instance->IntStates[LIMITED];
 /* @end@ */
+/* @end@ */
 }
 
 static void store(const IEEE_Cigre_DLLInterface_Instance *instance, const law_t *s, const real u[])
 {
+/* @if schedule@ */
+    kept_t kept;
+    kept.law = *s;
+    memcpy(kept.u, u, sizeof kept.u);
+    memcpy(instance->IntStates + KEPT, &kept, sizeof kept);
+/* @else@ */
     real *states = instance->@STATES@;
     memcpy(states, s, LAW_REALS * sizeof(real));
     memcpy(states + LAW_REALS, u, NU * sizeof(real));
@@ -95,6 +117,7 @@ static void store(const IEEE_Cigre_DLLInterface_Instance *instance, const law_t 
     instance->IntStates[CHANNEL] = s->channel;
 /* @if stages@ */
     instance->IntStates[LIMITED] = s->limited;
+/* @end@ */
 /* @end@ */
 }
 
@@ -123,7 +146,10 @@ int32_T Model_Initialize(IEEE_Cigre_DLLInterface_Instance *instance)
         u[i] = good ? (real)out[i] : start[i];
     @P@_init(&s);
     instance->IntStates[STARTED] = 0;
+/* @if schedule@ */
+/* @else@ */
     instance->IntStates[LIMITED] = 0;
+/* @end@ */
     store(instance, &s, u);
     give(instance, u, @GUARD@_OK);
     return IEEE_Cigre_DLLInterface_Return_OK;

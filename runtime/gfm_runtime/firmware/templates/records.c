@@ -1,10 +1,13 @@
 static void set_inputs(const gfm_law_t *law, tick_t *t, const real ref[], const real y[])
 {
     int j;
-    for (j = 0; j < GFM_NREF; j++)
-        t->ref[j] = t->r[j] = ref[j];
-    for (j = 0; j < @N_COLUMNS@; j++)
+    for (j = 0; j < GFM_NREF; j++) {
+        t->ref[j] = ref[j];
+        t->r[j] = ref[j];
+    }
+    for (j = 0; j < @N_COLUMNS@; j++) {
         t->y[j] = y[j];
+    }
     switch (law->error_map) {
     case @DC_ENERGY@:
         dc_energy(t->r, t->y);
@@ -25,13 +28,17 @@ static real row(const gfm_law_t *law, const gfm_t *s, const tick_t *t, int i)
 {
     real a = law->u_0[i] + s->offset[i];
     int j;
-    for (j = 0; j < law->n; j++)
+    for (j = 0; j < law->n; j++) {
         a += law->C[i][j] * s->x[j];
-    for (j = 0; j < GFM_NREF; j++)
+    }
+    for (j = 0; j < GFM_NREF; j++) {
         a += law->D_u0[i][j] * t->ref[j] + law->D_r[i][j] * t->r[j];
-    for (j = 0; j < @N_COLUMNS@; j++)
-        if (j != 2)
+    }
+    for (j = 0; j < @N_COLUMNS@; j++) {
+        if (j != 2) {
             a += law->D_y[i][j] * t->y[j];
+        }
+    }
     return a;
 }
 
@@ -39,7 +46,8 @@ static void output(const gfm_law_t *law, const gfm_t *s, tick_t *t)
 {
     int i;
     t->raw[1] = row(law, s, t, 1) * law->loop;
-    t->u[1] = t->y[2] = limited(t->raw[1], law->low[1], law->high[1]);
+    t->u[1] = limited(t->raw[1], law->low[1], law->high[1]);
+    t->y[2] = t->u[1];
     for (i = 0; i < @N_ROWS@; i += 2) {
         t->raw[i] = row(law, s, t, i) + law->D_y[i][2] * t->y[2];
         t->u[i] = limited(t->raw[i], law->low[i], law->high[i]);
@@ -53,33 +61,41 @@ static void advance(const gfm_law_t *law, gfm_t *s, const tick_t *t)
     for (i = 0; i < @N_ROWS@; i++) {
         real excess = t->u[i] - t->raw[i];
 /* @if stages@ */
-        if (i == 1 && law->inner != 0) /* the power limiter moves omega_u too */
+        if (i == 1 && law->inner != 0) { /* the power limiter moves omega_u too */
             excess = t->omega - t->raw[i];
+        }
 /* @end@ */
-        if (excess != 0)
-            for (j = 0; j < law->n; j++)
+        if (excess != @0@) {
+            for (j = 0; j < law->n; j++) {
                 s->x[j] += law->W[j][i] * excess;
+            }
+        }
         s->offset[i] = faded(s->offset[i] * law->decay);
         s->trend[i] = faded(s->trend[i] + law->follow * (t->u[i] - s->u[i] - s->trend[i]));
         s->u[i] = t->u[i];
     }
     for (i = 0; i < law->n; i++) {
         real a = law->B_r[i][0] * t->r[0];
-        for (j = 1; j < GFM_NREF; j++)
+        for (j = 1; j < GFM_NREF; j++) {
             a += law->B_r[i][j] * t->r[j];
-        for (j = 0; j < @N_COLUMNS@; j++)
+        }
+        for (j = 0; j < @N_COLUMNS@; j++) {
             a += law->B_y[i][j] * t->y[j];
-        for (j = 0; j < law->n; j++)
+        }
+        for (j = 0; j < law->n; j++) {
             a += law->A[i][j] * s->x[j];
+        }
         next[i] = a;
     }
-    for (i = 0; i < law->n; i++)
+    for (i = 0; i < law->n; i++) {
 /* @if stages@ */
-        if (!(law->freeze && s->limited && law->row[i] == 2))
+        if (!(law->freeze && s->limited && law->row[i] == 2)) {
             s->x[i] = faded(next[i]);
+        }
 /* @else@ */
         s->x[i] = faded(next[i]);
 /* @end@ */
+    }
 }
 
 static void set_states(const gfm_law_t *law, gfm_t *s, tick_t *t, const real u[])
@@ -88,17 +104,20 @@ static void set_states(const gfm_law_t *law, gfm_t *s, tick_t *t, const real u[]
     t->y[2] = u[1];
     for (i = 0; i < law->n; i++) {
         real a = law->E_r[i][0] * t->r[0];
-        for (j = 1; j < GFM_NREF; j++)
+        for (j = 1; j < GFM_NREF; j++) {
             a += law->E_r[i][j] * t->r[j];
-        for (j = 0; j < @N_COLUMNS@; j++)
+        }
+        for (j = 0; j < @N_COLUMNS@; j++) {
             a += law->E_y[i][j] * t->y[j];
+        }
         for (j = 0; j < @N_ROWS@; j++) {
             real wanted = u[j] - law->u_0[j];
-            for (m = 0; m < GFM_NREF; m++)
+            for (m = 0; m < GFM_NREF; m++) {
                 wanted -= law->D_u0[j][m] * t->ref[m];
+            }
             a += law->F[i][j] * wanted + law->G[i][j] * s->trend[j];
         }
-        s->x[i] = a + 0; /* never -0 */
+        s->x[i] = a + @0@; /* never -0 */
     }
 }
 

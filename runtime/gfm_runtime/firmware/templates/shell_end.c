@@ -7,8 +7,9 @@ static int refused(const @P@_t *s, const real ref[], const real y[], int *channe
     }
     *channel = @Y_CHECKS@
              : -1;
-    if (*channel >= 0)
+    if (*channel >= 0) {
         return @GUARD@_BAD_Y;
+    }
     *channel = @REF_CHECKS@
              : -1;
     return *channel >= 0 ? @GUARD@_BAD_REF : @GUARD@_OK;
@@ -20,24 +21,28 @@ void @P@_init(@P@_t *s)
     int i;
 /* @if stages@ */
     s->stage.e[0] = u[2];
-    s->stage.e[1] = 0;
+    s->stage.e[1] = @0@;
 /* @end@ */
     @P@_reset(s);
-    for (i = 0; i < @N_ROWS@; i++)
+    for (i = 0; i < @N_ROWS@; i++) {
         s->u[i] = u[i];
+    }
 }
 
 void @P@_reset(@P@_t *s)
 {
     int i;
-    for (i = 0; i < @GUARD@_NX; i++)
-        s->x[i] = 0;
-    for (i = 0; i < @N_ROWS@; i++)
-        s->offset[i] = s->trend[i] = 0;
+    for (i = 0; i < @GUARD@_NX; i++) {
+        s->x[i] = @0@;
+    }
+    for (i = 0; i < @N_ROWS@; i++) {
+        s->offset[i] = @0@;
+        s->trend[i] = @0@;
+    }
 /* @if stages@ */
     {
         const @P@_stage_t rest = {
-            .e = {s->stage.e[0], s->stage.e[1]}, .pll = {1, 0}, .omega_pll = @OMEGA_DEFAULT@};
+            .e = {s->stage.e[0], s->stage.e[1]}, .pll = {@1@, @0@}, .omega_pll = @OMEGA_DEFAULT@};
         s->stage = rest;
     }
     s->limited = 0;
@@ -54,12 +59,15 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
     int k;
 /* @end@ */
     int reason = refused(s, ref, y, &s->channel);
-    if (reason != @GUARD@_OK)
-        return s->reason = reason;
+    if (reason != @GUARD@_OK) {
+        s->reason = reason;
+        return reason;
+    }
     /* @if pll@ */
         measure_frequency(@law@s, y);
-        for (k = 0; k < @GUARD@_NREF; k++)
+        for (k = 0; k < @GUARD@_NREF; k++) {
             seen[k] = ref[k];
+        }
         seen[@GUARD@_REF_OMEGA_G] = s->stage.omega_pll;
         ref = seen;
     /* @end@ */
@@ -70,13 +78,14 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
     advance(@law@s, &t);
     if (!((t.omega - t.omega) + (t.u[0] - t.u[0]) + (s->stage.e[0] - s->stage.e[0])
             + (s->stage.e[1] - s->stage.e[1])
-            == 0)) {
+            == @0@)) {
         /* omega_u first: column 3 takes it to the others */
-        s->channel = !(t.omega - t.omega == 0)         ? 1
-            : !(t.u[0] - t.u[0] == 0)                  ? 0
-            : !(s->stage.e[0] - s->stage.e[0] == 0)    ? 2
+        s->channel = !(t.omega - t.omega == @0@)         ? 1
+            : !(t.u[0] - t.u[0] == @0@)                  ? 0
+            : !(s->stage.e[0] - s->stage.e[0] == @0@)    ? 2
                                                        : 3;
-        return s->reason = @GUARD@_BAD_U;
+        s->reason = @GUARD@_BAD_U;
+        return s->reason;
     }
     u[0] = t.u[0];
     u[1] = t.omega;
@@ -84,10 +93,11 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
     u[3] = s->stage.e[1];
 /* @else@ */
     advance(@law@s, &t);
-    if (!((t.u[1] - t.u[1]) + (t.u[0] - t.u[0]) + (t.u[2] - t.u[2]) == 0)) {
+    if (!((t.u[1] - t.u[1]) + (t.u[0] - t.u[0]) + (t.u[2] - t.u[2]) == @0@)) {
         /* omega_u first: column 3 takes it to the others */
-        s->channel = !(t.u[1] - t.u[1] == 0) ? 1 : !(t.u[0] - t.u[0] == 0) ? 0 : 2;
-        return s->reason = @GUARD@_BAD_U;
+        s->channel = !(t.u[1] - t.u[1] == @0@) ? 1 : !(t.u[0] - t.u[0] == @0@) ? 0 : 2;
+        s->reason = @GUARD@_BAD_U;
+        return s->reason;
     }
     u[0] = t.u[0];
     u[1] = t.u[1];
@@ -106,12 +116,14 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
 {
     tick_t t;
     int i, channel, reason = refused(s, ref, y, &channel);
-    if (reason != @GUARD@_OK)
+    if (reason != @GUARD@_OK) {
         return reason;
+    }
     set_inputs(@law@&t, ref, y);
     evaluate(@law@s, &t);
-    for (i = 0; i < @N_ROWS@; i++)
+    for (i = 0; i < @N_ROWS@; i++) {
         u[i] = t.u[i];
+    }
     return @GUARD@_OK;
 }
 
@@ -119,11 +131,12 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
 {
     tick_t t;
     int i, channel, reason = refused(s, ref, y, &channel);
-    if (reason != @GUARD@_OK)
+    if (reason != @GUARD@_OK) {
         return reason;
+    }
     set_inputs(@law@&t, ref, y);
     for (i = 0; i < @N_ROWS@; i++) {
-        s->offset[i] = 0;
+        s->offset[i] = @0@;
         s->trend[i] = trend[i];
         s->u[i] = u[i] - trend[i];
     }
@@ -138,8 +151,9 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
 /* @if stages@ */
     settle_stage(@law@s, t.u, y, e);
 /* @end@ */
-    for (i = 0; i < @N_ROWS@; i++)
+    for (i = 0; i < @N_ROWS@; i++) {
         u[i] = t.u[i];
+    }
     return @GUARD@_OK;
 }
 
@@ -148,10 +162,11 @@ int @P@_switch(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
 {
     real old[@N_ROWS@], change;
     int i, reason;
-    for (i = 0; i < @N_ROWS@; i++)
+    for (i = 0; i < @N_ROWS@; i++) {
         old[i] = u[i];
+    }
     reason = @P@_settle(@law@s, ref, y, u, trend@e@);
-    *bump = 0;
+    *bump = @0@;
     for (i = 0; i < @N_ROWS@; i++) {
         change = u[i] < old[i] ? old[i] - u[i] : u[i] - old[i];
         *bump = change > *bump ? change : *bump;

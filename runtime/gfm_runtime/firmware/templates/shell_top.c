@@ -3,6 +3,7 @@
 #include <float.h>
 #include <limits.h>
 #include <math.h> /* fabs, which is no call, and sqrt */
+#include <stdbool.h>
 
 #ifdef __FAST_MATH__
 #error "-ffast-math changes the results: compile without it, and with -ffp-contract=off"
@@ -39,6 +40,6 @@ static real limited(real value, real low, real high)
 /* 0 for what has decayed: subnormal numbers would take long on many processors. */
 static real faded(real value)
 {
-    return @fabs@(value) < @NEGLIGIBLE@ ? 0 : value;
+    return @fabs@(value) < @NEGLIGIBLE@ ? @0@ : value;
 }
 

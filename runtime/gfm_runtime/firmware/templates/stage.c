@@ -6,12 +6,13 @@ static void measure_frequency(@LAW@@P@_t *s, const real y[])
     real cosine = s->stage.pll[0], sine = s->stage.pll[1];
     real size = @sqrt@(v[0] * v[0] + v[1] * v[1]);
     real error = v[1] * cosine - v[0] * sine, h, a, b, turned, length;
-    if (size > @least_v@) /* else there is no voltage to follow */
+    if (size > @least_v@) { /* else there is no voltage to follow */
         error = error / size;
+    }
     s->stage.omega_pll += @T_k_pll@ * error;
     h = (s->stage.omega_pll + @k_pll@ * error - y[@GUARD@_Y_OMEGA_U]) * @half_turn@;
     /* times (1 + jh)/(1 - jh), whose modulus is 1; the root takes the rounding out */
-    a = 1 - h * h;
+    a = @1@ - h * h;
     b = h + h;
     turned = a * cosine - b * sine;
     sine = a * sine + b * cosine;
@@ -27,17 +28,21 @@ static real limit_power(@LAW@@P@_t *s, real p, real omega)
 {
     real over = p - @P_max@, under = @P_min@ - p, lower, raise;
     s->stage.x_high += @T_k_Pi@ * over;
-    if (s->stage.x_high < 0)
-        s->stage.x_high = 0;
+    if (s->stage.x_high < @0@) {
+        s->stage.x_high = @0@;
+    }
     s->stage.x_low += @T_k_Pi@ * under;
-    if (s->stage.x_low < 0)
-        s->stage.x_low = 0;
+    if (s->stage.x_low < @0@) {
+        s->stage.x_low = @0@;
+    }
     lower = @k_P@ * over + s->stage.x_high;
     raise = @k_P@ * under + s->stage.x_low;
-    if (lower > 0)
+    if (lower > @0@) {
         omega = omega - lower;
-    if (raise > 0)
+    }
+    if (raise > @0@) {
         omega = omega + raise;
+    }
     return limited(omega, @low_omega@, @high_omega@);
 }
 
@@ -49,8 +54,9 @@ static void limit_current(@LAW@@P@_t *s)
     real d = s->stage.i_ref[0], q = s->stage.i_ref[1];
     real size = d * d + q * q, most = @I_max@ * @I_max@;
     s->limited = size > most;
-    if (!s->limited)
+    if (!s->limited) {
         return;
+    }
     /* @if angle@ */
         d = @I_cos@;
         q = @I_sin@;
@@ -79,7 +85,7 @@ static void limit_current(@LAW@@P@_t *s)
 static void stator(@LAW@@P@_t *s, const tick_t *t, const real y[], real E_d, real E_q)
 {
     const real *v = &y[@GUARD@_Y_V_D];
-    real b = t->omega * @half_turn@, keep = 1 - @stator_a@, lose = 1 + @stator_a@;
+    real b = t->omega * @half_turn@, keep = @1@ - @stator_a@, lose = @1@ + @stator_a@;
     real d = s->stage.i_ref[0], q = s->stage.i_ref[1];
     real r_d = keep * d + b * q + @stator_b@ * (E_d - v[0]);
     real r_q = keep * q - b * d + @stator_b@ * (E_q - v[1]);
@@ -94,11 +100,12 @@ static void stator(@LAW@@P@_t *s, const tick_t *t, const real y[], real E_d, rea
 /* The voltage over the threshold impedance, 0 below the threshold. */
 static void drop(@LAW@const @P@_t *s, real omega, real over[])
 {
-    real d = s->stage.i_f[0], q = s->stage.i_f[1], R = 0, X = 0;
+    real d = s->stage.i_f[0], q = s->stage.i_f[1], R = @0@, X = @0@;
     /* @if threshold@ */
         real beyond = @sqrt@(d * d + q * q) - @I_thr@;
-        if (beyond < 0)
-            beyond = 0;
+        if (beyond < @0@) {
+            beyond = @0@;
+        }
         R = @k_thr@ * beyond;
         X = R * omega * @sigma@;
     /* @else@ */
@@ -126,7 +133,7 @@ static void voltage_loop(@LAW@@P@_t *s, const tick_t *t, const real y[], real E_
         s->stage.x_v[1] += @T_k_vi@ * error_q;
     }
     /* @if threshold@ */
-        s->limited = s->limited || over[0] != 0 || over[1] != 0;
+        s->limited = s->limited || over[0] != @0@ || over[1] != @0@;
     /* @end@ */
 }
 

@@ -7,21 +7,24 @@ static void settle_stage(@LAW@@P@_t *s, const real u[], const real y[], const re
     int k;
     s->limited = 0;
     s->stage.omega_pll = u[1];
-    s->stage.pll[0] = 1;
-    s->stage.pll[1] = 0;
+    s->stage.pll[0] = @1@;
+    s->stage.pll[1] = @0@;
     if (size > @least_v@) {
         s->stage.pll[0] = v[0] / size;
         s->stage.pll[1] = v[1] / size;
     }
-    s->stage.x_high = s->stage.x_low = 0;
+    s->stage.x_high = @0@;
+    s->stage.x_low = @0@;
     for (k = 0; k < 2; k++) {
         s->stage.v_f[k] = v[k];
-        s->stage.i_f[k] = s->stage.i_ref[k] = i[k];
-        s->stage.x_c[k] = s->stage.x_v[k] = 0;
+        s->stage.i_f[k] = i[k];
+        s->stage.i_ref[k] = i[k];
+        s->stage.x_c[k] = @0@;
+        s->stage.x_v[k] = @0@;
         s->stage.e[k] = e[k];
     }
     /* @if stage@ */
-        real X = u[1] * @L_f@, through_d, through_q, over[2] = {0, 0};
+        real X = u[1] * @L_f@, through_d, through_q, over[2] = {@0@, @0@};
         real lack_d = e[0] - v[0] + X * i[1], lack_q = e[1] - v[1] - X * i[0];
         /* @if integral@ */
             s->stage.x_c[0] = lack_d;

@@ -1,0 +1,95 @@
+"""What a model is to the controller's process, and how one is opened by its kind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.models.ports import PortMap
+
+KINDS = ("dll", "fmu")
+_LONGEST = 64  # of a name, see gfm_hil.engine.handshake
+
+
+class ModelError(Exception):
+    """A model fails while it runs; the message names it and says what it said."""
+
+
+class Model(Protocol):
+    """A controller that is not ours.
+
+    Attributes:
+        name: what the run calls it: 1 to 64 printable ASCII characters.
+    """
+
+    name: str
+
+    def start(self, u: NDArray[np.float64]) -> None:
+        """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
+
+        Raises:
+            ModelError: it refuses.
+        """
+
+    def tick(
+        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> None:
+        """One tick: u[k] from the references (5,) and the measurements, p.u.
+
+        Raises:
+            ModelError: it fails, or blocks the bridge.
+        """
+
+    def close(self) -> None:
+        """End it, and remove what it left."""
+
+
+def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model:
+    """The model ``KIND:FILE``, for a run with sampling time T_s [s].
+
+    Args:
+        text: ``dll:FILE`` or ``fmu:FILE``.
+        ports: which signal each of its ports is.
+        T_s: sampling time of the run, s.
+        inner: whether the run has an inner stage, so that y and u have its signals.
+
+    Raises:
+        UserError: there is no such file, it is no such model, or its ports do not fit.
+    """
+    kind, colon, file = text.partition(":")
+    if not colon or kind not in KINDS or not file:
+        raise UserError(f"controller {text!r}: must be dll:FILE or fmu:FILE")
+    path = Path(file).absolute()
+    if not path.is_file():
+        raise UserError(f"{file}: there is no such file")
+    if kind == "dll":
+        from gfm_hil.models.dll import DllModel
+
+        return DllModel(path, ports, T_s, inner)
+    from gfm_hil.models.fmu import FmuModel
+
+    return FmuModel(path, ports, T_s, inner)
+
+
+def run_name(kind: str, model: str) -> str:
+    """What a run calls a model, from what the model calls itself."""
+    plain = "".join(c if " " <= c <= "~" else "?" for c in f"{kind} {model}")
+    return plain[:_LONGEST].strip()
+
+
+def ticks_a_step(where: str, step_s: float, T_s: float) -> int:
+    """How many ticks of T_s [s] pass between two steps of a model.
+
+    Raises:
+        UserError: its step is not a whole number of ticks.
+    """
+    ticks = round(step_s / T_s) if step_s > 0 else 0
+    if ticks < 1 or abs(step_s - ticks * T_s) > 1e-6 * T_s:
+        raise UserError(
+            f"{where}: its step of {step_s:g} s must be a multiple of the run's T_s = {T_s:g} s"
+        )
+    return ticks

@@ -1,0 +1,125 @@
+"""A gain-scheduled law in C: its stages as modules, and one more that chooses between them.
+
+It has the functions of a law, so that a model for EMT programs or an FMU takes it as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+
+from gfm_runtime.assembly import X_MAX
+from gfm_runtime.catalogue import LawSet
+from gfm_runtime.firmware.c_text import chosen, filled, literal, plain, template
+from gfm_runtime.firmware.module import MADE, Module, Style, keys_of, make_modules, sources
+from gfm_runtime.impedance import COHERENT, EXCITATION, SETTLED, WASHOUT, X_MIN, make_impedance
+from gfm_runtime.impedance import SMOOTH as SMOOTHING
+
+
+def stage_names(laws: LawSet) -> list[str]:
+    """What the laws of a set are called, in their order."""
+    if laws.schedule is None:
+        return [laws.name]
+    return [f"{laws.name}[{k}]" for k in range(len(laws.laws))]
+
+
+def one_module(
+    laws: LawSet, T_s: float, real: str, omega_b: float
+) -> tuple[Module, dict[str, str]]:
+    """A law or a scheduled one as what has its name, with its sources in style unrolled.
+
+    Raises:
+        LawError: as ``make_modules``.
+    """
+    modules = make_modules(dict(zip(stage_names(laws), laws.laws, strict=True)), T_s, real, omega_b)
+    code = sources(modules, T_s, "unrolled")
+    if laws.schedule is None:
+        return modules[0], code
+    return whole(laws, modules), code | schedule_sources(laws, modules, T_s, omega_b, "unrolled")
+
+
+def whole(laws: LawSet, stages: Sequence[Module]) -> Module:
+    """What stands for a scheduled law's stages: it has their signals, and its own name."""
+    return replace(stages[0], name=laws.name)
+
+
+def schedule_sources(
+    laws: LawSet, stages: Sequence[Module], T_s: float, omega_b: float, style: Style
+) -> dict[str, str]:
+    """The header and the source that choose between stages, by file name.
+
+    Args:
+        laws: with a schedule.
+        stages: its laws as modules, in the same order.
+        T_s, omega_b: as for ``make_modules``.
+        style: of the modules.
+    """
+    schedule, m = laws.schedule, whole(laws, stages)
+    assert schedule is not None and m.law is not None
+    est = make_impedance(T_s, schedule.X_0, omega_b, schedule.X_f)[0]
+    X = [*sorted(stage.X for stage in schedule.stages)[:-1], X_MAX]
+    a, age = WASHOUT * est["T_s"], next(n for n in count(1) if n * (WASHOUT * T_s) > SETTLED)
+    choices = {"stages": m.stages}
+    own = style == "unrolled"
+    parts = [
+        (str(k), p.prefix if own else "gfm", "" if own else f"&{p.prefix}_law, ")
+        for k, p in enumerate(stages)
+    ]
+    e = ", e" * m.stages
+
+    def cases(text: str) -> str:
+        return "\n".join(
+            f"    case {k}:\n"
+            + "".join(
+                f"        {line}\n"
+                for line in text.format(s=f"s->stage_{k}", t=t, law=law, e=e).splitlines()
+            )
+            + "        break;"
+            for k, t, law in parts
+        )
+
+    def double(value: object) -> str:
+        return literal(value, np.dtype(np.float64))
+
+    copied = "(void)memcpy(trend, {s}.trend, sizeof {s}.trend);"
+    if m.stages:
+        copied += "\n(void)memcpy(e, {s}.stage.e, sizeof {s}.stage.e);"
+    first = parts[0][1]
+    keys = keys_of(m) | {
+        "MADE": MADE,
+        "LAW_NAME": plain(laws.name),
+        "SOURCE": plain(m.law.source),
+        "COUNT": str(len(stages)),
+        "FIRST": first,
+        "FIRST_GUARD": first.upper(),
+        "INCLUDES": "\n".join(f'#include "{p.prefix}.h"' for p in stages),
+        "MEMBERS": "\n".join(f"    {t}_t stage_{k};" for k, t, _ in parts),
+        "E_OUT": ", real e[]" * m.stages,
+        "E_MEMORY": ", e[2] = {0}" * m.stages,
+        "LOOK": cases("(void){t}_look({law}&{s}, ref, y, u);\n" + copied),
+        "SETTLE": cases("reason = {t}_settle({law}&{s}, ref, y, u, trend{e});"),
+        "INIT": "\n".join(f"    {t}_init(&s->stage_{k});" for k, t, _ in parts),
+        "RESET": cases("{t}_reset(&{s});"),
+        "STEP": cases("s->reason = {t}_step({law}&{s}, ref, y, u);"),
+        "SETTLED": str(age),
+        "DWELL": str(round(schedule.dwell_s / T_s)),
+        "START": str(int(np.searchsorted(X[:-1], schedule.X_0))),
+        "ABOVE": ", ".join(double(x * (1 + schedule.hysteresis)) for x in X),
+        "BELOW": ", ".join(double(x * (1 - schedule.hysteresis)) for x in X),
+        "X_0": repr(float(schedule.X_0)),
+        "X_f": double(est["X_f"]),
+        "X_MIN": double(X_MIN),
+        "COHERENT": double(COHERENT),
+        "EXCITATION": double(EXCITATION),
+        "a": double(a),
+        "b": double(SMOOTHING * est["T_s"]),
+        "T_omega": double(est["T_s"] * est["omega_b"]),
+        "forget": double(est["forget"]),
+    }
+    return {
+        f"{m.prefix}{end}": filled(chosen(template(f"schedule{end}"), choices), keys)
+        for end in (".h", ".c")
+    }
