@@ -78,9 +78,9 @@ def plant_ticks(sides, plant, last):
             gap = _await(sides, k, awaited, gap, spins, patience, repeat, hurried)
         why = Why.GO_ON
         for i in range(len(sides)):
-            why = _close(sides[i], plant, i, k, gap, hurried)
-            if why != Why.GO_ON:
-                break
+            said = _close(sides[i], plant, i, k, gap, hurried)
+            if why == Why.GO_ON:
+                why = said
         if why != Why.GO_ON:
             break
         if not delayed:
