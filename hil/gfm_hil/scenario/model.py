@@ -320,7 +320,9 @@ class Scenario(_Model):
                 own = self.of(name)
                 for key in ("link", "expect", "law", "inner"):
                     del member[key]
-                member["plant"]["converter"] = load_converter(own.plant.converter).model_dump()
+                if member["plant"] is not None:
+                    converter = load_converter(own.plant.converter)
+                    member["plant"]["converter"] = converter.model_dump()
                 member["laws"] = own.laws_digest()
         content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
         names = self.laws()
