@@ -47,8 +47,8 @@ class Share(NamedTuple):
     """What a role's loop has of one converter.
 
     Attributes:
-        crowded: there are more loops than processors. In real time this one then yields its
-            processor at every look, and in lockstep it sleeps soon.
+        crowded: there are more loops than processors: this one yields its processor at every
+            look, and in lockstep it sleeps soon.
     """
 
     bench: Bench
@@ -70,13 +70,12 @@ class _End:
         self.writer = FrameWriter("y" if plant else "u", bench.inner)
         self.reader = FrameReader.of(role, scenario)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
-        realtime = scenario.mode == "realtime"
         sleeps_soon = share.crowded and port.patient is not None
         self.loop["spin_limit"] = _SOON if sleeps_soon else port.spin_limit
         w, r = self.writer, self.reader
         end = LinkEnd(
             port.send, port.receive, port.patient or _rest, port.handle,
-            0 if share.crowded and realtime else port.spins,
+            0 if share.crowded else port.spins,
             (w.sequence, w.frame, w.message), (r.frame, r.message), r.record,
         )  # fmt: skip
         records = Records(
