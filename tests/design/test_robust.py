@@ -103,6 +103,7 @@ def test_gamma_and_delay_margin() -> None:
     assert delay_margin(LAW) >= 1e-3
 
 
+@pytest.mark.full
 def test_every_corner_decays() -> None:
     assert sigma(CONTROLLED.corners()).max() <= -1.0
     assert sigma(RIG.corners()).max() < 0.0  # stable, but slower: see docs/deployable.md

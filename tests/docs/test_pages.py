@@ -127,6 +127,7 @@ def test_committed_modes_over_the_delay_are_current(monkeypatch: pytest.MonkeyPa
         np.testing.assert_allclose(numbers(old), numbers(" ".join(new)), rtol=1e-3, atol=2.5)
 
 
+@pytest.mark.full
 @pytest.mark.timeout(600)
 def test_worked_example_of_a_tuning_says_what_the_page_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -113,6 +113,7 @@ def test_measures_a_controller_that_is_a_program(tmp_path: Path) -> None:
     assert Y_dd == pytest.approx(Y[0, 0, 0], rel=0.05)
 
 
+@pytest.mark.full
 def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--from", "100", "--to", "800", "--points", "4", "--settle", "1", "--grid", "5:10"]
     folder = tmp_path / "out"

@@ -128,6 +128,7 @@ def test_the_limit_cycle_of_the_rounded_output_fails_a_run_everywhere(tmp_path, 
             assert found["ripple_pu"]["p"] < 0.02
 
 
+@pytest.mark.full
 def test_a_comparison_says_which_law_oscillates(tmp_path, capsys):
     arguments = ["compare", "rig_pref_step", "--laws", "mimo-gfm,droop-5", "--link", "inproc"]
     assert main([*arguments, "--out", str(tmp_path / "out"), "--quiet"]) == 3
