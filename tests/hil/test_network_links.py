@@ -37,13 +37,18 @@ from ..support.processes import (
     wait_for,
 )
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.timeout(400)]  # the first one compiles
+
+
+def over(link: str, patience_s: float = 30.0) -> dict[str, Any]:
+    """A link whose peers may be slow: the machine may be busy."""
+    return {"type": link, "peer_timeout_s": patience_s}
 
 
 def content(**changes: Any) -> dict[str, Any]:
     """Two converters that feed a load."""
     made: dict[str, Any] = {
-        "title": "two", "duration": 0.5, "law": "droop-3", "link": {"type": "shm"},
+        "title": "two", "duration": 0.5, "law": "droop-3", "link": over("shm"),
         "references": {"P_ref": 0.3},
         "network": {
             "converters": {"A": {"node": "bus", "law": "vsg-2"}, "B": {"node": "bus"}},
@@ -89,7 +94,7 @@ def started(folder: Path, given: dict[str, Any]) -> Iterator[subprocess.Popen[st
 def test_over_links_a_run_is_that_in_process(link: str, tmp_path: Path) -> None:
     """Over two links at a time, and with a trip on the way, after which the other goes on."""
     trip = {"plant": {"protection": {"over_current": {"threshold": 0.4, "delay_s": 0.01}}}}
-    members = with_members(A={"link": {"type": link}}, B={**trip, "expect": "tripped"})
+    members = with_members(A={"link": over(link)}, B={**trip, "expect": "tripped"})
     given = load_scenario(content(network=members))
     found = run_network(given, tmp_path / "run", figures=False)
     memory = gfmhil.run_network(given)
@@ -106,7 +111,7 @@ def test_over_links_a_run_is_that_in_process(link: str, tmp_path: Path) -> None:
 
 def test_a_controller_that_is_killed_trips_its_converter_and_no_other(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    with started(folder, content(duration=150.0)) as process:
+    with started(folder, content(duration=150.0, link=over("shm", 3.0))) as process:
         os.kill(roles_of(folder / "B")["controller"], signal.SIGKILL)
         lost = wait_for(lambda: log_of_plant(folder / "B", "end"), process)
         before = int(lost[0]["tick"])
@@ -135,7 +140,7 @@ def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_pat
     folder = tmp_path / "run"
     patient = {"hold": 10**6}
     given = content(
-        duration=60.0, mode="realtime", link={"type": "shm", "peer_timeout_s": 30.0}, events=[],
+        duration=60.0, mode="realtime", link=over("shm"), events=[],
         network=with_members(A={"late_policy": patient}, B={"late_policy": {"hold": 3000}}),
     )  # fmt: skip
     with started(folder, given) as process:
@@ -192,7 +197,7 @@ def by_hand(tmp_path: Path, file: Path, *more: str) -> dict[str, subprocess.Pope
 
 def test_roles_started_by_hand_meet(tmp_path: Path) -> None:
     file = tmp_path / "two.toml"
-    file.write_text(toml_text(content(link={"type": "zmq"}, duration=0.3)), "utf-8")
+    file.write_text(toml_text(content(link=over("zmq"), duration=0.3)), "utf-8")
     ended = {name: end(process) for name, process in by_hand(tmp_path, file).items()}
     assert {name: code for name, (code, *_) in ended.items()} == {"plant": 0, "A": 0, "B": 0}
     merge_roles(tmp_path / "plant" / "B", tmp_path / "B", tmp_path / "whole")
@@ -203,7 +208,7 @@ def test_roles_started_by_hand_meet(tmp_path: Path) -> None:
 
 def test_a_controller_of_another_scenario_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "two.toml"
-    file.write_text(toml_text(content(link={"type": "zmq"})), "utf-8")
+    file.write_text(toml_text(content(link=over("zmq", 3.0))), "utf-8")
     processes = by_hand(tmp_path, file, "--seed", "7")
     _, out, _ = end(processes["plant"])
     end(processes["A"]), end(processes["B"])
@@ -230,7 +235,7 @@ def test_what_is_wrong_is_said_before_anything_starts(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "two.toml"
-    file.write_text(toml_text(content(link={"type": "zmq"})), "utf-8")
+    file.write_text(toml_text(content(link=over("zmq"))), "utf-8")
     command, *more = words
     assert main([command, str(file), "--out", str(tmp_path / "x"), *more]) == 2
     said = capsys.readouterr().err

@@ -50,8 +50,6 @@ def plant_ticks(sides, plant, last):
         own = sides[i].records.loop[0]
         spins = min(spins, sides[i].end.spins)
         patience, repeat = min(patience, own.patience), min(repeat, own.repeat)
-    if r.others != 0:  # before the other controllers miss the plant, which waits for one
-        patience //= 2
     delayed = plant_is_delayed(plant)
     # In lockstep a delayed plant sends its next frame right after an answer, so one reading of the
     # clock serves both. A reading stalls the processor: two of them took a tenth of the tick.
