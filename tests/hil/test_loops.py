@@ -313,7 +313,7 @@ def test_silence_of_the_other_role_ends_either(role, mode, place, make):
 
 
 @pytest.mark.parametrize("link", PORTS)
-@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+@pytest.mark.parametrize("mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.alone)])
 def test_the_stop_flag_ends_both(mode, link, place, make):
     begin = time.monotonic()
     content = {"mode": mode, "law": "vsg-2", "duration": 200.0, "link": LIVE}
