@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder, progress
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
+from gfm_hil.realtime.priority import processors
 from gfm_hil.results.runner import Notice
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
@@ -57,7 +57,7 @@ def call(options: argparse.Namespace) -> int:
         return _only(options, campaign)
     store_at = new_folder(options.out, campaign.name)
     with contextlib.ExitStack() as stack:
-        executor, workers = None, options.workers or len(os.sched_getaffinity(0))
+        executor, workers = None, options.workers or processors()
         if options.dask:  # before anything is written
             executor, workers = stack.enter_context(cluster(options.dask, campaign))
         store = Store(store_at, campaign, options.resume)

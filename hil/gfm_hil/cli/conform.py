@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_fold
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.realtime.priority import processors
 from gfm_hil.studies.campaign.execute import WorkerLost
 from gfm_hil.studies.conformity.execute import Found, execute, make_jobs
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS
@@ -85,7 +85,7 @@ def call(options: argparse.Namespace) -> int:
     )
     found: list[Found] = []
     lost = None
-    workers = options.workers or len(os.sched_getaffinity(0))
+    workers = options.workers or processors()
     columns = BarColumn(), TaskProgressColumn(), "{task.fields[at]}", TimeRemainingColumn()
     began = time.monotonic()
     with Interrupt() as interrupt, progress("{task.description}", *columns,
