@@ -120,9 +120,11 @@ def test_p_and_q(device, run):
 
 
 def test_a_set_point_reverts(device, run):
+    before = len(settled(run))
     write(device, 704, WSetRvrtTms=1, WSetEna=1, WSet=3200)
-    assert read(device, 704, "WSetRvrtRem") == 1
-    wait_for(lambda: last(run)["ref_P_ref"] == 0.8)
+    wait_for(lambda: any("name" in line["operator"] for line in told(run)[before:]))
+    labels = [line["label"] for line in told(run)[before:]]
+    assert "P_ref = 0.8" in labels and labels[-1] == "P_ref = 0.5"
     wait_for(lambda: last(run)["ref_P_ref"] == 0.5)
     wait_for(lambda: read(device, 704, "WSetEna") == 0)  # once the run has answered the server
     write(device, 704, WSetRvrtTms=0)
