@@ -119,7 +119,7 @@ def test_the_headers_folder_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 def run(tmp_path: Path, model: Path, scenario: str, *options: str) -> Run:
     folder = tmp_path / "run"
-    command = ["run", scenario, "--link", "shm", "--mode", "lockstep", "--out", str(folder)]
+    command = ["run", scenario, "--link", "shm", "--out", str(folder)]
     command += ["--controller", f"c:{model}", "--inner", "cascaded", "--quiet", "--no-figures"]
     code = main([*command, *options])
     found = Run.load(folder)
@@ -147,7 +147,7 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_example_holds_the_plant(
     example: Path, scenario: str, p_end: float, tmp_path: Path
 ) -> None:
-    found = run(tmp_path, example, scenario)
+    found = run(tmp_path, example, scenario, "--mode", "lockstep")
     p, i = found.columns["true_p"][:], found.columns["true_i"][:]
     first = found.scenario.sorted_events()[0].at(found.scenario.T_s)
     assert found.summary["status"] == "completed"
@@ -185,6 +185,20 @@ def test_a_library_that_fails_is_named_and_the_run_is_kept(
     if what != "start":
         assert found.summary["ticks"] >= 100
         assert np.ptp(found.columns["true_p"][:100]) < 0.05  # a voltage that turns: at rest
+
+
+@pytest.mark.apt
+def test_in_real_time_a_library_that_takes_too_long_ends_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
+    monkeypatch.setenv("FOREIGN_WHAT", "slow")
+    late = {"mode": "realtime", "T_s": 1e-3, "late_policy": {"hold": 50}, "duration": 5.0}
+    link = {"type": "shm", "peer_timeout_s": 20.0}
+    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2", link=link, **late))
+    reason = "no fresh u for longer than late_policy.hold allows"
+    assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
+    assert found.summary["misses"] >= 50
 
 
 @pytest.mark.apt

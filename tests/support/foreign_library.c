@@ -1,5 +1,6 @@
 /* A controller library that misbehaves at its step AT in the way that FOREIGN_WHAT names; until then
  * it leaves the bridge's voltage turning at the nominal speed. */
+#define _DEFAULT_SOURCE
 #include "gfmhil_controller.h"
 
 #include <math.h>
@@ -50,6 +51,8 @@ int gfmhil_step(void *self, const gfmhil_input *in, gfmhil_output *out)
     if (!strcmp(what, "hang"))
         for (;;)
             sleep(1);
+    if (!strcmp(what, "slow"))
+        usleep(500000);
     if (!strcmp(what, "nan"))
         out->e[1] = NAN;
     return strcmp(what, "fault") ? 0 : 7;
