@@ -338,8 +338,12 @@ class Load(Options):
     frequency; without Q a resistor."""
 
     node: str = Field(min_length=1, description="where it is")
-    P: NonNegative = Field(description="active power at nominal voltage, p.u. of the first converter")
-    Q: NonNegative = Field(0.0, description="reactive power at nominal voltage, p.u. of the first converter")
+    P: NonNegative = Field(
+        description="active power at nominal voltage, p.u. of the first converter"
+    )
+    Q: NonNegative = Field(
+        0.0, description="reactive power at nominal voltage, p.u. of the first converter"
+    )
     closed: bool = Field(True, description="whether its breaker is closed when the run begins")
 
     @model_validator(mode="after")
