@@ -56,7 +56,7 @@ def _line(error: Any, model: Any) -> str:
         *parents, last = error["loc"]
         known = _fields(model, parents)
         close = meant(last, known)
-        allowed = "" if close or not known else f"; allowed are {', '.join(sorted(known))}"
+        allowed = "" if close or not known else f"; use one of {', '.join(sorted(known))}"
         return f"{path} = {shown}: unknown key{close}{allowed}"
     if error["type"] in ("model_type", "dict_type", "model_attributes_type"):
         models = _models_at(model, error["loc"])

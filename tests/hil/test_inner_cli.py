@@ -120,7 +120,7 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
             "inner.type = 'stator': must be one of 'virtual-stator', 'cascaded',",
         ),
         ('{type = "virtual-stator", X_v = 0.0}', "inner.X_v: 0.0 must be > 0"),
-        ('{type = "virtual-stator", I_thr = 1.0}', "inner.virtual-stator.I_thr = 1.0: unknown key"),
+        ('{type = "virtual-stator", I_thr = 1.0}', "inner.I_thr = 1.0: unknown key"),
         (
             '{type = "cascaded", priority = "e"}',
             "priority: must be 'circular', 'd', 'q' or",
