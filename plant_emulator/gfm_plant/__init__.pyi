@@ -17,13 +17,14 @@ from .grid import (
     grid_unbalance,
     grid_voltage,
     phase_jump,
+    start_again,
     take_out,
 )
 from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .network import Network
 from .options import NetworkParts, Plant
 from .parameters import ConverterParameters, load_converter
-from .protection import trip_reason
+from .protection import trip_reason, wait_reason
 from .records import PlantRecords
 from .sensors import plant_sample
 from .steady_state import NoEquilibrium, plant_equilibrium
@@ -59,6 +60,8 @@ __all__ = [
     "plant_sample",
     "plant_step",
     "plant_truth",
+    "start_again",
     "take_out",
     "trip_reason",
+    "wait_reason",
 ]

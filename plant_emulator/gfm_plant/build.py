@@ -100,10 +100,12 @@ def make_network(
     banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
     opened = {name for name, line in parts.lines.items() if not line.closed}
     opened |= {name for name, load in parts.loads.items() if not load.closed}
-    return _make(
+    network = _make(
         converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks,
         frozenset(opened), parts.machines,
     )  # fmt: skip
+    network.net["joins"] = 1
+    return network
 
 
 def _make(

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gfm_plant.emulator import reconnect
+from gfm_plant.emulator import reconnect, synchronise
 from gfm_plant.model import DELTA
 from gfm_plant.network import Network
 from gfm_plant.wiring import FaultPlace
@@ -251,11 +251,25 @@ def line_breaker(plant: Network, name: str, closed: bool) -> None:
 def take_out(plant: Network) -> None:
     """Make the circuits for the next trip, after one of several converters has tripped."""
     row = int(plant.now[0]["row"])
-    if row == 0 or len(plant.par) == 1:
+    if row == 0 or not plant.net[0]["joins"]:
         return
     out = plant.wiring.blocked | {row - 1}
     plant.now["row"] = 0
     plant.rewire(replace(plant.wiring, blocked=out))
+
+
+def start_again(plant: Network, k: int) -> None:
+    """Start the bridge of a converter of a network that has tripped, on the voltage of its
+    capacitor.
+
+    Its protection's trip is cleared. The others go on.
+
+    Args:
+        plant: a network, after `take_out`.
+        k: index of the converter, whose `protection.start_condition` is MAY_START.
+    """
+    plant.rewire(replace(plant.wiring, blocked=plant.wiring.blocked - {k}))
+    synchronise(plant.records, k)
 
 
 def _grid_source(plant: Network) -> int:

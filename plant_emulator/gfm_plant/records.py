@@ -157,6 +157,10 @@ converter_state_dtype = np.dtype(
         ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
         ("trip_tick", "i8"),
         ("trip_value", "f8"),
+        # of a bridge that is to start again, see `protection.start_condition`; the speed of the
+        # capacitor's voltage that a blocked one sees
+        ("waits", "i8"),
+        ("omega_seen", "f8"),
     ],
     align=True,
 )
@@ -177,6 +181,7 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
     par = np.dtype(
         [
             ("omega_b", "f8"),  # rad/s
+            ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
             # swing equations and governors, on their own ratings (H = 0: an ideal grid); their
             # ratings over the network's
             ("n_machines", "i8"),

@@ -11,7 +11,7 @@ several, a controller that leaves or falls silent trips its converter, and the o
 from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, Why
-from gfm_hil.engine.tick import obey, sample, take
+from gfm_hil.engine.tick import asks_to_start, obey, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
@@ -277,6 +277,8 @@ def _judge(side, plant, i, why):
     elif r.goes_on and reader[0].e2e == INVALID:
         trip(plant, i, CONTROLLER, NOT_HEARD)
     if plant.st[i].trip != r.tripped:
+        return Why.CHANGED
+    if r.lost == 0 and asks_to_start(plant, i, reader[0].state):
         return Why.CHANGED
     if r.late * r.T >= r.patience:
         judge(reader, True, True)

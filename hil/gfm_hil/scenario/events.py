@@ -117,9 +117,11 @@ class Gains(_Event):
 
 
 class Reset(_Event):
-    """Return from a trip or the safe state to the scenario's start, for runs that wait there."""
+    """Return from a trip or the safe state to the scenario's start, for runs that wait there. A
+    converter of a network starts again in the network as it is by then."""
 
     type: Literal["reset"] = Field(description="kind of event")
+    converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
         return "reset"

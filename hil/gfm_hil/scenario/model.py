@@ -209,7 +209,8 @@ class Scenario(_Model):
     after_trip: Literal["end", "wait"] = Field(
         "end",
         description="wait: a trip or a safe state does not end the run; the plant stays blocked "
-        "until an event, or an operator, resets both sides to the scenario's start",
+        "until an event, or an operator, resets both sides to the scenario's start; of a network "
+        "the converter that tripped waits for its reset",
     )
     prevent_idle: Literal["auto", "always", "never"] = Field(
         "auto",
@@ -412,8 +413,6 @@ class Scenario(_Model):
                     f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
                     f"{meant(asked, self.converters)}"
                 )
-        if self.network is not None and self.after_trip == "wait":
-            problems.append("after_trip = 'wait': a network has no reset yet; use 'end'")
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
         problems += self._wrong_links()
