@@ -34,6 +34,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "conformity-criteria": conformity_pages.criteria,
     "inner-keys": scenario_pages.inner_tables,
     "network-keys": scenario_pages.network_tables,
+    "check-keys": scenario_pages.check_table,
     "law-keys": scenario_pages.law_tables,
     "law-mistakes": outputs.mistakes,
     "scenario-keys": scenario_pages.scenario_tables,

@@ -170,6 +170,58 @@ def _find_modes(
     return Modes(rates, states, modes, drive)
 
 
+def find_voltage(
+    node: str,
+    branches: Sequence[Branch],
+    capacitors: Sequence[Capacitor],
+    sources: Sequence[Source],
+    order: Sequence[str],
+    shunts: Sequence[Shunt] = (),
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the voltage of a node as factors of w, (n_w,), and of the sources, (n_s,).
+
+    That of a node where branches alone meet is the one under which their currents go on adding up
+    to nothing: with D for which branches meet where, D L^-1 D' v = D L^-1 (R i - what the other
+    ends give).
+
+    Args:
+        branches, capacitors, sources, order, shunts: as for ``find_modes``.
+    """
+    charged = {part.node: order.index(part.name) for part in capacitors}
+    fixed = _places("source", sources)
+    through = {shunt.node: shunt.R for shunt in shunts}
+    n_w, n_s = len(order), len(sources)
+    ends = [end for branch in branches for end in (branch.start, branch.end)]
+    known = {GROUND, *charged, *fixed, *through}
+    free = [one for one in dict.fromkeys(ends) if one not in known]
+    rows: dict[str, NDArray[np.float64]] = {GROUND: np.zeros(n_w + n_s)}
+    for one, place in charged.items():
+        rows[one] = np.eye(n_w + n_s)[place]
+    for one, place in fixed.items():
+        rows[one] = np.eye(n_w + n_s)[n_w + place]
+    for one in through:
+        if one not in rows:
+            rows[one] = np.zeros(n_w + n_s)
+            for branch in branches:
+                if one in (branch.start, branch.end):
+                    sign = 1.0 if branch.end == one else -1.0
+                    rows[one][order.index(branch.name)] = sign * through[one]
+    if node in rows:
+        return rows[node][:n_w], rows[node][n_w:]
+    D = np.zeros((len(free), len(branches)))
+    right = np.zeros((len(branches), n_w + n_s))
+    for j, branch in enumerate(branches):
+        right[j, order.index(branch.name)] = branch.R
+        for end, sign in ((branch.start, 1.0), (branch.end, -1.0)):
+            if end in rows:
+                right[j] -= sign * rows[end]
+            else:
+                D[free.index(end), j] = sign
+    DL = D / [branch.L for branch in branches]
+    found = np.linalg.lstsq(DL @ D.T, DL @ right, rcond=None)[0][free.index(node)]
+    return found[:n_w], found[n_w:]
+
+
 def _places(kind: str, parts: Sequence[Source | Capacitor]) -> dict[str, int]:
     """Index of the part at each node."""
     found: dict[str, int] = {}

@@ -33,6 +33,7 @@ from gfm_plant.solution import (
     read_states,
     state,
 )
+from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
@@ -148,6 +149,8 @@ def plant_step(plant: PlantRecords) -> None:
             now.unbalance_left = now.sequence[0, 1] = 0.0
             now.sequence[1, 0] = now.sequence[1, 1] = 0.0
             now.sequence[0, 0] = 1.0
+    if now.check == WATCHING:
+        watch(plant)
     if now.faulted:
         now.fault_left -= n.T_s
         if now.fault_left < 0.5 * n.T_s:

@@ -64,15 +64,18 @@ class Network:
         self.wiring = kept.wiring
 
     def start(
-        self, x: NDArray[np.float64], u: NDArray[np.float64], machines: Sequence[float] = ()
+        self,
+        x: NDArray[np.float64],
+        u: NDArray[np.float64],
+        machines: Sequence[tuple[float, float]] = (),
     ) -> None:
         """Put a plant fresh from `make_plant` into an equilibrium.
 
         Args:
             x: states of each converter, (N, 8); (8,) for one.
             u: its commands, (N, 4); for one also (4,), or (3,) without the q component of the
-                bridge's voltage. All turn at the speed of the grid.
-            machines: angle of each machine's voltage, rad.
+                bridge's voltage. What closed lines connect turns at one speed.
+            machines: angle of each machine's voltage, rad, and its speed, p.u.
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
         u = np.pad(u, ((0, 0), (0, N_COMMANDS - u.shape[1])))
@@ -83,16 +86,22 @@ class Network:
         volts = {
             unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(self.wiring.units)
         }
-        volts[GRID_SOURCE] = complex(now["V_g"])
-        for j, (machine, angle) in enumerate(zip(self.wiring.machines, machines, strict=True), 1):
+        turns = {unit.bridge: float(u[k, 1]) for k, unit in enumerate(self.wiring.units)}
+        volts[GRID_SOURCE], turns[GRID_SOURCE] = complex(now["V_g"]), float(now["omega_g"])
+        for j, (machine, (angle, omega)) in enumerate(
+            zip(self.wiring.machines, machines, strict=True), 1
+        ):
             unit = np.exp(1j * angle)
             now["unit"][N + 1 + j] = unit.real, unit.imag
-            now["omega"][j] = u[0, 1]
+            now["omega"][j] = turns[machine.emf] = omega
             volts[machine.emf] = float(self.net[0]["E"][j]) * unit
-        if self.net[0]["reference"]:
-            now["omega_g"] = u[0, 1]
-        speed = float(self.net[0]["omega_b"]) * (u[0, 1] - 1.0)
-        z = modes.drive @ [volts[name] for name in sources] / (1j * speed - modes.rates)
+        if reference := int(self.net[0]["reference"]):
+            now["omega_g"] = now["omega"][reference]
+        z = np.zeros(len(modes.rates), complex)
+        for omega in {turns[name] for name in sources}:
+            speed = float(self.net[0]["omega_b"]) * (omega - 1.0)
+            those = [volts[name] if turns[name] == omega else 0.0 for name in sources]
+            z += modes.drive @ those / (1j * speed - modes.rates)
         w = modes.states @ z
         for k, row in enumerate(x):  # as they are given: all digits
             i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))
@@ -138,11 +147,12 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():
         net["to_grid"][0, order.index(name)] = factor
-    found = {}
+    found, which = {}, {}
     for k in range(N + 1):
-        blocked = wiring.blocked | ({k - 1} if k > 0 else set())
+        blocked = frozenset(wiring.blocked | ({k - 1} if k > 0 else set()))
         for fault in (False, True) if wiring.fault else (False,):
-            found[k + (N + 1) * fault] = wiring.modes(frozenset(blocked), fault)
+            which[k + (N + 1) * fault] = blocked, fault
+            found[k + (N + 1) * fault] = wiring.modes(blocked, fault)
     _pack_pieces(records, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     running = [j for j, m in enumerate(wiring.machines, 1) if m.name not in wiring.opened]
     net["reference"] = running[0] if running and wiring.grid is None else 0
@@ -151,6 +161,7 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
     for j, machine in enumerate(wiring.machines, 1):
         places[machine.emf] = (N + 1 + j,)
         net["current_at"][0, j] = order.index(machine.name)
+    net["check_w"] = net["check_s"] = 0.0
     parts = int(net[0]["n_parts"])
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][0, circuit] = len(modes.rates)
@@ -163,6 +174,14 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
         for j, source in enumerate(sources):
             for place in places[source]:
                 _set(net["drive"][0, circuit, :n, place], modes.drive[:, j])
+        for side, node in enumerate(wiring.check.sides if wiring.check else ()):
+            if node == GRID_SOURCE:
+                net["check_s"][0, circuit, side, N] = 1.0
+                continue
+            by_w, by_s = wiring.voltage(node, *which[circuit])
+            net["check_w"][0, circuit, side, : len(order)] = by_w
+            for factor, source in zip(by_s, sources, strict=True):
+                net["check_s"][0, circuit, side, places[source][0]] = factor
 
 
 def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:

@@ -214,6 +214,12 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("drive", "f8", (n_c, n_w, n_s, 2)),
             ("states", "f8", (n_c, n_w, n_w, 2)),
             ("modes", "f8", (n_c, n_w, n_w, 2)),
+            # of a synchro-check: the voltages of its two sides by w and by the sources; the largest
+            # difference of voltage, p.u., speed, rad/s, and angle, rad; how long, and until when, s
+            ("check_w", "f8", (n_c, 2, n_w)),
+            ("check_s", "f8", (n_c, 2, n_s)),
+            ("check_limits", "f8", (3,)),
+            ("check_lasting", "f8"),
         ],
         align=True,
     )
@@ -259,6 +265,14 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("omega", "f8", (n_swing,)),  # of the machines; that of the grid is omega_g
             ("slope", "f8", (n_swing,)),
             ("brought", "f8", (n_swing,)),
+            # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
+            # `check_limits`, for how long they have been within, and the time that is left, s;
+            # ticks in a row in which both sides were alive
+            ("check", "i8"),
+            ("check_looks", "i8"),
+            ("check_seen", "f8", (3,)),
+            ("check_lasted", "f8"),
+            ("check_left", "f8"),
         ],
         align=True,
     )

@@ -8,7 +8,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_plant.circuit import (
+    GROUND,
+    Branch,
+    Capacitor,
+    Modes,
+    Shunt,
+    Source,
+    find_modes,
+    find_voltage,
+)
 
 GRID_SOURCE = "grid"
 
@@ -89,6 +101,19 @@ class FaultPlace:
 
 
 @dataclass(frozen=True)
+class Check:
+    """The synchro-check of an open breaker.
+
+    Attributes:
+        name: of the breaker; "" for that of the grid.
+        sides: the nodes at its two ends, or GRID_SOURCE for the grid itself.
+    """
+
+    name: str
+    sides: tuple[str, str]
+
+
+@dataclass(frozen=True)
 class Wiring:
     """The connections of a plant.
 
@@ -104,6 +129,7 @@ class Wiring:
         opened: names of branches whose breakers are open.
         fault: where one is, or may be again, or None.
         blocked: indices of converters whose bridges are out of every circuit.
+        check: the synchro-check that waits to close a breaker, or None.
     """
 
     omega_b: float
@@ -117,6 +143,7 @@ class Wiring:
     opened: frozenset[str] = frozenset()
     fault: FaultPlace | None = None
     blocked: frozenset[int] = frozenset()
+    check: Check | None = None
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -178,6 +205,24 @@ class Wiring:
                 found[branch.name] = 1.0 if branch.end == self.grid else -1.0
         return found
 
+    def islands(self) -> list[tuple[str, ...]]:
+        """The nodes in groups that closed lines connect, each in the order of ``nodes``."""
+        groups = {node: {node} for node in self.nodes}
+        for line in self.branches:
+            if line.end != GROUND and line.name not in self.opened:
+                both = groups[line.start] | groups[line.end]
+                groups.update(dict.fromkeys(both, both))
+        each = (tuple(n for n in self.nodes if n in groups[node]) for node in self.nodes)
+        return list(dict.fromkeys(each))
+
+    def breakers(self) -> dict[str, tuple[str, str, str]]:
+        """By the name that people use: the branch or shunt that a breaker opens, and the nodes at
+        its two ends."""
+        found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
+        lines = (*self.branches, *self.machine_branches)
+        found |= {b.name: (b.name, b.start, b.end) for b in lines}
+        return found | {shunt.name: (shunt.name, shunt.node, GROUND) for shunt in self.shunts}
+
     def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
         """The modes of a circuit, and the names of its sources in their order.
 
@@ -188,6 +233,38 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
+        branches, capacitors, sources, shunts, _ = self._circuit(blocked, faulted)
+        modes = find_modes(branches, capacitors, sources, self.omega_b, self.order, shunts)
+        return modes, [source.name for source in sources]
+
+    def voltage(
+        self, node: str, blocked: frozenset[int], faulted: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The voltage of a node in a circuit as factors of w and of the sources, see
+        ``find_voltage``; of a node where no current can flow, that of what it hangs on.
+
+        Args:
+            blocked, faulted: as for ``modes``.
+        """
+        branches, capacitors, sources, shunts, hanging = self._circuit(blocked, faulted)
+        there = {end for branch in branches for end in (branch.start, branch.end)}
+        there |= {part.node for part in (*capacitors, *sources)}
+        seen, reached = {node}, [node]
+        while reached:
+            here = reached.pop(0)
+            if here in there or here == GROUND:
+                return find_voltage(here, branches, capacitors, sources, self.order, shunts)
+            for branch in hanging:
+                if here in (branch.start, branch.end):
+                    other = branch.end if branch.start == here else branch.start
+                    reached += [other] if other not in seen else []
+                    seen.add(other)
+        return np.zeros(len(self.order)), np.zeros(len(sources))
+
+    def _circuit(
+        self, blocked: frozenset[int], faulted: bool
+    ) -> tuple[list[Branch], list[Capacitor], list[Source], list[Shunt], list[Branch]]:
+        """The parts of a circuit, and the branches that an open breaker has left hanging."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         if faulted and self.fault is not None:
@@ -208,13 +285,15 @@ class Wiring:
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
             sources.append(Source(GRID_SOURCE, self.grid))
+        hanging: list[Branch] = []
         if self.opened or not self.closed:
+            whole = branches
             held = {GROUND} | {c.node for c in capacitors} | {s.node for s in shunts}
             branches = _without_ends(branches, held | {source.node for source in sources})
             met = {node for branch in branches for node in (branch.start, branch.end)}
             shunts = [s for s in shunts if s.node in met]
-        modes = find_modes(branches, capacitors, sources, self.omega_b, self.order, shunts)
-        return modes, [source.name for source in sources]
+            hanging = [branch for branch in whole if branch not in branches]
+        return branches, capacitors, sources, shunts, hanging
 
     def _whole(self, branches: Sequence[Branch]) -> Iterator[Branch]:
         """Those that are closed; a split one as two."""

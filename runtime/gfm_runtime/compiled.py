@@ -11,10 +11,10 @@ has not changed. But a compiled function contains its callees, which are in othe
 update, a stale one would compute something else without a word. Here any change of any of our
 compiled code makes all of it compile again.
 
-numba names a compiled function by its arguments, and a record among them by a number that counts the
-types of the process. The records of two sizes of plants, compiled by two processes, could so have one
-name: a third process that loads both would call either for both. Here a record is named by what it
-holds.
+numba names a compiled function by its arguments, and a record among them by a number that counts
+the types of the process. The records of two sizes of plants, compiled by two processes, could so
+have one name: a third process that loads both would call either for both. Here a record is named by
+what it holds.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from gfm_hil.engine.loop_records import (
 )
 from gfm_hil.engine.plant_ticks import plant_ticks
 from gfm_hil.engine.setup import Bench, follow_trips
-from gfm_hil.engine.timeline import Timeline
+from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.engine.waiting import part_from
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
@@ -131,6 +131,7 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
             first.keep_u(bench.u)
         for started in follow_trips(bench.plant):
             ends[started].keep_u(bench.plant.st["u"][started, 0, : len(bench.u)])
+        report_check(bench.plant, timelines, tick)
         for timeline in timelines:
             timeline.look(max(tick - 1, 0))
             if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):

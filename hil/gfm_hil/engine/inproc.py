@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gfm_hil.engine.loop_records import ControllerRecords, Why
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, asks_to_start, obey, sample, take
-from gfm_hil.engine.timeline import Timeline
+from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.recording.columns import (
     CONTROLLER_TIMES,
     PLANT_TIMES,
@@ -24,6 +24,7 @@ from gfm_hil.recording.columns import (
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_is_delayed, plant_step
+from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
 
@@ -97,7 +98,7 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, go
         for i in range(len(ctl)):
             trips -= st[i].trip
             changed = asks_to_start(plant, i, ctl[i].state) or changed
-        if changed or trips != 0:
+        if changed or trips != 0 or plant.now[0].check > WATCHING:
             return k + 1
     return stop
 
@@ -157,6 +158,7 @@ def run_inproc(
             follow_trips(bench.plant)
         elif int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
             bench.restore_plant(k)
+        report_check(bench.plant, timelines, k)
         for timeline in timelines:
             timeline.look(k - 1)
         if not go_on(k):

@@ -26,6 +26,7 @@ from gfm_plant import plant_is_delayed, plant_step
 from gfm_plant.names import CONTROLLER, GONE, LEFT
 from gfm_plant.names import SILENT as NOT_HEARD
 from gfm_plant.protection import trip
+from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import PLANT_TRIP, SAFE
 
@@ -85,6 +86,8 @@ def plant_ticks(sides, plant, last):
             plant_step(plant)
         for i in range(len(sides)):
             why = _judge(sides[i], plant, i, why)
+        if why == Why.GO_ON and plant.now[0].check > WATCHING:
+            why = Why.CHANGED
         if why != Why.GO_ON:
             break
         why = Why.DONE

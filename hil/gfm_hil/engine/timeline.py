@@ -32,7 +32,7 @@ from gfm_hil.scenario.events import (
     nominal_hz,
 )
 from gfm_hil.scenario.profiles import Point, read_profile
-from gfm_plant import trip_reason, wait_reason
+from gfm_plant import Checked, Network, finish_check, trip_reason, wait_reason
 from gfm_plant.names import CONTROLLER, NOT_ASKED
 from gfm_runtime.signals import carried
 from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
@@ -210,6 +210,20 @@ class Timeline:
             return "tripped" if heard else "safe", safe_reason(ctl)
         return ("safe", trip_reason(self._bench.plant.records, self._bench.place)) if trip else None
 
+    def checked(self, found: Checked, tick: int) -> None:
+        """Log how a synchro-check has ended."""
+        kind = "breaker" if found.name else "grid-breaker"
+        name, f_b = found.name or "grid breaker", nominal_hz(self._bench.plant)
+        said = (
+            f"dV = {found.V:.4f} p.u., df = {found.omega * f_b:.4f} Hz, dphi = {found.degrees:.2f}"
+            " degrees"
+        )
+        if found.closed:
+            self.write(tick, kind, label=f"{name} on, synchronous", found=said)
+        else:
+            refused = f"the sides did not agree in time: {said}"
+            self.write(tick, kind, label=f"{name} stays off", refused=refused)
+
     def finish(self, tick: int) -> None:
         """The scenario is over: the run is complete unless it still waits for a reset."""
         self.end(*(self._fault or ("completed", "")), tick)
@@ -257,6 +271,13 @@ class Timeline:
         self.flush()
         self._log.close()
         self._room.unlink(missing_ok=True)
+
+
+def report_check(plant: Network, timelines: Sequence[Timeline], tick: int) -> None:
+    """Carry out what a synchro-check of the plant has found before a tick, and log it."""
+    found = finish_check(plant)
+    for timeline in timelines if found is not None else ():
+        timeline.checked(found, tick)
 
 
 class TimelineInMemory(Timeline):

@@ -39,11 +39,13 @@ from gfm_plant import (
     Network,
     NetworkParts,
     Plant,
+    finish_check,
     load_converter,
     make_network,
     make_plant,
 )
 from gfm_plant.records import SIZES
+from gfm_plant.synchro_check import AGREED
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
 from gfm_runtime.errors import meant, printable
 from gfm_runtime.inner_file import named_inner
@@ -648,5 +650,8 @@ def _try_plant(scenario: Scenario) -> None:
                     next(profile.points(scenario.T_s))[1].apply(plant)
                 else:
                     apply_grid_event(event, plant)
+                    if plant.wiring.check is not None:  # what it waits for is tried too
+                        plant.now["check"] = AGREED
+                        finish_check(plant)
             except (UserError, ValueError) as problem:
                 raise UserError(f"events.{k}: {problem}") from None
