@@ -43,6 +43,7 @@ NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[network.converters.NAME]", scenario.Member),
     ("[network.lines.NAME]", options.Line),
     ("[network.loads.NAME]", options.Load),
+    ("[network.constant_power.NAME]", options.ConstantPowerLoad),
     ("[network.capacitors.NAME]", options.CapacitorBank),
     ("[network.machines.NAME]", options.Machine),
 )

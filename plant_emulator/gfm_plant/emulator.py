@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_plant.constant_power import draw_power, measure, see_middle
 from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
@@ -121,6 +122,8 @@ def plant_step(plant: PlantRecords) -> None:
         now.unit_before[k, 0], now.unit_before[k, 1] = now.unit[k, 0], now.unit[k, 1]
     for i in range(n.n_states):
         now.w_before[i, 0], now.w_before[i, 1] = now.w[i, 0], now.w[i, 1]
+    for j in range(n.n_sinks):
+        now.v_sink_before[j, 0], now.v_sink_before[j, 1] = now.v_sink[j, 0], now.v_sink[j, 1]
     for part in range(n.n_parts):
         if n.stretch[part] > 0.0:
             _stretch(plant, part)
@@ -192,6 +195,8 @@ def _go_back(plant: PlantRecords) -> None:
         now.unit[k, 0], now.unit[k, 1] = now.unit_before[k, 0], now.unit_before[k, 1]
     for i in range(n.n_states):
         now.w[i, 0], now.w[i, 1] = now.w_before[i, 0], now.w_before[i, 1]
+    for j in range(n.n_sinks):
+        now.v_sink[j, 0], now.v_sink[j, 1] = now.v_sink_before[j, 0], now.v_sink_before[j, 1]
 
 
 @compiled
@@ -302,7 +307,12 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
         omega = now.omega[j] + 0.5 * n.T_s * now.slope[j]
         drive(n, now, c, part, machine_source(n, j), n.E[j], 0.0, omega)
 
+    if n.n_sinks > 0:
+        draw_power(n, now, c, part)
+
     half_step(n, now, c, part, 0)
+    if n.n_sinks > 0:
+        see_middle(n, now, c)
     if swings:
         read_states(n, now, c)
     else:
@@ -319,6 +329,8 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
 
     half_step(n, now, c, part, 2)
     read_states(n, now, c)
+    if n.n_sinks > 0:
+        measure(n, now, part)
     if swings:
         _bring(n, now, now.unit, n.half_h[part] / 3.0)
     for k in range(n.n_converters):

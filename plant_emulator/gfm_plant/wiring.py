@@ -17,6 +17,7 @@ from gfm_plant.circuit import (
     Capacitor,
     Modes,
     Shunt,
+    Sink,
     Source,
     find_modes,
     find_voltage,
@@ -123,6 +124,7 @@ class Wiring:
         branches: lines between nodes, and loads with an inductor, which end at `circuit.GROUND`.
         shunts: loads that are resistors.
         capacitors: banks of them.
+        sinks: loads of constant power.
         machines: the synchronous machines, whose breakers have their names.
         grid: node of the grid, None: there is none.
         closed: whether the grid's breaker is closed.
@@ -137,6 +139,7 @@ class Wiring:
     branches: tuple[Branch, ...] = ()
     shunts: tuple[Shunt, ...] = ()
     capacitors: tuple[Capacitor, ...] = ()
+    sinks: tuple[Sink, ...] = ()
     machines: tuple[Machine, ...] = ()
     grid: str | None = None
     closed: bool = True
@@ -162,6 +165,7 @@ class Wiring:
         ends += [node for branch in self.branches for node in (branch.start, branch.end)]
         ends += [machine.node for machine in self.machines]
         ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
+        ends += [sink.node for sink in self.sinks]
         return tuple(dict.fromkeys(node for node in ends if node != GROUND))
 
     @property
@@ -185,15 +189,11 @@ class Wiring:
         return own | {b.name: b for b in self.branches if b.end != GROUND}
 
     @property
-    def parts(self) -> list[str]:
-        """Names of the lines, loads and machines, without the converters' lines."""
-        lines = (*self.branches, *self.machine_branches)
-        return [branch.name for branch in lines] + [shunt.name for shunt in self.shunts]
-
-    @property
     def has_load(self) -> bool:
         """Whether anything is left to feed without the grid."""
-        return bool(self.shunts) or any(branch.end == GROUND for branch in self.branches)
+        return bool(self.shunts or self.sinks) or any(
+            branch.end == GROUND for branch in self.branches
+        )
 
     def to_grid(self) -> dict[str, float]:
         """What each state brings to the grid, as a factor of its current."""
@@ -221,10 +221,11 @@ class Wiring:
         found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
         lines = (*self.branches, *self.machine_branches)
         found |= {b.name: (b.name, b.start, b.end) for b in lines}
-        return found | {shunt.name: (shunt.name, shunt.node, GROUND) for shunt in self.shunts}
+        to_ground: tuple[Shunt | Sink, ...] = (*self.shunts, *self.sinks)
+        return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
     def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
-        """The modes of a circuit, and the names of its sources in their order.
+        """The modes of a circuit, and the names of its sources and sinks in their order.
 
         Args:
             blocked: indices of the converters whose bridges block.
@@ -234,8 +235,10 @@ class Wiring:
             ValueError: as ``find_modes``.
         """
         branches, capacitors, sources, shunts, _ = self._circuit(blocked, faulted)
-        modes = find_modes(branches, capacitors, sources, self.omega_b, self.order, shunts)
-        return modes, [source.name for source in sources]
+        sinks = [sink for sink in self.sinks if sink.name not in self.opened]
+        parts = branches, capacitors, sources
+        modes = find_modes(*parts, self.omega_b, self.order, shunts, sinks)
+        return modes, [part.name for part in sources] + [part.name for part in sinks]
 
     def voltage(
         self, node: str, blocked: frozenset[int], faulted: bool
@@ -248,7 +251,7 @@ class Wiring:
         """
         branches, capacitors, sources, shunts, hanging = self._circuit(blocked, faulted)
         there = {end for branch in branches for end in (branch.start, branch.end)}
-        there |= {part.node for part in (*capacitors, *sources)}
+        there |= {part.node for part in capacitors} | {part.node for part in sources}
         seen, reached = {node}, [node]
         while reached:
             here = reached.pop(0)

@@ -95,4 +95,4 @@ def _name_of_record(record: Any) -> tuple[str, tuple[int]]:
     return "Record", (int.from_bytes(hashlib.sha256(record.name.encode()).digest()[:8]),)
 
 
-types.Record.mangling_args = property(_name_of_record)
+types.Record.mangling_args = property(_name_of_record)  # type: ignore[method-assign,assignment]

@@ -286,3 +286,23 @@ def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole() -> Non
     for name in "AB":
         assert part.of(name) == whole.of(name).model_copy(update={"converter": name})
     assert (part.of("A").law, part.of("A").inner) == ("droop-3", None)
+
+
+def test_a_load_of_constant_power_draws_it_at_any_voltage() -> None:
+    """And a resistor draws with the square of it."""
+    taken = {}
+    for kind in ("constant_power", "loads"):
+        given = content(duration=3.0, law="vsg-2", inner="virtual-stator")
+        given["network"]["loads"] = {}
+        given["network"]["capacitors"] = {"filter": {**BUS, "Q": 0.2}}
+        given["network"][kind] = {"x": {**BUS, "P": 0.6}}
+        given["events"] = [{"type": "reference", "t": 0.2, "V_ref": 0.9, "ramp_s": 0.3}]
+        run = gfmhil.run_network(given)
+        assert run.status == "completed"
+        p = sum(np.asarray(one.signals["p"][:]) for one in run.values())
+        assert p[:1900] == pytest.approx(p[0], abs=1e-6)  # at rest until then
+        taken[kind] = p[0], p[-1]
+    before, after = taken["constant_power"]
+    assert before == pytest.approx(0.6, abs=0.01) and after == pytest.approx(before, abs=0.005)
+    before, after = taken["loads"]
+    assert after / before == pytest.approx(0.9**2, rel=0.03)

@@ -117,7 +117,7 @@ def operating_points(
     ]
     fixed = wiring.grid if wiring.closed else None
     free = [node for node in wiring.nodes if node != fixed]
-    feeding = {part.node for part in (*wiring.units, *wiring.machines)}
+    feeding = {unit.node for unit in wiring.units} | {one.node for one in wiring.machines}
     islands = [nodes for nodes in wiring.islands() if fixed not in nodes and feeding & {*nodes}]
     island_of = {node: k for k, nodes in enumerate(islands) for node in nodes}
     alive = {*island_of} | {node for nodes in wiring.islands() if fixed in nodes for node in nodes}
@@ -164,6 +164,10 @@ def operating_points(
         for capacitor in wiring.capacitors:
             omega = speeds[capacitor.node]
             missing[capacitor.node] -= 1j * omega * capacitor.C * volts[capacitor.node]
+        for load in plant.loads:
+            if load.name not in wiring.opened:
+                slip = wiring.omega_b * (speeds[load.node] - 1.0)
+                missing[load.node] -= load.at_rest(volts[load.node], slip)[1]
         for j, machine in enumerate(wiring.machines, 1):
             omega = speeds[machine.node]
             emf = float(n["E"][j]) * cmath.exp(1j * z[nodes_end + j - 1])

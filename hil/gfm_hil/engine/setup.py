@@ -127,7 +127,7 @@ def make_benches(scenario: Scenario) -> list[Bench]:
         if scenario.network is None:
             grid = scenario.plant.grid
             starts = [operating_point(plant.par, laws[0], refs[0], grid.omega_g, grid.V_g)]
-            machines = list[float]()
+            machines = list[tuple[float, float]]()
         else:
             starts, machines = operating_points(plant, laws, refs)
     except NoEquilibrium as problem:

@@ -276,8 +276,9 @@ class Timeline:
 def report_check(plant: Network, timelines: Sequence[Timeline], tick: int) -> None:
     """Carry out what a synchro-check of the plant has found before a tick, and log it."""
     found = finish_check(plant)
-    for timeline in timelines if found is not None else ():
-        timeline.checked(found, tick)
+    if found is not None:
+        for timeline in timelines:
+            timeline.checked(found, tick)
 
 
 class TimelineInMemory(Timeline):
