@@ -12,25 +12,29 @@ import gfmhil
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.log import read_log
 from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_network
+from gfm_hil.results.runner import run_network, run_scenario
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import load_converter
 
 CHECK = {"V": 0.1, "f_hz": 0.5, "degrees": 5.0, "lasting_s": 0.02, "within_s": 5.0}
 
 
-def island(closes_at: float, **check: Any) -> Run:
+def content(closes_at: float, **check: Any) -> dict[str, Any]:
     """One converter that the grid leaves at 0.2 s; it gives more than its reference to the load,
     and so its frequency is below the grid's."""
     closes = {"type": "grid-breaker", "t": closes_at, "closed": True}
-    return gfmhil.run({
+    return {
         "title": "island", "duration": 8.0, "law": "vsg-2", "inner": "virtual-stator",
         "link": {"type": "inproc"},
         "references": {"P_ref": 0.3},
         "plant": {"grid": {"load_R": 45.0, "load_L": 0.02}},
         "events": [{"type": "grid-breaker", "t": 0.2, "closed": False},
                    closes | ({"check": check} if check else {})],
-    })  # fmt: skip
+    }  # fmt: skip
+
+
+def island(closes_at: float, **check: Any) -> Run:
+    return gfmhil.run(content(closes_at, **check))
 
 
 def test_the_grids_breaker_closes_when_the_angles_meet() -> None:
@@ -45,6 +49,21 @@ def test_the_grids_breaker_closes_when_the_angles_meet() -> None:
     assert 0.1 < slip < 0.5
     blind = island(closed["t"] + 0.5 / slip)
     assert blind.status in ("tripped", "safe")  # by a current that nothing measures any more
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(400)  # compiles
+def test_over_a_link_it_closes_in_the_same_tick(tmp_path: Path) -> None:
+    given = content(0.4, **CHECK | {"degrees": 60.0, "within_s": 0.2})
+    given |= {"duration": 1.0, "link": {"type": "shm", "peer_timeout_s": 30.0}}
+    given["events"].append({**given["events"][-1], "t": 0.7, "check": {**CHECK, "within_s": 0.03}})
+    found = run_scenario(load_scenario(given), tmp_path / "run", figures=False)
+    memory = gfmhil.run(given)
+    labels = [event["label"] for event in memory.summary["events"]]
+    assert labels[2] == "grid breaker on, synchronous"
+    assert [event["label"] for event in found.summary["events"]] == labels
+    for name in ("p", "V", "omega_u"):
+        np.testing.assert_array_equal(found.signals[name][:], memory.signals[name][:])
 
 
 @pytest.mark.full
