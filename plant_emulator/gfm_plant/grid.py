@@ -188,8 +188,8 @@ def phase_jump(plant: Network, degrees: float) -> None:
 def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     """Set the line to `L_g` and `R_g` times the elements of the converter file.
 
-    Its current is continuous, but in an island, where the flux of line and load is. Factors of the
-    options are not applied on top.
+    The line's current does not jump. In an island the flux of line and load does not jump, so that
+    the current may. The ``factors`` of the options are not applied again.
 
     Raises:
         ValueError: If L_g <= 0 or R_g < 0, or a mode becomes too fast for the DC link. The plant

@@ -18,10 +18,10 @@ from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords, Record
 from gfm_plant.wiring import GRID_SOURCE, Wiring
 
 _DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
-_PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
+_PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
 _ROUNDS = 100  # of the search for the currents of loads of constant power
-_MOST = 500  # steps, or pieces, in a period
+_MOST = 500  # steps of the DC link, or intervals of Simpson's rule, in a period
 
 
 @dataclass

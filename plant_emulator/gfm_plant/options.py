@@ -330,7 +330,7 @@ class Line(Options):
     end: str = Field(min_length=1, description="node at its end")
     L: Positive = Field(description="p.u. of the first converter")
     R: NonNegative = Field(0.0, description="p.u. of the first converter")
-    closed: bool = Field(True, description="its breaker at the start")
+    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
 
 
 class Load(Options):
@@ -338,9 +338,13 @@ class Load(Options):
     frequency; without Q a resistor."""
 
     node: str = Field(min_length=1, description="where it is")
-    P: NonNegative = Field(description="active power at nominal voltage, p.u. of the first one")
-    Q: NonNegative = Field(0.0, description="reactive power there, p.u.")
-    closed: bool = Field(True, description="its breaker at the start")
+    P: NonNegative = Field(
+        description="active power at nominal voltage, p.u. of the first converter"
+    )
+    Q: NonNegative = Field(
+        0.0, description="reactive power at nominal voltage, p.u. of the first converter"
+    )
+    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
 
     @model_validator(mode="after")
     def _draws_something(self) -> Load:

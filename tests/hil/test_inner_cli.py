@@ -123,7 +123,7 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
         ('{type = "virtual-stator", I_thr = 1.0}', "inner.virtual-stator.I_thr = 1.0: unknown key"),
         (
             '{type = "cascaded", priority = "e"}',
-            "priority: Input should be 'circular', 'd', 'q' or",
+            "priority: must be 'circular', 'd', 'q' or",
         ),
         ('{type = "cascaded", I_max = "x"}', "inner.I_max: unknown parameter 'x'; known: ['D_p',"),
         (

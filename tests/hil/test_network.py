@@ -227,7 +227,7 @@ def test_a_run_on_disk_is_that_in_memory(
           "events": []}, "network.converters.A.law"),
         ({"network": {"converters": {"A": {"node": "x"}}, "grid": "y"}}, "the grid is at node 'y'"),
         ({"network": {"converters": {"A": {"node": "x"}}, "lines": {"l": {**LINE, "L": 0.0}}}},
-         "network.lines.l.L: Input should be greater than 0"),
+         "network.lines.l.L: must be greater than 0"),
         ({"network": {"converters": {"A": {"node": "x", "plant": {"grid": {"V_g": 0.9}}}}}},
          "plant.grid: is the scenario's own"),
     ],

@@ -68,7 +68,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "converter file with mistakes": (
         {"plant": {"converter": "converter.toml"}},
-        ["L_f: Input should be greater than 0, not -0.001", "C_dc", "not 'big'"],
+        ["L_f: must be greater than 0, not -0.001", "C_dc", "not 'big'"],
     ),
     "unknown key": ({"durration": 3}, ["durration = 3", "unknown key"]),
     "unknown key inside": ({"link": {"baud": 9600}}, ["link.baud = 9600", "unknown key"]),

@@ -583,7 +583,8 @@ def check_scenario(
                 for stage in load_law(law, member.inner).laws:
                     _try_law(law, stage, scenario.T_s)
             except LawError as problem:
-                at = f"network.converters.{member.converter}.law: "
+                key = "inner" if _no_stage(member.inner) else "law"
+                at = f"network.converters.{member.converter}.{key}: "
                 wrong += [f"{where}: {at}{line}" for line in problem.lines]
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
@@ -599,6 +600,16 @@ def check_scenario(
     if wrong:
         raise UserError("\n".join(map(printable, wrong)))
     return scenario
+
+
+def _no_stage(name: str | None) -> bool:
+    """Whether there is no such inner stage."""
+    try:
+        if name is not None:
+            named_inner(name)
+    except LawError:
+        return True
+    return False
 
 
 def _try_law(name: str, stage: Law, T_s: float) -> None:
@@ -630,11 +641,16 @@ def plant_of(scenario: Scenario) -> Network:
 def _try_plant(scenario: Scenario) -> None:
     """Build the plant and try those of its events that not every plant can carry out."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
-    if scenario.plant.converter.endswith(".toml"):
-        try:
-            read_toml(scenario.plant.converter)
-        except ValueError as problem:
-            raise UserError(f"{converter}: {problem}") from None
+    files = {converter: scenario.plant.converter}
+    for name in scenario.converters:
+        file = scenario.of(name).plant.converter
+        files[f"network.converters.{name}.plant.converter = {file!r}"] = file
+    for place, file in files.items():
+        if file.endswith(".toml"):
+            try:
+                read_toml(file)
+            except ValueError as problem:
+                raise UserError(f"{place}: {problem}") from None
     try:
         plant = plant_of(scenario)
     except ValidationError as problem:
