@@ -353,6 +353,21 @@ class Load(Options):
         return self
 
 
+class ConstantPowerLoad(Options):
+    """A load whose control holds P and Q, such as a drive or a charger: it draws the current
+    conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
+    as the filter of such a load is."""
+
+    node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
+    P: float = Field(description="active power, p.u. of the first one; negative: it feeds in")
+    Q: float = Field(0.0, description="reactive power, p.u.")
+    tau_s: Positive = Field(0.005, description="lag of its measurement of the voltage, s")
+    V_least: Positive = Field(
+        0.7, description="below this voltage it is an impedance that draws P and Q there, p.u."
+    )
+    closed: bool = Field(True, description="its breaker at the start")
+
+
 class CapacitorBank(Options):
     """Capacitors between a node and ground."""
 
@@ -385,5 +400,6 @@ class NetworkParts(Options):
     )
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
     loads: dict[str, Load] = Field({}, description="by name")
+    constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
     machines: dict[str, Machine] = Field({}, description="by name")
