@@ -528,3 +528,107 @@ def test_the_gate_fails_a_test_with_each_part_and_the_report(lab: Path) -> None:
         conform("droop-3", against="lab")
     assert str(lab.parent / "second" / "report.html") in str(why.value)
     assert (lab.parent / "second" / "report.html").is_file()
+
+
+def clause_of(verdict: str, value: float | None = 1.0, words: str = "opposes") -> dict[str, Any]:
+    return {
+        "clause": words, "kind": "peak_delta_p", "verdict": verdict, "value": value,
+        "unit": "p.u.", "text": "It is so.",
+    }  # fmt: skip
+
+
+def results_of(path: Path, *clauses: dict[str, Any], law: str = "x", **more: Any) -> Path:
+    """The results.json of a report with one test."""
+    outcome = worst([c["verdict"] for c in clauses])
+    parts = [{"part": "up", "verdict": outcome, "reason": "", "clauses": [*clauses]}]
+    found = {"lab/jump": {"verdict": outcome, "parts": parts}}
+    content = {"version": "1", "inner": None, "under_test": {}, "laws": {law: found}, **more}
+    path.write_text(json.dumps(content), "utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changes", "code"),
+    [
+        ([PASS], [PASS], [], 0),
+        ([PASS], [FAIL], ["worse"], 1),
+        ([PASS], [CANNOT], ["worse"], 1),
+        ([CANNOT], [FAIL], ["worse"], 1),
+        ([FAIL], [CANNOT], ["better"], 0),
+        ([FAIL], [PASS], ["better"], 0),
+        ([PASS, PASS], [PASS], ["gone"], 1),
+        ([PASS, FAIL], [PASS], ["gone"], 0),  # what did not pass proves nothing
+        ([PASS], [PASS, FAIL], ["new"], 0),  # nothing is known of before
+        ([FAIL, PASS], [PASS, FAIL], ["worse", "better"], 1),
+    ],
+)
+def test_a_report_is_worse_if_a_verdict_is_or_a_proof_is_gone(
+    old: list[str], new: list[str], changes: list[str], code: int, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    files = [
+        str(results_of(tmp_path / name, *map(clause_of, verdicts)))
+        for name, verdicts in (("old", old), ("new", new))
+    ]
+    page = tmp_path / "diff.html"
+    assert main(["conform", "diff", *files, "--json", "--html", str(page)]) == code
+    found = json.loads(capsys.readouterr().out)
+    assert [row["change"] for row in found["rows"]] == changes
+    assert found["worse"] is bool(code)
+    assert page.read_text("utf-8").count("<td>lab/jump</td>") == len(changes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "share", "moved"),
+    [
+        (1.0, 1.04, "0.05", False),
+        (1.0, 1.06, "0.05", True),
+        (1.06, 1.0, "0.05", True),
+        (1.0, 1.06, "0.1", False),
+        (1e-5, 1e-3, "0.05", False),  # next to nothing either way
+        (-0.5, 0.5, "0.5", True),
+        (None, 0.5, "0.5", True),
+        (None, None, "0.0", False),
+    ],
+)
+def test_a_value_moves_by_a_share_of_the_larger(
+    old: float | None, new: float | None, share: str, moved: bool, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    files = [
+        str(results_of(tmp_path / name, clause_of(PASS, value)))
+        for name, value in (("old", old), ("new", new))
+    ]
+    assert main(["conform", "diff", *files, "--share", share]) == 0  # no verdict changed
+    said = capsys.readouterr().out
+    assert ("1 moved, 0 as before" in said) is moved and ("1 as before" in said) is not moved
+
+
+def test_a_law_of_another_name_and_a_test_that_is_gone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = results_of(tmp_path / "old", clause_of(PASS), law="mine")
+    new = results_of(tmp_path / "new", clause_of(PASS), law="mine-2", inner="cascaded")
+    assert main(["conform", "diff", str(old), str(new)]) == 0
+    said = capsys.readouterr().out
+    assert "The law was mine and is mine-2." in said and "each law's own and is cascaded" in said
+    content = json.loads(new.read_text("utf-8"))
+    content["laws"]["mine-2"] = {"lab/other": content["laws"]["mine-2"]["lab/jump"]}
+    new.write_text(json.dumps(content), "utf-8")
+    assert main(["conform", "diff", str(old), str(new)]) == 1
+    assert "1 gone, 1 new, 0 as before" in capsys.readouterr().out
+
+
+def test_a_report_as_the_command_writes_it_is_read_again(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (lab / "none.toml").write_text(LAB + NONE)
+    for law, name in (("droop-3", "old"), ("vsg-2", "new")):
+        gfmhil.conform(law, lab, lab.parent / name)
+    assert main(["conform", "diff", str(lab.parent / "old"), str(lab.parent / "new")]) == 0
+    assert "droop-3 and is vsg-2" in capsys.readouterr().out
+    (lab.parent / "old" / "results.json").write_text("[]")
+    assert main(["conform", "diff", str(lab.parent / "old"), str(lab.parent / "new")]) == 2
+    error = capsys.readouterr().err
+    assert "old/results.json: is no results.json" in error and error.count("\n") == 1
+    assert main(["conform", "diff", str(lab), str(lab.parent / "new"), "--share", "2"]) == 2

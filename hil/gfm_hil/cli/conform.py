@@ -15,10 +15,12 @@ from rich.table import Table
 
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder, progress
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import fitting, terminal
 from gfm_hil.realtime.priority import processors
 from gfm_hil.studies.campaign.execute import WorkerLost
+from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.execute import Found, execute, make_jobs
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS
 from gfm_hil.studies.conformity.result import Conformity
@@ -34,6 +36,23 @@ def add(command: argparse.ArgumentParser) -> None:
     command.description = (
         "Exit code 0: every clause passes; 1: one fails or cannot be judged; 2: wrong input."
     )
+    others = command.add_subparsers(metavar="{diff}", title="on reports")
+    diff = others.add_parser("diff", help="what changed between two reports")
+    diff.description = (
+        "Exit code 0: nothing got worse; 1: a verdict did, or a clause that passed is gone; 2: "
+        "wrong input."
+    )
+    diff.set_defaults(call=_diff)
+    diff.add_argument(
+        "old", type=Path, metavar="OLD", help="folder of a report, or its results.json"
+    )
+    diff.add_argument("new", type=Path, metavar="NEW", help="the same")
+    diff.add_argument(
+        "--share", type=float, default=SHARE, metavar="X",
+        help=f"values that moved by more than this part of the larger are told; {SHARE:g}",
+    )  # fmt: skip
+    diff.add_argument("--html", type=Path, metavar="FILE", help="write a page too")
+    diff.add_argument("--json", action="store_true", help="print all of it as JSON, nothing else")
     command.add_argument(
         "--law", action="append", metavar="LAW",
         help="catalogue name or law file; may be repeated; all: the whole catalogue",
@@ -114,6 +133,29 @@ def call(options: argparse.Namespace) -> int:
     else:
         _print(result, time.monotonic() - began)
     return 0 if result.passed else EXIT_FAILED
+
+
+def _diff(options: argparse.Namespace) -> int:
+    """Two reports beside each other; returns the exit code."""
+    found = compare_results(read_results(options.old), read_results(options.new), options.share)
+    if options.html is not None:
+        write_text(options.html, found.page(str(options.old), str(options.new)))
+    if options.json:
+        print(json.dumps(found.plain(), indent=1))
+    else:
+        console = terminal()
+        for note in found.notes:
+            console.print(escape(note), highlight=False, soft_wrap=True)
+        table = Table("", "law", "test", "part", "clause", "verdict", "measured", box=None,
+                      pad_edge=False)  # fmt: skip
+        for row in found.rows:
+            where = map(escape, (row.law, row.test, row.part, row.clause.clause))
+            shown = f"[red]{row.change}[/]" if row.counts else row.change
+            table.add_row(shown, *where, row.verdict, escape(row.value))
+        if found.rows:
+            console.print(table)
+        console.print(found.words, highlight=False)
+    return EXIT_FAILED if found.worse else 0
 
 
 def _names(law: str) -> Sequence[str]:
