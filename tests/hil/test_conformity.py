@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import json
 import math
+import shlex
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ from gfm_hil.studies.conformity.sets import (
 )
 from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
+
+from ..support.firmware import cc
 
 Vector = NDArray[np.float64]
 
@@ -500,6 +503,9 @@ def test_wrong_test_files_are_told_in_one_line(
         (["--law", "droop-3", "--workers", "0"], "--workers 0"),
         (["--law", "droop-3", "--converter", "nowhere.toml"], "nowhere.toml"),
         ([], "--law"),
+        (["--controller", "vsg-2.so"], "must be dll:FILE or fmu:FILE"),
+        (["--controller", "dll:nowhere.so"], "nowhere.so: there is no such file"),
+        (["--law", "droop-3", "--map", "map.toml"], "map.toml: is of a controller"),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(
@@ -508,6 +514,45 @@ def test_wrong_arguments_are_told_in_one_line(
     assert main(["conform", *arguments]) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
+
+
+@pytest.mark.compilers
+@pytest.mark.timeout(300)
+def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (lab / "strict.toml").write_text(STRICT)
+    built = str(lab.parent / "dll")
+    asked = ["firmware", "dll", "vsg-2", "--inner", "virtual-stator", "--real", "float64"]
+    assert main([*asked, "-o", built]) == 0
+    (library,) = Path(built).glob("*.so")
+    found = gfmhil.conform(
+        "vsg-2", lab, lab.parent / "out", inner="virtual-stator", controller=f"dll:{library}"
+    )
+    name = f"dll:{library.name}"
+    assert found.laws == ["vsg-2", name]
+    assert found.matrix[name, "lab/jump"] == found.matrix["vsg-2", "lab/jump"] == PASS
+    assert found.matrix[name, "lab/strict"] == found.matrix["vsg-2", "lab/strict"] == FAIL
+    for test in ("lab/jump", "lab/strict"):
+        (law,), (model,) = (found.of(of, test) for of in ("vsg-2", name))
+        for one, other in zip(law.verdicts, model.verdicts, strict=True):
+            assert other.value == pytest.approx(one.value, abs=1e-3) and other.text == one.text
+    # one controller cannot be both of a network
+    network = gfmhil.conform(against="miso/1-loss-of-last-machine", controller=f"dll:{library}")
+    assert set(network.matrix.values()) == {CANNOT}
+    assert "is one controller, and the test's network has several" in network.failures[0]
+    # the command that the report names repeats the run
+    again = shlex.split(found.of(name, "lab/jump")[0].again)
+    assert again[3:] == ["--controller", f"dll:{library}"]
+    assert main([*again[1:], "--out", str(lab.parent / "again"), "--no-figures", "--quiet"]) == 0
+    # what does not answer as the interface says is refused part by part
+    other = lab.parent / "other.so"
+    source = "int nothing(void) { return 0; }\n"
+    (lab.parent / "other.c").write_text(source)
+    assert cc(lab.parent, "-shared", "-fPIC", "other.c", "-o", "other.so").returncode == 0
+    refused = gfmhil.conform(against=lab / "jump.toml", controller=f"dll:{other}")
+    assert refused.matrix == {("dll:other.so", "lab/jump"): CANNOT}
+    assert "has no function Model_GetInfo" in refused.failures[0]
 
 
 def test_parts_without_a_criterion_are_refused() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model
-from gfm_hil.results.runner import Notice, run_network, run_scenario
+from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 
@@ -107,10 +106,7 @@ def _model_command(
     if scenario.link.type == INPROC:
         raise UserError("--controller: is a process, and a run in process has none; choose --link")
     compile_for_model(scenario, notice)
-    command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
-    command += ["--endpoint", "{endpoint}", "--out", str(folder.absolute()), "--quiet"]
-    command += ["--part", str(os.getpid()), "--model", options.controller]
-    return command + (["--map", str(options.map.absolute())] if options.map else [])
+    return model_command(folder, options.controller, options.map)
 
 
 def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:

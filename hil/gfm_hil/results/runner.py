@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -85,6 +87,20 @@ def run_scenario(
         wall_s = time.monotonic() - began
         labels = bench.controller.labels
         return finish(scenario, folder, labels, wall_s, figures, outside.get(""))
+
+
+def model_command(folder: Path, model: str, ports: Path | None) -> list[str]:
+    """The ``controller_command`` of a run whose controller steps a model in place of the law.
+
+    Args:
+        folder: of the run.
+        model: ``dll:FILE`` or ``fmu:FILE``.
+        ports: file of the map of its ports.
+    """
+    command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
+    command += ["--endpoint", "{endpoint}", "--out", str(folder.absolute()), "--quiet"]
+    command += ["--part", str(os.getpid()), "--model", model]
+    return command + (["--map", str(ports.absolute())] if ports else [])
 
 
 def run_network(

@@ -210,23 +210,28 @@ def campaign(
 
 
 def conform(
-    law: str | Path | Law | Sequence[str | Path | Law],
+    law: str | Path | Law | Sequence[str | Path | Law] = (),
     against: str | Path | Sequence[str | Path] = ALL,
     folder: str | Path | None = None,
     *,
     inner: str | None = None,
     converter: str | Path | None = None,
+    controller: str | None = None,
+    ports: str | Path | None = None,
     workers: int = 1,
 ) -> Conformity:
     """Run the published tests of grid-forming converters, and judge them clause by clause.
 
     Args:
-        law: name, law file or ``Law``, or several of them.
+        law: name, law file or ``Law``, or several of them; none with a controller.
         against: shipped sets, ``all`` of them, or paths of your own.
         folder: where to write the report with figures, results.json and junit.xml; None writes
             nothing.
         inner: inner stage of every law; each law's own if None.
         converter: file of the converter under test; the shipped one if None.
+        controller: a model to test beside the laws, ``dll:FILE`` or ``fmu:FILE``. It begins at
+            the operating point of the first law, or of ``mimo-gfm`` without any.
+        ports: file of the map of the model's ports.
         workers: as for ``campaign``.
 
     Raises:
@@ -236,6 +241,9 @@ def conform(
     if not 1 <= workers <= 1024:
         raise UserError(f"workers = {workers}: must lie in [1, 1024]")
     given = [law] if isinstance(law, str | Path | Law) else list(law)
+    foreign = conformity.foreign_controller(controller, ports)
+    if not given and foreign is None:
+        raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
     place = None if folder is None else Path(folder)
     if place is not None and place.exists() and any(place.iterdir()):
@@ -248,9 +256,10 @@ def conform(
         for file in files.values():
             law_file(file)
         converters = Path(temporary) if place is None else place / "converters"
-        jobs = conformity.make_jobs(files, cases, inner, under, converters, place, True)
+        jobs = conformity.make_jobs(files, cases, inner, under, converters, place, True, foreign)
         conformity.execute(jobs, workers, found.append)
-    made = Conformity(list(files), inner, under, cases, found, place)
+    names = [*files, *([foreign.name] if foreign else [])]
+    made = Conformity(names, inner, under, cases, found, place)
     if place is not None:
         made.write(place)
     return made

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compiled_bench, compiled_benches
+from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
+from gfm_hil.models import model_file, read_map
 from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory, run_network_in_memory
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.results.runner import (
+    model_command,
+    run_in_memory,
+    run_network_in_memory,
+    run_scenario,
+)
+from gfm_hil.scenario.model import Link, Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
 from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, worst
@@ -23,18 +31,46 @@ from gfm_hil.studies.conformity.sets import Case, scenario_of
 _POLL_S = 0.2
 
 
+_LINK = Link(type="shm", peer_timeout_s=10.0)  # of a model
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """A model as the controller, in place of a law.
+
+    Attributes:
+        model: ``dll:FILE`` or ``fmu:FILE``.
+        ports: file of the map of its ports.
+    """
+
+    model: str
+    ports: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """What reports call it: its kind and the name of its file.
+
+        Raises:
+            UserError: there is no such file.
+        """
+        kind, path = model_file(self.model)
+        return f"{kind}:{path.name}"
+
+
 @dataclass(frozen=True)
 class Job:
     """A part of a test under a law.
 
     Attributes:
-        law, file: its name, and what a scenario calls it.
+        law, file: its name, and what a scenario calls it. Of a model: its name, and the law at
+            whose operating point a run begins.
         case, part: what to run.
         inner: stage of every law; the law's own if None.
         under: the converter under test.
         converters: folder for converter files, which lasts while jobs run.
         folder: where the scenario and the figure go; None writes neither.
         figures: whether to draw one.
+        foreign: the model that computes u in place of the law, or None.
     """
 
     law: str
@@ -46,6 +82,7 @@ class Job:
     converters: Path
     folder: Path | None
     figures: bool
+    foreign: Foreign | None = None
 
     @property
     def name(self) -> str:
@@ -61,7 +98,7 @@ class Found:
         law, test, part: names; the part of a test without parts is empty.
         status, reason: how the run ended; ``none`` if it did not take place.
         verdicts: one a clause and time.
-        scenario: folder of the scenario that repeats the run, or None.
+        again: the command that repeats the run; empty if no scenario was written.
         figure: file, or None.
     """
 
@@ -71,7 +108,7 @@ class Found:
     status: str
     reason: str
     verdicts: list[Verdict]
-    scenario: Path | None = None
+    again: str = ""
     figure: Path | None = None
 
     @property
@@ -88,6 +125,22 @@ class Found:
         return told[0].text if told else self.reason
 
 
+def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign | None:
+    """The model that a user names, checked as far as that goes without loading it.
+
+    Raises:
+        UserError: there is no such file, the map is none, or there is a map but no model.
+    """
+    if model is None:
+        if ports is not None:
+            raise UserError(f"map {ports}: is of a controller; name it too")
+        return None
+    kind, path = model_file(model)
+    file = None if ports is None else Path(ports).absolute()
+    read_map(file)
+    return Foreign(f"{kind}:{path}", file)
+
+
 def slug(name: str) -> str:
     """A name as that of a file."""
     return re.sub(r"[^\w.+-]+", "-", name.removesuffix(".toml")).strip("-")
@@ -101,12 +154,18 @@ def make_jobs(
     converters: Path,
     folder: Path | None,
     figures: bool,
+    foreign: Foreign | None = None,
 ) -> list[Job]:
-    """A job for each part of each test under each law; ``laws`` are files by name, and the rest as
-    for ``Job``."""
+    """A job for each part of each test under each law, and then under the model; ``laws`` are files
+    by name, of which the first one, or else that of a scenario without a law, also says where the
+    model begins. The rest is as for ``Job``."""
+    each: list[tuple[str, str, Foreign | None]] = [(*law, None) for law in laws.items()]
+    if foreign is not None:
+        start = next(iter(laws.values()), Scenario.model_fields["law"].default)
+        each.append((foreign.name, start, foreign))
     return [
-        Job(law, file, case, part, inner, under, converters, folder, figures)
-        for law, file in laws.items()
+        Job(law, file, case, part, inner, under, converters, folder, figures, model)
+        for law, file, model in each
         for case in cases
         for part in case.test.runs()
     ]
@@ -161,22 +220,37 @@ def _finish(future: Future[Found], job: Job, keep: Callable[[Found], None]) -> N
 
 def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
-    seen: set[tuple[bool, int]] = set()
+    seen: set[tuple[bool, int, bool]] = set()
     for job in jobs:
         if job.part.cannot is not None:
             continue
         try:
             scenario = _scenario(job)
-            kind = scenario.has_inner, len(scenario.converters)
-            if kind not in seen:
+            kind = scenario.has_inner, len(scenario.converters), job.foreign is not None
+            if kind in seen:
+                continue
+            if job.foreign is not None:
+                compiled_bench(scenario, notice, ("plant",))
+                compile_for_model(scenario, notice)
+            else:
                 (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
-                seen.add(kind)
+            seen.add(kind)
         except UserError:  # which the verdict will say
             continue
 
 
 def _scenario(job: Job) -> Scenario:
-    return scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
+    """The scenario of a job.
+
+    Raises:
+        UserError: it cannot be run.
+    """
+    found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
+    if job.foreign is None:
+        return found
+    if found.network is not None:
+        raise UserError(f"{job.law} is one controller, and the test's network has several")
+    return found.model_copy(update={"link": _LINK})
 
 
 def run_part(job: Job) -> Found:
@@ -187,32 +261,54 @@ def run_part(job: Job) -> Found:
     if part.cannot is not None:
         reason = f"Cannot be judged: {part.cannot}"
         return Found(*names, "none", reason, cannot(criteria, reason))
-    try:
-        scenario = _scenario(job)
-        run, others = _run(scenario, test.judged)
-    except UserError as problem:
-        text = str(problem).replace("\n", "; ").replace(job.file, job.law)
-        reason = f"Cannot be judged: there is no such run: {text}"
-        return Found(*names, "none", reason, cannot(criteria, reason))
-    verdicts = judge(run, criteria, job.under, others)
-    place = figure = None
-    if job.folder is not None:
-        place = job.folder / "runs" / slug(job.law) / slug(job.name)
-        place.mkdir(parents=True, exist_ok=True)
-        write_scenario(place, scenario)
-    if place is not None and job.figures and run.ticks:
-        from gfm_hil.studies.conformity.figure import draw_part  # takes half a second to import
+    with ExitStack() as stack:
+        try:
+            scenario = _scenario(job)
+            run, others = _run(job, scenario, stack)
+        except UserError as problem:
+            text = str(problem).replace("\n", "; ").replace(job.file, job.law)
+            reason = f"Cannot be judged: there is no such run: {text}"
+            return Found(*names, "none", reason, cannot(criteria, reason))
+        verdicts = judge(run, criteria, job.under, others)
+        again, figure = "", None
+        if job.folder is not None:
+            place = job.folder / "runs" / slug(job.law) / slug(job.name)
+            place.mkdir(parents=True, exist_ok=True)
+            write_scenario(place, scenario)
+            again = _again(place, job.foreign)
+            if job.figures and run.ticks:
+                from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
 
-        figure = place / "figure.png"
-        draw_part(figure, f"{job.law} · {job.name} · {scenario.title}", run, verdicts)
-    reason = str(run.summary["reason"])
-    return Found(*names, run.status, reason, verdicts, place, figure)
+                figure = place / "figure.png"
+                draw_part(figure, f"{job.law} · {job.name} · {scenario.title}", run, verdicts)
+        reason = str(run.summary["reason"])
+        return Found(*names, run.status, reason, verdicts, again, figure)
 
 
-def _run(scenario: Scenario, judged: str | None) -> tuple[Run, Mapping[str, Run]]:
-    """The run that is judged, and those of the other converters."""
+def _again(place: Path, foreign: Foreign | None) -> str:
+    """The command that repeats the run of the scenario in a folder."""
+    words = ["gfmhil", "run", str(place / "scenario.toml")]
+    if foreign is not None:
+        words += ["--controller", foreign.model]
+        words += ["--map", str(foreign.ports)] if foreign.ports else []
+    return shlex.join(words)
+
+
+def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[str, Run]]:
+    """The run that is judged, and those of the other converters.
+
+    Args:
+        stack: keeps what a run of a model is read from.
+    """
+    if job.foreign is not None:
+        folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
+        command = model_command(folder, job.foreign.model, job.foreign.ports)
+        run = run_scenario(scenario, folder, figures=False, controller_command=command)
+        if run.status == "interrupted":
+            raise KeyboardInterrupt
+        return run, {}
     if scenario.network is None:
         return run_in_memory(scenario), {}
     runs = run_network_in_memory(scenario)
-    name = judged or scenario.converters[0]
+    name = job.case.test.judged or scenario.converters[0]
     return runs[name], {other: run for other, run in runs.items() if other != name}

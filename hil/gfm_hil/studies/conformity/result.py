@@ -36,7 +36,7 @@ class Conformity:
     """What the tests showed.
 
     Attributes:
-        laws: names, in order.
+        laws: names, in order; with a model its name is the last one.
         inner: stage of every law; None: each law's own.
         under: the converter under test.
         cases: the tests, in order.
@@ -231,11 +231,8 @@ class Conformity:
             if f.figure is not None:
                 alt = html.escape(f"{f.test} {f.part}")
                 text.append(f'<img alt="{alt}" src="{inline(f.figure)}">')
-            if f.scenario is not None:
-                text.append(
-                    f"<p><code>gfmhil run {html.escape(str(f.scenario / 'scenario.toml'))}</code> "
-                    "repeats the run.</p>"
-                )
+            if f.again:
+                text.append(f"<p><code>{html.escape(f.again)}</code> repeats the run.</p>")
         return "\n".join(text)
 
     def __repr__(self) -> str:
