@@ -23,8 +23,8 @@ from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, worst
-from gfm_hil.studies.conformity.model import Criterion, Part
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, judge_nfp, worst
+from gfm_hil.studies.conformity.model import Criterion, Nfp, Part
 from gfm_hil.studies.conformity.sets import (
     Case,
     load_cases,
@@ -44,6 +44,7 @@ JUMPS = {2.0: -10.0, 7.0: 10.0, 12.0: -25.0, 17.0: 25.0}  # s: degrees
 PEAK = {10.0: 0.3, 25.0: 0.6}  # p.u.
 F_SWING, RATIO = 2.0, 0.3
 
+OMEGA_B = 100 * math.pi  # rad/s
 UNDER = load_under_test(None)
 CRITERIA: TypeAdapter[Criterion] = TypeAdapter(Criterion)
 
@@ -482,6 +483,8 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
         ("f_n = 50.0", 'f_n = 50.0\njudged = "twin"', "judged: 'twin'"),
         ("duration = 1.5", 'duration = 1.5\nlaw = "vsg-2"', "scenario.law"),
         ('known = "own"', 'known = "rumour"', "rumour"),
+        ('kind = "no_trip"', 'kind = "nfp"\nunknown = "why"', "nfp: must be its only criterion"),
+        ('kind = "no_trip"', 'kind = "nfp"', "bands, unknown: give one of them"),
         ("least = 0.05", "least = 0.05\nat = [7.0]", "at = 7"),
     ],
 )
@@ -553,6 +556,80 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(
     refused = gfmhil.conform(against=lab / "jump.toml", controller=f"dll:{other}")
     assert refused.matrix == {("dll:other.so", "lab/jump"): CANNOT}
     assert "has no function Model_GetInfo" in refused.failures[0]
+
+
+def nfp_of(**more: Any) -> Nfp:
+    found = one("nfp", from_hz=0.1, to_hz=50.0, **more)
+    assert isinstance(found, Nfp)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("band", "verdict", "at"),
+    [
+        ({"low": 37.0, "high": 51.0}, PASS, 1.0),  # 51 - 49.75 is less than 39.04 - 37
+        ({"low": 40.0, "high": 51.0}, FAIL, 8.0),
+        ({"low": 37.0, "high": 49.5}, FAIL, 1.0),
+        ({"phase_high": -5.0}, PASS, 1.0),
+        ({"phase_low": -38.0}, FAIL, 8.0),
+        ({"high": 51.0, "from_hz": 1.1, "to_hz": 1.9}, CANNOT, None),
+    ],
+)
+def test_a_plot_is_judged_in_its_bands(band: dict[str, Any], verdict: str, at: Any) -> None:
+    """A gain of 50 behind a lag at 10 Hz: 50/(1 + (f/10)^2)^0.5 and -atan(f/10)."""
+    hz = np.array([0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0])
+    nfp = 50.0 / (1.0 + 1j * hz / 10.0)
+    asked = {"from_hz": 1.0, "to_hz": 10.0, **band}
+    (found,) = judge_nfp(hz, nfp, nfp_of(bands=[asked]))
+    assert found.verdict == verdict
+    if at is not None:
+        x = np.degrees(np.angle(nfp)) if "phase" in next(iter(band)) else np.abs(nfp)
+        assert found.value == pytest.approx(x[hz == at][0]) and f"At {at:.3g} Hz" in found.text
+
+
+NFP = """
+title = "plot"
+f_n = 50.0
+source = { document = "here", clause = "closed form", revision = "1", known = "own" }
+[scenario]
+duration = 1.0
+references = { P_ref = 0.0 }
+plant = { grid = { scr = 5.0, x_over_r = 10.0 } }
+[[criteria]]
+kind = "nfp"
+clause = "plot"
+from_hz = 2.0
+to_hz = 10.0
+points = 3
+"""
+
+
+def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
+    """dp/dw_g = -K w_b / (s + K w_b D_p / (1 + s T)), K = 1 / X (1 + s^2/w_b^2), X = X_p + 1/SCR:
+    the swing of a droop behind its low-pass, on a line that is a state of its own. Resistances, the
+    filter capacitor and the delay are within 1 %."""
+    gains = gfmhil.Law.load("droop-3").gains
+    s = 2j * np.pi * np.array([2.0, 10.0])
+    K = 1 / (load_converter("paper").pu()["L_f"] + 1 / 5.0) / (1 + (s / OMEGA_B) ** 2)
+    lag = 1 + s * gains["T"]
+    high, low = np.abs(K * OMEGA_B / (s + K * OMEGA_B * gains["D_p"] / lag))
+    limits = (0.99 * low, 1.01 * high), (0.99 * low, 0.99 * high), (1.01 * low, 1.01 * high)
+    bands = [{"from_hz": 2.0, "to_hz": 10.0, "low": a, "high": b} for a, b in limits]
+    text = ", ".join("{" + ", ".join(f"{k} = {v}" for k, v in b.items()) + "}" for b in bands)
+    (tmp_path / "plot.toml").write_text(f"{NFP}bands = [{text}]")
+    found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
+    (part,) = found.found
+    assert [v.verdict for v in part.verdicts] == [PASS, FAIL, FAIL]
+    report = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert report.count("data:image/png;base64,") == 1 and "gfmhil identify" in report
+
+
+def test_a_plot_without_known_limits_is_drawn_and_not_judged(tmp_path: Path) -> None:
+    (tmp_path / "plot.toml").write_text(NFP + 'unknown = "nobody knows them"')
+    found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
+    (part,) = found.of("droop-3", f"{tmp_path.name}/plot")
+    assert part.verdict == CANNOT and "nobody knows them" in part.words
+    assert part.figure is not None and part.figure.is_file()
 
 
 def test_parts_without_a_criterion_are_refused() -> None:

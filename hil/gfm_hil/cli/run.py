@@ -77,7 +77,7 @@ def call(options: argparse.Namespace) -> int:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
             stack.enter_context(companion("modbus", folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-            command = _model_command(scenario, folder, options, notice)
+            command = _model_command(scenario, options, notice)
             figures = not options.no_figures
             run = run_scenario(scenario, folder, progress, notice, figures, command)
         if options.json:
@@ -91,9 +91,7 @@ def call(options: argparse.Namespace) -> int:
     return exit_code(run.summary)
 
 
-def _model_command(
-    scenario: Scenario, folder: Path, options: argparse.Namespace, notice: Notice
-) -> list[str]:
+def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Notice) -> list[str]:
     """The program that steps the model of --controller; empty without one.
 
     Raises:
@@ -106,7 +104,7 @@ def _model_command(
     if scenario.link.type == INPROC:
         raise UserError("--controller: is a process, and a run in process has none; choose --link")
     compile_for_model(scenario, notice)
-    return model_command(folder, options.controller, options.map)
+    return model_command(options.controller, options.map)
 
 
 def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:

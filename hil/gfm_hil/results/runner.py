@@ -56,7 +56,8 @@ def run_scenario(
         notice: told what a person should know while waiting.
         figures: draw the figures and write report.html.
         controller_command: program and arguments of another controller instead of ours, for a
-            link that is none of ``inproc``; see ``Processes``.
+            link that is none of ``inproc``; see ``Processes``. Here ``{folder}`` becomes the run
+            folder.
 
     Raises:
         UserError: the folder is in use, no operating point, an endpoint that is occupied. The
@@ -77,7 +78,8 @@ def run_scenario(
                 if scenario.in_process:
                     began = _run_here([bench], [folder], progress, interrupt)
                 else:
-                    command = tuple(controller_command)
+                    own = str(folder.absolute())
+                    command = tuple(x.replace("{folder}", own) for x in controller_command)
                     both = Processes(scenario, folder, progress, notice, interrupt, command)
                     began, outside = both.run()
         except UserError:
@@ -89,16 +91,15 @@ def run_scenario(
         return finish(scenario, folder, labels, wall_s, figures, outside.get(""))
 
 
-def model_command(folder: Path, model: str, ports: Path | None) -> list[str]:
+def model_command(model: str, ports: Path | None) -> list[str]:
     """The ``controller_command`` of a run whose controller steps a model in place of the law.
 
     Args:
-        folder: of the run.
         model: ``dll:FILE`` or ``fmu:FILE``.
         ports: file of the map of its ports.
     """
     command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
-    command += ["--endpoint", "{endpoint}", "--out", str(folder.absolute()), "--quiet"]
+    command += ["--endpoint", "{endpoint}", "--out", "{folder}", "--quiet"]
     command += ["--part", str(os.getpid()), "--model", model]
     return command + (["--map", str(ports.absolute())] if ports else [])
 

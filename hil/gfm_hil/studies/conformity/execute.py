@@ -24,9 +24,10 @@ from gfm_hil.results.runner import (
 from gfm_hil.scenario.model import Link, Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
-from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, worst
-from gfm_hil.studies.conformity.model import Part, UnderTest
+from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, judge_nfp, worst
+from gfm_hil.studies.conformity.model import Criterion, Nfp, Part, UnderTest
 from gfm_hil.studies.conformity.sets import Case, scenario_of
+from gfm_hil.studies.identification import identify
 
 _POLL_S = 0.2
 
@@ -261,28 +262,73 @@ def run_part(job: Job) -> Found:
     if part.cannot is not None:
         reason = f"Cannot be judged: {part.cannot}"
         return Found(*names, "none", reason, cannot(criteria, reason))
+    if isinstance(criteria[0], Nfp):
+        return _plot(job, criteria[0])
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
             run, others = _run(job, scenario, stack)
         except UserError as problem:
-            text = str(problem).replace("\n", "; ").replace(job.file, job.law)
-            reason = f"Cannot be judged: there is no such run: {text}"
-            return Found(*names, "none", reason, cannot(criteria, reason))
+            return _no_run(job, criteria, problem)
         verdicts = judge(run, criteria, job.under, others)
         again, figure = "", None
         if job.folder is not None:
-            place = job.folder / "runs" / slug(job.law) / slug(job.name)
-            place.mkdir(parents=True, exist_ok=True)
-            write_scenario(place, scenario)
+            place = _place(job.folder, job, scenario)
             again = _again(place, job.foreign)
             if job.figures and run.ticks:
                 from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
 
                 figure = place / "figure.png"
-                draw_part(figure, f"{job.law} · {job.name} · {scenario.title}", run, verdicts)
+                draw_part(figure, _title(job, scenario), run, verdicts)
         reason = str(run.summary["reason"])
         return Found(*names, run.status, reason, verdicts, again, figure)
+
+
+def _plot(job: Job, asked: Nfp) -> Found:
+    """Measure, judge and draw a network-frequency-perturbation plot."""
+    foreign = job.foreign
+    try:
+        scenario = _scenario(job)
+        found = identify(
+            None, scenario, start_hz=asked.from_hz, stop_hz=asked.to_hz, points=asked.points,
+            controller_command=model_command(foreign.model, foreign.ports) if foreign else (),
+        )  # fmt: skip
+    except UserError as problem:
+        return _no_run(job, [asked], problem)
+    again, figure = "", None
+    if job.folder is not None:
+        place = _place(job.folder, job, scenario)
+        if foreign is None:
+            again = shlex.join(
+                ["gfmhil", "identify", str(place / "scenario.toml"), "--from", f"{asked.from_hz:g}",
+                 "--to", f"{asked.to_hz:g}", "--points", str(asked.points)]
+            )  # fmt: skip
+        if job.figures:
+            from gfm_hil.studies.conformity.figure import draw_plot
+
+            figure = place / "figure.png"
+            draw_plot(figure, _title(job, scenario), found, asked)
+    verdicts = judge_nfp(found.frequency, found.nfp, asked)
+    return Found(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
+
+
+def _no_run(job: Job, criteria: Sequence[Criterion], problem: UserError) -> Found:
+    text = str(problem).replace("\n", "; ").replace(job.file, job.law)
+    reason = f"Cannot be judged: there is no such run: {text}"
+    told = cannot(criteria, reason)
+    return Found(job.law, job.case.id, job.part.name, "none", reason, told)
+
+
+def _title(job: Job, scenario: Scenario) -> str:
+    return f"{job.law} · {job.name} · {scenario.title}"
+
+
+def _place(folder: Path, job: Job, scenario: Scenario) -> Path:
+    """The folder of a part, with its scenario."""
+    place = folder / "runs" / slug(job.law) / slug(job.name)
+    place.mkdir(parents=True, exist_ok=True)
+    write_scenario(place, scenario)
+    return place
 
 
 def _again(place: Path, foreign: Foreign | None) -> str:
@@ -302,7 +348,7 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     """
     if job.foreign is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        command = model_command(folder, job.foreign.model, job.foreign.ports)
+        command = model_command(job.foreign.model, job.foreign.ports)
         run = run_scenario(scenario, folder, figures=False, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ from gfm_hil.studies.conformity.model import (
     Damped,
     Energy,
     InStep,
+    Nfp,
     NoOscillation,
     NoTrip,
     PeakDelta,
@@ -103,6 +105,50 @@ def judge(
         for criterion in criteria
         for at in criterion.at or [_first(run)]
     ]
+
+
+def judge_nfp(hz: Vector, nfp: NDArray[np.complex128], asked: Nfp) -> list[Verdict]:
+    """The verdicts on a network-frequency-perturbation plot, one a band.
+
+    Args:
+        hz: frequencies, Hz, shape (K,).
+        nfp: change of p over that of the grid's frequency, p.u. over p.u., shape (K,).
+        asked: its bands, or why there are none.
+    """
+    made = partial(Verdict, asked.clause, asked.kind, "p", 0.0, 0.0)
+    gain, phase = np.abs(nfp), np.degrees(np.angle(nfp))
+    span = f"From {hz[0]:.3g} to {hz[-1]:.3g} Hz the gain lies between {gain.min():.4g} and "
+    span += f"{gain.max():.4g} p.u./p.u."
+    if asked.unknown is not None:
+        text = f"Cannot be judged: {asked.unknown}. {span}"
+        return [made(CANNOT, float(gain.max()), "p.u./p.u.", "", text)]
+    found = []
+    for band in asked.bands:
+        inside = (hz >= band.from_hz) & (hz <= band.to_hz)
+        where = f"{band.from_hz:g} to {band.to_hz:g} Hz"
+        if not inside.any():
+            found.append(made(CANNOT, None, "", where, f"No point lies between {where}."))
+            continue
+        for x, low, high, unit, name in (
+            (gain, band.low, band.high, "p.u./p.u.", "gain"),
+            (phase, band.phase_low, band.phase_high, "°", "phase"),
+        ):
+            if low is None and high is None:
+                continue
+            beyond = np.maximum(
+                -math.inf if low is None else low - x, -math.inf if high is None else x - high
+            )
+            k = int(np.argmax(np.where(inside, beyond, -math.inf)))
+            ok = bool(beyond[k] <= 0)
+            limits = [f"at least {low:g} {unit}"] if low is not None else []
+            limits += [f"at most {high:g} {unit}"] if high is not None else []
+            text = (
+                f"At {hz[k]:.3g} Hz the {name} is {x[k]:.4g} {unit}, the nearest to its limits "
+                f"or the furthest beyond them between {where}."
+            )
+            limit = f"{' and '.join(limits)}, {where}"
+            found.append(made(PASS if ok else FAIL, float(x[k]), unit, limit, text))
+    return found
 
 
 def cannot(criteria: Sequence[Criterion], reason: str) -> list[Verdict]:

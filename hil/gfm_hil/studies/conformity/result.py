@@ -246,7 +246,8 @@ _HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "wha
 
 def _row(v: Verdict) -> list[str]:
     measured = "–" if v.value is None else f"{cell(v.value)} {v.unit}".rstrip()
-    plain = (v.clause, v.signal or "–", f"{v.start:g} … {v.stop:g}", measured, v.limit, v.text)
+    window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
+    plain = (v.clause, v.signal or "–", window, measured, v.limit, v.text)
     return [status(v.verdict), *map(html.escape, plain)]
 
 
