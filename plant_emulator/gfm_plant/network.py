@@ -180,10 +180,9 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
             f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
             " plant.grid.load_L"
         )
-    least = 1.0
-    if min(records.par["i_peak"]) < math.inf:  # the hardware looks at the current once a piece
-        least = math.ceil(longest / _LOOK)
-    pieces = np.maximum(np.ceil(stretch * (fastest / (2 * _PIECE))), least)
+    # the hardware of a peak-current limit looks at the current once a piece
+    most = _LOOK if min(records.par["i_peak"]) < math.inf else longest
+    pieces = np.ceil(stretch * max(fastest / (2 * _PIECE), (1 - 1e-9) / most))
     net["pieces"][0, :parts], net["half_h"][0, :parts] = pieces, stretch / pieces / 2
     for k, r in enumerate(records.par):
         per_C = r["omega_b"] / r["C_dc"]
