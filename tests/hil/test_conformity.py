@@ -22,9 +22,10 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
+from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, judge_nfp, worst
-from gfm_hil.studies.conformity.model import Criterion, Nfp, Part
+from gfm_hil.studies.conformity.model import Criterion, Declared, Nfp, Part
 from gfm_hil.studies.conformity.sets import (
     Case,
     load_cases,
@@ -321,7 +322,7 @@ def test_a_converter_of_ones_own_lies_beside_its_file(
 
 def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> None:
     cases = load_cases(["all"])
-    sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "withstand"}
+    sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "rte", "withstand"}
     assert {case.id.split("/")[0] for case in cases} == {*shipped_sets()} == sets
     for case in cases:
         for part in case.test.runs():
@@ -630,6 +631,73 @@ def test_a_plot_without_known_limits_is_drawn_and_not_judged(tmp_path: Path) -> 
     (part,) = found.of("droop-3", f"{tmp_path.name}/plot")
     assert part.verdict == CANNOT and "nobody knows them" in part.words
     assert part.figure is not None and part.figure.is_file()
+
+
+@pytest.mark.parametrize(
+    ("event", "answer"),
+    [
+        (
+            {"type": "grid-phase-jump", "degrees": -8.0},
+            lambda u, t: math.radians(8.0) / 0.6 * envelopes.jump_response(u, t, 0.6),
+        ),
+        (
+            {"type": "grid-frequency", "f_hz": 49.0, "rate": 1.0},
+            lambda u, t: envelopes.rocof_response(u, t, -0.02, 3.0, lasts=1.0),
+        ),
+        (
+            {"type": "grid-impedance", "scr": 10.0, "x_over_r": 6.0},
+            lambda u, t: envelopes.scr_jump_response(u, t, 3.0, 10.0, 0.5),
+        ),
+    ],
+    ids=["jump", "ramp", "scr"],
+)
+@pytest.mark.parametrize(
+    ("factor", "verdict"), [(1.0, PASS), (1.02, PASS), (2.0, FAIL), (0.1, FAIL), (-1.0, FAIL)]
+)
+def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
+    event: dict[str, Any], answer: Any, factor: float, verdict: str
+) -> None:
+    """On p as it is; the mean over a cycle moves it by less than the envelope is wide."""
+    unit = Declared(D=150.0, H=5.0, X_eff=0.6 - 1 / 3)
+    scenario = Scenario.model_validate(
+        {
+            "title": "event", "duration": 4.0, "link": {"type": "inproc"},
+            "plant": {"grid": {"scr": 3.0, "x_over_r": 6.0}}, "events": [{"t": 1.0, **event}],
+        }
+    )  # fmt: skip
+    t = np.arange(40_000) * 1e-4 - 1.0
+    change = answer(envelopes.Unit(unit.D, unit.H, unit.X_eff), np.maximum(t, 0.0))
+    run = run_of(scenario, p=0.5 + factor * np.where(t >= 0, change, 0.0))
+    asked = one("in_envelope")
+    (found,) = judge(run, [asked], UNDER.model_copy(update={"unit": unit}))
+    assert found.verdict == verdict
+    assert (found.value == 0.0) is (verdict == PASS)
+    assert found.curve is not None and "curve" not in found.plain()
+    (unknown,) = judge(run, [asked], UNDER)
+    assert unknown.verdict == CANNOT and "are not declared" in unknown.text
+    (other,) = judge(run, [one("in_envelope", at=[2.5])], UNDER.model_copy(update={"unit": unit}))
+    assert other.verdict == CANNOT and "not that of an event" in other.text
+
+
+def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
+    lab: Path,
+) -> None:
+    criterion = '[[criteria]]\nkind = "in_envelope"\nclause = "as expected"\n'
+    (lab / "jump.toml").write_text(LAB.split("[[criteria]]")[0] + criterion)
+    asked = {"law": "vsg-2", "against": lab, "inner": "virtual-stator"}
+    own = gfmhil.conform(**asked, folder=lab.parent / "out")
+    assert own.matrix == {("vsg-2", "lab/jump"): PASS}
+    assert "the envelope of D = 1" in own.found[0].verdicts[0].text  # 1 % droop: D = 100
+    (figure,) = (lab.parent / "out").rglob("figure.png")
+    assert figure.stat().st_size > 10_000
+    declared = lab.parent / "light.toml"
+    shipped = (folder / "conformity" / "converter.toml" for folder in SCENARIO_FOLDERS)
+    text = next(path for path in shipped if path.is_file()).read_text("utf-8")
+    declared.write_text(
+        text.replace("[plant]", "unit = { D = 5.0, H = 0.5, X_eff = 0.3 }\n\n[plant]")
+    )
+    light = gfmhil.conform(**asked, converter=declared)
+    assert light.matrix == {("vsg-2", "lab/jump"): FAIL}
 
 
 def test_parts_without_a_criterion_are_refused() -> None:

@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,7 @@ from gfm_hil.studies.campaign.worker import compile_once
 from gfm_hil.studies.conformity import execute as conformity
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test
-from gfm_hil.studies.law import Law
+from gfm_hil.studies.law import Law, law_files
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.toml_file import read_toml
@@ -53,7 +52,7 @@ def run(
         UserError: one line a mistake; or the scenario has no operating point.
         LawError: the law is none.
     """
-    with _law_files([] if law is None else [law]) as files:
+    with law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
         made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
@@ -83,26 +82,6 @@ def _named(made: Run, law: Law) -> Run:
     return replace(
         made, scenario=scenario, summary=summary, laws=laws, events=events, law_text=law.to_toml()
     )
-
-
-@contextmanager
-def _law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
-    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts, which
-    messages call by the name of the law."""
-    with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
-        files: dict[str, str] = {}
-        for k, law in enumerate(laws):
-            if isinstance(law, Law):
-                files[law.name] = str(law.save(Path(place) / f"{k}.toml"))
-            else:
-                files[str(law)] = str(law)
-        try:
-            yield files
-        except UserError as problem:
-            text = str(problem)
-            for name, file in files.items():
-                text = text.replace(file, name)
-            raise UserError(text) from None
 
 
 @dataclass(frozen=True, repr=False)
@@ -194,7 +173,7 @@ def campaign(
             given = read_toml(path)
         except ValueError as problem:
             raise UserError(f"{path}: {problem}") from None
-    with _law_files(laws or []) as files:
+    with law_files(laws or []) as files:
         content = {**given, **changes} | ({"laws": list(files)} if files else {})
         made = check_campaign(content, path, laws=files)
         axes, place = find_axes(made, None, None), None if folder is None else Path(folder)
@@ -252,7 +231,7 @@ def conform(
     if inner is not None:
         named_inner(inner)
     found: list[conformity.Found] = []
-    with _law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
+    with law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
         for file in files.values():
             law_file(file)
         converters = Path(temporary) if place is None else place / "converters"

@@ -25,8 +25,9 @@ from gfm_hil.scenario.model import Link, Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
 from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, judge_nfp, worst
-from gfm_hil.studies.conformity.model import Criterion, Nfp, Part, UnderTest
+from gfm_hil.studies.conformity.model import Criterion, Declared, InEnvelope, Nfp, Part, UnderTest
 from gfm_hil.studies.conformity.sets import Case, scenario_of
+from gfm_hil.studies.envelopes import measure_unit
 from gfm_hil.studies.identification import identify
 
 _POLL_S = 0.2
@@ -270,7 +271,7 @@ def run_part(job: Job) -> Found:
             run, others = _run(job, scenario, stack)
         except UserError as problem:
             return _no_run(job, criteria, problem)
-        verdicts = judge(run, criteria, job.under, others)
+        verdicts = judge(run, criteria, _declared(job, scenario, criteria), others)
         again, figure = "", None
         if job.folder is not None:
             place = _place(job.folder, job, scenario)
@@ -282,6 +283,21 @@ def run_part(job: Job) -> Found:
                 draw_part(figure, _title(job, scenario), run, verdicts)
         reason = str(run.summary["reason"])
         return Found(*names, run.status, reason, verdicts, again, figure)
+
+
+def _declared(job: Job, scenario: Scenario, criteria: Sequence[Criterion]) -> UnderTest:
+    """What the owner declares, with the unit that is measured where it is asked for."""
+    under = job.under
+    if under.unit is not None or not any(isinstance(c, InEnvelope) for c in criteria):
+        return under
+    if job.foreign is not None:  # which runs over a link alone
+        return under
+    try:
+        found = measure_unit(None, scenario)
+    except UserError:
+        return under
+    unit = Declared(D=found.D, H=found.H, X_eff=found.X_eff)
+    return under.model_copy(update={"unit": unit})
 
 
 def _plot(job: Job, asked: Nfp) -> Found:

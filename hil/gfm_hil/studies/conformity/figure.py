@@ -81,7 +81,12 @@ def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:
     row = 0
     for v in verdicts:
         colour = VERDICT_COLOURS[v.verdict]
-        if v.limited is not None:
+        if v.curve is not None:
+            t, edges = v.curve[0], v.curve[1:]
+            axes.fill_between(t, edges[0], edges[1], color=colour, alpha=0.12, lw=0)
+            for edge in edges:
+                axes.plot(t, edge, color=colour, lw=1.2, ls=(0, (3, 1.5)))
+        elif v.limited is not None:
             for limit in (v.low, v.high):
                 if limit is not None:
                     axes.plot(v.limited, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))

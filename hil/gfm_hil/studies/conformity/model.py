@@ -146,6 +146,15 @@ class InStep(_Windowed):
     kind: Literal["stays_in_step"] = Field(description="kind of criterion")
 
 
+class InEnvelope(_Windowed):
+    """The means of p over the last cycle stay in the envelope that DyCoV draws around what a unit
+    of the declared or measured damping, inertia and reactance is expected to do. The event at the
+    time is a phase jump, a ramp of the grid's frequency or a jump of its short-circuit ratio."""
+
+    kind: Literal["in_envelope"] = Field(description="kind of criterion")
+    longest_s: float = Field(0.0, ge=0, description="s that p may be beyond, in one piece")
+
+
 class Band(_Model):
     """Limits of a gain and a phase between two frequencies."""
 
@@ -203,6 +212,7 @@ Criterion = Annotated[
     | NoTrip
     | NoOscillation
     | InStep
+    | InEnvelope
     | Nfp,
     Field(discriminator="kind"),
 ]
@@ -270,6 +280,14 @@ class Test(_Model):
         return self
 
 
+class Declared(_Model):
+    """The grid-forming unit that the converter is declared to be."""
+
+    D: float = Field(ge=0, description="damping, p.u. of power over p.u. of frequency")
+    H: float = Field(gt=0, description="inertia constant, s")
+    X_eff: float = Field(gt=0, description="effective reactance, p.u.")
+
+
 class UnderTest(_Model):
     """The converter under test: its plant, and what its owner declares."""
 
@@ -279,3 +297,6 @@ class UnderTest(_Model):
     )
     P_max: float = Field(description="declared: most power in the steady state, p.u.")
     P_min: float = Field(description="declared: least power in the steady state, p.u.")
+    unit: Declared | None = Field(
+        None, description="declared, for in_envelope; measured by a small phase jump if none"
+    )
