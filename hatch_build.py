@@ -11,6 +11,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 # Of deploy/ by name: keys may lie beside them. gfm_hil.cli.deploy has the same list.
 FILES = (
     "scenarios/**/*.csv",
+    "scenarios/**/LICENSE.txt",
     "scenarios/**/*.toml",
     "deploy/can/*",
     "deploy/container/Containerfile",

@@ -11,7 +11,7 @@ import pytest
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.models import open_model, read_map
+from gfm_hil.models import Rig, open_model, read_map
 from gfm_hil.models.ports import PortMap, wire
 from gfm_hil.results import runner
 from gfm_hil.results.run import Run
@@ -275,8 +275,8 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        ("exe:x", "must be dll:FILE or fmu:FILE"),
-        ("dll:", "must be dll:FILE or fmu:FILE"),
+        ("exe:x", "must be dll:FILE, fmu:FILE or c:FILE"),
+        ("dll:", "must be dll:FILE, fmu:FILE or c:FILE"),
         ("dll:none.so", "none.so: there is no such file"),
         ("dll:{text}", "cannot be loaded"),
         ("fmu:{text}", "is no FMU that FMPy reads"),
@@ -285,7 +285,7 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
 def test_a_file_that_is_no_model_is_refused(model: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "text").write_text("no model")
     with pytest.raises(UserError, match=message):
-        open_model(model.format(text=tmp_path / "text"), PortMap(), 1e-4, False)
+        open_model(model.format(text=tmp_path / "text"), PortMap(), Rig())
 
 
 def test_the_command_refuses_what_makes_no_sense(

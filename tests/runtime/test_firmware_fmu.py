@@ -290,7 +290,7 @@ def test_what_the_command_refuses(
 ) -> None:
     out = ["-o", str(tmp_path / "law.fmu")]
     assert main(["firmware", "fmu", "vsg-1", "-o", str(tmp_path / "no" / "law.fmu")]) == 2
-    assert "No such file or directory" in capsys.readouterr().err
+    assert f"{tmp_path}/no/law.fmu: No such file or directory" in capsys.readouterr().err
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["firmware", "fmu", "vsg-1", *out]) == 2
     assert "apt-get install gcc libc6-dev" in capsys.readouterr().err

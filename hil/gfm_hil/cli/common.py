@@ -25,7 +25,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages
+from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages, staged
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
 from gfm_hil.scenario.model import Scenario, load_scenario
@@ -196,7 +196,7 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console.print(f"[bold {colour}]{summary['status']}[/]{expected}{reason}", highlight=False)
     for part in summary["unmet"]:
         console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
-    stage = f" · inner stage {inner_stages(summary)}" if "inner" in summary else ""
+    stage = f" · inner stage {inner_stages(summary)}" if staged(summary) else ""
     console.print(escape(controlled_by(summary) + stage), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from importlib.resources import files
 from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
@@ -66,6 +67,10 @@ def add(command: argparse.ArgumentParser) -> None:
     )
     vectors.add_argument("-o", "--out", type=Path, metavar="FILE", help="else to the screen")
     vectors.set_defaults(call=call_golden)
+    include = kinds.add_parser(
+        "include", help="print the folder of gfmhil_controller.h, for a controller in C of your own"
+    )
+    include.set_defaults(call=call_include)
     proof = kinds.add_parser("check", help="build and run a folder, and compare every bit")
     proof.add_argument("folder", type=Path, metavar="DIR", help="what export wrote")
     proof.add_argument(
@@ -144,6 +149,12 @@ def call_golden(options: argparse.Namespace) -> int:
         print(text, end="")
     else:
         write_text(options.out, text)
+    return 0
+
+
+def call_include(_: argparse.Namespace) -> int:
+    """Print the folder of our header; returns the exit code."""
+    print(files("gfm_hil.models"))
     return 0
 
 

@@ -25,10 +25,11 @@ from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
-from gfm_hil.models import open_model, read_map
+from gfm_hil.models import Rig, open_model, read_map
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import Scenario
+from gfm_plant import load_converter
 from gfm_runtime.errors import meant
 
 
@@ -40,7 +41,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--quiet", action="store_true", help="say nothing but errors")
     command.add_argument(
         "--model", metavar="KIND:FILE",
-        help="of the controller: dll:FILE or fmu:FILE, which computes u in place of the law",
+        help="of the controller: dll:FILE, fmu:FILE or c:FILE, which gives u in place of the law",
     )  # fmt: skip
     add_map(command, "--model")
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
@@ -58,7 +59,7 @@ def call(options: argparse.Namespace) -> int:
     model = None
     if options.model is not None:
         ports = read_map(options.map)
-        model = open_model(options.model, ports, scenario.T_s, scenario.has_inner)
+        model = open_model(options.model, ports, _rig(scenario))
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
     if options.part is not None:  # of `gfmhil run`, which puts the parts together
@@ -94,6 +95,12 @@ def call(options: argparse.Namespace) -> int:
     elif not options.quiet:
         print_summary(runs[""].summary, folder)
     return max(exit_code(run.summary) for run in runs.values())
+
+
+def _rig(scenario: Scenario) -> Rig:
+    """What a model in place of the controller is connected to."""
+    delay, bases = scenario.plant.delay, load_converter(scenario.plant.converter).bases
+    return Rig(scenario.T_s, scenario.has_inner, bases, delay.samples + delay.fraction)
 
 
 def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:

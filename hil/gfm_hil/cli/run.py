@@ -34,7 +34,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument(
         "--controller", metavar="KIND:FILE",
-        help="dll:FILE (IEEE/CIGRE) or fmu:FILE: the controller, in place of a law of ours",
+        help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours",
     )  # fmt: skip
     add_map(command, "--controller")
     command.add_argument("--out", help="run folder; runs/<scenario>-<time> by default")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 
 from rich.table import Column, Table
 
@@ -31,6 +32,7 @@ def call(options: argparse.Namespace) -> int:
     )
     table = Table(*columns, box=None, pad_edge=False)
     for name, s in found.items():
-        table.add_row(name, s.mode, ", ".join(s.laws()), f"{s.duration:g}", s.title)
+        laws = ", ".join(Path(law).name for law in s.laws())
+        table.add_row(name, s.mode, laws, f"{s.duration:g}", s.title)
     terminal().print(table)
     return 0

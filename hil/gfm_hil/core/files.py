@@ -18,7 +18,7 @@ def replacing(path: Path) -> Iterator[Path]:
     the new one. If the block raises, ``path`` stays as it was.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the file cannot be written; it names ``path``, not the path beside it.
     """
     part = path.with_name(f"{_PREFIX}{os.getpid()}-{path.name}")
     try:
@@ -26,6 +26,10 @@ def replacing(path: Path) -> Iterator[Path]:
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(path)
+    except OSError as problem:
+        if problem.filename != str(part):
+            raise
+        raise OSError(problem.errno, problem.strerror, str(path)) from None
     finally:
         part.unlink(missing_ok=True)
 

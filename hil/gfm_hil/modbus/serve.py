@@ -22,7 +22,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity
 from gfm_hil.core.roles import ROLES
 from gfm_hil.core.supervised import supervised
-from gfm_hil.engine.announcement import present
+from gfm_hil.engine.announcement import not_running, present
 from gfm_hil.modbus.connection import CLIENT, UNIT, Server
 from gfm_hil.modbus.device import TICK_S, Device
 from gfm_hil.modbus.image import BASE
@@ -115,7 +115,7 @@ async def _serve(
     over = _until_told()
     while watcher.look() is None:  # the handshake may not be over
         if over.is_set() or not _going(folder):
-            raise UserError(f"{folder}: no run is going on there")
+            raise not_running(folder)
         await asyncio.sleep(TICK_S)
     began = time.monotonic()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -10,9 +11,28 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.models.ports import PortMap
+from gfm_plant import Bases
 
-KINDS = ("dll", "fmu")
+KINDS = ("dll", "fmu", "c")
+_FORMS = "dll:FILE, fmu:FILE or c:FILE"
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What a model is connected to.
+
+    Attributes:
+        T_s: sampling time of the run, s.
+        inner: whether the run has an inner stage, so that y and u have its signals.
+        bases: of the converter.
+        delay: from the sampling of y to the moment when u acts, in ticks.
+    """
+
+    T_s: float = 1e-4
+    inner: bool = False
+    bases: Bases = field(default_factory=Bases)
+    delay: float = 0.0
 
 
 class ModelError(Exception):
@@ -48,14 +68,14 @@ class Model(Protocol):
         """End it, and remove what it left."""
 
 
-def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model:
-    """The model ``KIND:FILE``, for a run with sampling time T_s [s].
+def open_model(text: str, ports: PortMap, rig: Rig) -> Model:
+    """The model ``KIND:FILE``.
 
     Args:
-        text: ``dll:FILE`` or ``fmu:FILE``.
+        text: ``dll:FILE``, ``fmu:FILE``, or ``c:FILE`` for a library that has the interface of
+            ``gfmhil_controller.h``.
         ports: which signal each of its ports is.
-        T_s: sampling time of the run, s.
-        inner: whether the run has an inner stage, so that y and u have its signals.
+        rig: what it is connected to.
 
     Raises:
         UserError: there is no such file, it is no such model, or its ports do not fit.
@@ -64,10 +84,14 @@ def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model:
     if kind == "dll":
         from gfm_hil.models.dll import DllModel
 
-        return DllModel(path, ports, T_s, inner)
+        return DllModel(path, ports, rig.T_s, rig.inner)
+    if kind == "c":
+        from gfm_hil.models.library import LibraryModel
+
+        return LibraryModel(path, ports, rig)
     from gfm_hil.models.fmu import FmuModel
 
-    return FmuModel(path, ports, T_s, inner)
+    return FmuModel(path, ports, rig.T_s, rig.inner)
 
 
 def model_file(text: str) -> tuple[str, Path]:
@@ -78,7 +102,7 @@ def model_file(text: str) -> tuple[str, Path]:
     """
     kind, colon, file = text.partition(":")
     if not colon or kind not in KINDS or not file:
-        raise UserError(f"controller {text!r}: must be dll:FILE or fmu:FILE")
+        raise UserError(f"controller {text!r}: must be {_FORMS}")
     path = Path(file).absolute()
     if not path.is_file():
         raise UserError(f"{file}: there is no such file")

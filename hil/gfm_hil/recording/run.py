@@ -213,10 +213,11 @@ class RecordedRun:
 
 
 def controlled_by(summary: Mapping[str, Any]) -> str:
-    """The laws of a run, or what a controller that is not ours calls itself."""
+    """The laws of a run, files without their folders, or what a controller that is not ours calls
+    itself."""
     name = summary.get("controller", OUR_CONTROLLER)
     if name == OUR_CONTROLLER:
-        return " → ".join(summary["laws"])
+        return " → ".join(Path(law).name for law in summary["laws"])
     return name or "a controller that gave no name"
 
 

@@ -83,6 +83,12 @@ def event_metrics(
     has_settled = done > 0 and settled < 0.95 * length and settled < done
     beyond = slow_high - final if step > 0 else final - slow_low
     nadir, top, slope = _frequency(f, start, stop, max(1, round(ROCOF_WINDOW / T_s)))
+    # a controller of phase voltages commands a frame of constant speed, which is no frequency
+    tells = (
+        nadir != top or not np.isnan(signals["law"][start : start + 1][0])
+        if "law" in signals
+        else True
+    )
     v_low, v_high = _extremes(pieces(V, start, stop))
     free = start + lasts if stop - start - lasts >= _FEW else start
     first = p[free : min(stop, free + round(LONGEST / T_s))]
@@ -95,9 +101,9 @@ def event_metrics(
         "t90_s": _crossed(p, start, stop, before, 0.9 * way, T_s) if abs(way) >= _NO_STEP else None,
         "settling_s": settled * T_s if has_settled else None,
         "i_peak": _extremes(pieces(i, start, stop))[1],
-        "f_nadir_hz": nadir * f_n,
-        "f_peak_hz": top * f_n,
-        "rocof_hz_s": None if slope is None else slope * f_n / T_s,
+        "f_nadir_hz": nadir * f_n if tells else None,
+        "f_peak_hz": top * f_n if tells else None,
+        "rocof_hz_s": slope * f_n / T_s if slope is not None and tells else None,
         "v_min": v_low,
         "v_max": v_high,
     }

@@ -94,6 +94,11 @@ def finite(value: Any) -> Any:
     return value
 
 
+def staged(summary: Mapping[str, Any]) -> bool:
+    """Whether laws of ours with an inner stage controlled the run."""
+    return "inner" in summary and bool(summary["laws"])
+
+
 def inner_stages(summary: Mapping[str, Any]) -> str:
     """The kinds of the laws' inner stages in words: one if all have the same."""
     kinds = summary["inner"]
@@ -126,7 +131,7 @@ def write_report(
     )
     facts = [
         ("controlled by", controlled_by(summary)),
-        *([("inner stage", inner_stages(summary))] if "inner" in summary else []),
+        *([("inner stage", inner_stages(summary))] if staged(summary) else []),
         ("link, mode", f"{summary['link']}, {summary['mode']}"),
         (
             "simulated",

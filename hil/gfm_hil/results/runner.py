@@ -95,7 +95,7 @@ def model_command(model: str, ports: Path | None) -> list[str]:
     """The ``controller_command`` of a run whose controller steps a model in place of the law.
 
     Args:
-        model: ``dll:FILE`` or ``fmu:FILE``.
+        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``.
         ports: file of the map of its ports.
     """
     command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]

@@ -6,6 +6,7 @@ with # are for people. Between its lines a course is straight.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import math
@@ -172,19 +173,42 @@ def content_hash(file: str) -> str:
 
 
 def look_beside(content: Any, folder: Path) -> None:
-    """Make the files of a scenario's courses absolute where they lie in the scenario's folder.
+    """Make the files that a scenario names absolute where they lie in the scenario's folder: laws,
+    inner stages, converters and courses of the grid.
 
     Args:
         content: of the scenario's file, plain data that nobody has checked.
         folder: of the file.
     """
-    events = content.get("events") if isinstance(content, dict) else None
-    for event in events if isinstance(events, list) else []:
-        file = event.get("file") if isinstance(event, dict) else None
-        if isinstance(file, str) and "\0" not in file and len(file) < 4096:
-            beside = folder / file
-            try:
-                if beside.is_file():
-                    event["file"] = str(beside.absolute())
-            except OSError:  # a name too long: the check of the file says so
-                continue
+    for table, key in _files(content):
+        file = table[key]
+        if not isinstance(file, str) or "\0" in file:
+            continue
+        if key != "file" and not file.endswith(".toml"):
+            continue
+        with contextlib.suppress(OSError):  # a name too long: the check of the file says so
+            if (folder / file).is_file():
+                table[key] = str((folder / file).absolute())
+
+
+def _files(content: Any) -> Iterator[tuple[Any, Any]]:
+    """The places of a scenario's content that may name files, each as container and key."""
+
+    def within(table: Any, *keys: str) -> Iterator[tuple[Any, Any]]:
+        for key in keys if isinstance(table, dict) else ():
+            value = table.get(key)
+            if isinstance(value, list):
+                yield from ((value, k) for k in range(len(value)))
+            elif key in table:
+                yield table, key
+
+    def inside(table: Any, key: str) -> Any:
+        return table.get(key) if isinstance(table, dict) else None
+
+    members = inside(inside(content, "network"), "converters")
+    for one in (content, *(members.values() if isinstance(members, dict) else ())):
+        yield from within(one, "law", "inner", "ready_laws", "compare")
+        yield from within(inside(one, "plant"), "converter")
+    events = inside(content, "events")
+    for event in events if isinstance(events, list) else ():
+        yield from within(event, "file", "law")

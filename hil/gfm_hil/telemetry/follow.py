@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.announcement import not_running
 from gfm_hil.recording.columns import Columns, named
 from gfm_hil.recording.live import LiveRun, begun
 from gfm_hil.recording.timing import count_misses
@@ -54,7 +55,7 @@ class Follower:
         if (folder / "summary.json").is_file():
             raise UserError(f"{folder}: the run is over, see gfmhil export")
         if not begun(folder):
-            raise UserError(f"{folder}: no run is going on there; --wait waits for one")
+            raise UserError(f"{not_running(folder)}; --wait waits for one")
         self.folder, self.run = folder, LiveRun(folder)
         self.T_s = self.run.T_s
         self._next = {role: self.run.done(role) for role in ROLES}

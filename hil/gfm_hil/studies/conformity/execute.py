@@ -41,7 +41,7 @@ class Foreign:
     """A model as the controller, in place of a law.
 
     Attributes:
-        model: ``dll:FILE`` or ``fmu:FILE``.
+        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``.
         ports: file of the map of its ports.
     """
 

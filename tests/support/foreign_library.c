@@ -1,0 +1,67 @@
+/* A controller library that misbehaves at its step AT in the way that FOREIGN_WHAT names; until then
+ * it leaves the bridge's voltage turning at the nominal speed. */
+#define _DEFAULT_SOURCE
+#include "gfmhil_controller.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#define AT 100
+#ifndef SAYS
+#define SAYS GFMHIL_CONTROLLER_VERSION
+#endif
+
+static gfmhil_setup rated;
+static const char *what;
+static int steps;
+
+int gfmhil_version(void) { return SAYS; }
+const char *gfmhil_name(void) { return "a library that fails"; }
+
+void *gfmhil_new(const gfmhil_setup *setup)
+{
+    what = getenv("FOREIGN_WHAT");
+    rated = *setup;
+    return strcmp(what, "refuse") ? &rated : NULL;
+}
+
+int gfmhil_start(void *self, const gfmhil_input *in, const gfmhil_output *now)
+{
+    (void)self, (void)in, (void)now;
+    steps = 0;
+    return strcmp(what, "start") ? 0 : 3;
+}
+
+int gfmhil_step(void *self, const gfmhil_input *in, gfmhil_output *out)
+{
+    (void)self, (void)in;
+    /* after the first call e turns by its angle in one period */
+    const double turn = steps ? rated.omega_n * rated.period : 0.0;
+    const double c = cos(turn), s = sin(turn) / sqrt(3.0);
+    const double a = out->e[0], b = out->e[1], d = out->e[2];
+    out->e[0] = c * a - s * (b - d);
+    out->e[1] = c * b - s * (d - a);
+    out->e[2] = c * d - s * (a - b);
+    if (steps++ < AT)
+        return 0;
+    if (!strcmp(what, "crash"))
+        *(volatile int *)0 = 1;
+    if (!strcmp(what, "hang"))
+        for (;;)
+            sleep(1);
+    if (!strcmp(what, "slow"))
+        usleep(80000);
+    if (!strcmp(what, "nan"))
+        out->e[1] = NAN;
+    return strcmp(what, "fault") ? 0 : 7;
+}
+
+const char *gfmhil_fault(void *self, int number)
+{
+    (void)self;
+    return number == 7 ? "the cooling has stopped" : NULL;
+}
+
+void gfmhil_free(void *self) { (void)self; }
