@@ -66,8 +66,8 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--controller", metavar="KIND:FILE",
-        help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: a controller to test, with or without laws beside "
-        "it; it begins at the operating point of the first law",
+        help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: a controller to test, with or without "
+        "laws beside it; it begins at the operating point of the first law",
     )  # fmt: skip
     add_map(command, "--controller")
     command.add_argument(
