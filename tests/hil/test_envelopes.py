@@ -234,6 +234,12 @@ def test_a_law_makes_a_unit_of_its_converter() -> None:
     assert more.X_eff == pytest.approx(0.3, rel=0.1)  # X_v of the stage
 
 
+def test_a_law_without_inertia_makes_a_unit_of_almost_none() -> None:
+    at = {"plant__grid": {"scr": 10.0, "x_over_r": 10.0}, "references__P_ref": 0.0}
+    unit = measure_unit("droop-1", inner="virtual-stator", **at)
+    assert pytest.approx(100.0, rel=0.15) == unit.D and unit.H < 0.05
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

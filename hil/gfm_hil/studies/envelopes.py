@@ -40,6 +40,7 @@ Response = NDArray[np.complex128]
 
 OMEGA_B = 314.0  # rad/s, as DyCoV rounds it
 _APART = 1e-5  # of the poles' size; closer ones are moved this far from each other
+_FAR = 30.0  # of the logarithms of a fit, where there is none
 _TUNNEL_S, _TUNNEL_FROM = 0.3, 0.02  # s; how the tunnel opens
 _T_90 = 0.01  # s; reactive current after a step of the grid's voltage
 _HALF, _HALF_S, _HALF_LEAST = 0.5, 0.03, 0.005  # after an SCR jump: of the change, s, p.u.
@@ -345,7 +346,7 @@ def fit_jump(
     at, p = t[used], change[used]
 
     def off(z: Vector) -> Vector:
-        X, zero, stiff = np.exp(z)
+        X, zero, stiff = np.exp(np.clip(z, -_FAR, _FAR))
         return -radians / X * _impulse([1.0, zero], [1.0, zero, stiff], at) - p
 
     largest = float(np.abs(p).max())
