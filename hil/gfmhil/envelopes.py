@@ -9,7 +9,9 @@ from gfm_hil.studies.envelopes import (
     fit_ramp,
     measure_unit,
     phase_jump,
+    rocof,
     rocof_response,
+    scr_jump,
     scr_jump_response,
 )
 
@@ -22,6 +24,8 @@ __all__ = [
     "fit_ramp",
     "measure_unit",
     "phase_jump",
+    "rocof",
     "rocof_response",
+    "scr_jump",
     "scr_jump_response",
 ]

@@ -242,13 +242,43 @@ def _stretch(plant: PlantRecords, part: int) -> None:
             s.E[0] *= scale
             s.E[1] *= scale
         s.E_told[0], s.E_told[1] = s.E[0], s.E[1]
-    c = circuit(n, now)
-    for _ in range(n.pieces[part]):
-        for k in range(n.n_converters):
-            r, s = plant.par[k], plant.st[k]
-            if r.i_peak < math.inf and s.trip == 0:
-                s.E[0], s.E[1] = _within_peak(plant, k, part)
-        _piece(plant, c, part)
+    c, cut = circuit(n, now), part
+    for k in range(n.n_converters):
+        if _may_peak(plant, k, part):
+            cut = part + n.n_parts
+    for _ in range(n.pieces[cut]):
+        if cut != part:
+            for k in range(n.n_converters):
+                if plant.par[k].i_peak < math.inf and plant.st[k].trip == 0:
+                    s = plant.st[k]
+                    s.E[0], s.E[1] = _within_peak(plant, k, cut)
+        _piece(plant, c, cut)
+
+
+@compiled
+def _may_peak(plant: PlantRecords, k: int, part: int) -> bool:
+    """Return whether the current of L_f might come near its limit in a stretch of length h.
+
+    With a = omega_b h / L_f and b = omega_b h / C_f it moves by at most a |E - v| +
+    a b / 2 |i - i_o|, as without losses i - i_o and v swing against each other; the fifth of the
+    limit that is left is for what i_o does meanwhile. A fault at the terminal takes v at once.
+    """
+    n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
+    if not r.i_peak < math.inf or s.trip != 0:
+        return False
+    if now.faulted:
+        return True
+    f, c, o = own(k) + I_F, own(k) + V, own(k) + I_O
+    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
+    E_r, E_i = s.E_told[0] * u_r - s.E_told[1] * u_i, s.E_told[0] * u_i + s.E_told[1] * u_r
+    E_r, E_i = E_r - now.w[c, 0], E_i - now.w[c, 1]
+    i_r, i_i = now.w[f, 0], now.w[f, 1]
+    d_r, d_i = i_r - now.w[o, 0], i_i - now.w[o, 1]
+    h = r.omega_b * n.stretch[part]
+    a, b = h / r.L_f, h / r.C_f
+    size = r.current * math.sqrt(i_r * i_r + i_i * i_i) + a * math.sqrt(E_r * E_r + E_i * E_i)
+    size += 0.5 * a * b * r.current * math.sqrt(d_r * d_r + d_i * d_i)
+    return not size < 0.8 * r.i_peak
 
 
 @compiled

@@ -199,11 +199,11 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
         places[machine.emf] = (N + 1 + j,)
         net["current_at"][0, j] = order.index(machine.name)
     net["check_w"] = net["check_s"] = 0.0
-    parts = int(net[0]["n_parts"])
+    cuts = 2 * int(net[0]["n_parts"])
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][0, circuit] = len(modes.rates)
         _set(net["rate"][0, circuit, :n], modes.rates)
-        for part, half in enumerate(net["half_h"][0, :parts]):
+        for part, half in enumerate(net["half_h"][0, :cuts]):
             _set(net["decay"][0, circuit, part, :n], np.exp(modes.rates * half))
         _set(net["states"][0, circuit, : len(order), :n], modes.states)
         _set(net["modes"][0, circuit, :n, : len(order)], modes.modes)
@@ -236,11 +236,11 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
             f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
             " plant.grid.load_L"
         )
-    least = 1.0
-    if min(records.par["i_peak"]) < math.inf:  # the hardware looks at the current once a piece
-        least = math.ceil(longest / _LOOK)
-    pieces = np.maximum(np.ceil(stretch * (fastest / (2 * _PIECE))), least)
-    net["pieces"][0, :parts], net["half_h"][0, :parts] = pieces, stretch / pieces / 2
+    # the hardware of a peak-current limit looks at the current once a piece of the second cut
+    each = np.concatenate([stretch, stretch])
+    most = np.repeat([longest, _LOOK], parts)
+    pieces = np.ceil(each * np.maximum(fastest / (2 * _PIECE), (1 - 1e-9) / most))
+    net["pieces"][0, : 2 * parts], net["half_h"][0, : 2 * parts] = pieces, each / pieces / 2
     for k, r in enumerate(records.par):
         per_C = r["omega_b"] / r["C_dc"]
         rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
@@ -252,10 +252,10 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
                 f" rad/s; allowed are {2 * _DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
             )
         r["dc_steps"] = max(1, math.ceil(rate * max(net["half_h"][0, :parts]) / _DC_STEP))
-        for part, half in enumerate(net["half_h"][0, :parts]):
+        for part, half in enumerate(net["half_h"][0, : 2 * parts]):
             net["sensor_weights"][0, part, k] = _low_pass(float(r["omega_s"] * 2 * half))
     for j in range(int(net[0]["n_sinks"])):
-        for part, half in enumerate(net["half_h"][0, :parts]):
+        for part, half in enumerate(net["half_h"][0, : 2 * parts]):
             lag = float(net[0]["tau_sink"][j])
             net["sink_weights"][0, part, j] = _low_pass(2 * half / lag)
 

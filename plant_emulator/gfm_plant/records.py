@@ -206,26 +206,27 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("n_sinks", "i8"),
             ("S_sink", "f8", (n_l, 2)),
             ("tau_sink", "f8", (n_l,)),
-            ("sink_weights", "f8", (n_parts, n_l, 4)),
+            ("sink_weights", "f8", (2 * n_parts, n_l, 4)),
             ("least_v2", "f8", (n_l,)),
             ("voltage_at", "i8", (n_l,)),
             ("to_grid", "f8", (n_w,)),  # what each state of w brings to the grid, as a current
             # one sampling period in stretches, between the instants at which a command begins to
-            # act; each is cut into pieces for Simpson's rule, and each piece in halves
+            # act; each is cut into pieces for Simpson's rule, and each piece in halves. Another cut
+            # of each, n_parts places further on, lets a peak-current limit look at the current
             ("T_s", "f8"),
             ("n_converters", "i8"),
             ("n_parts", "i8"),
             ("stretch", "f8", (n_parts,)),  # s
-            ("pieces", "i8", (n_parts,)),
-            ("half_h", "f8", (n_parts,)),  # s
+            ("pieces", "i8", (2 * n_parts,)),
+            ("half_h", "f8", (2 * n_parts,)),  # s
             ("age", "i8", (n_parts, converters)),  # place in `u` of the command that acts
             # of the last reading, and of a piece's parabola
-            ("sensor_weights", "f8", (n_parts, converters, 4)),
+            ("sensor_weights", "f8", (2 * n_parts, converters, 4)),
             # the modes of each circuit
             ("n_states", "i8"),  # of w, without those at its end that the plant does not have
             ("n_modes", "i8", (n_c,)),
             ("rate", "f8", (n_c, n_w, 2)),  # real and imaginary part, also below; 1/s
-            ("decay", "f8", (n_c, n_parts, n_w, 2)),  # in half a piece of each stretch
+            ("decay", "f8", (n_c, 2 * n_parts, n_w, 2)),  # in half a piece of each cut
             ("drive", "f8", (n_c, n_w, n_s, 2)),
             ("states", "f8", (n_c, n_w, n_w, 2)),
             ("modes", "f8", (n_c, n_w, n_w, 2)),

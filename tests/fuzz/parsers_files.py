@@ -25,6 +25,7 @@ from gfm_hil.scenario.profiles import read_profile
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_hil.scope.record import open_record
 from gfm_hil.studies.campaign import loading
+from gfm_hil.studies.conformity.diff import Results, compare_results, read_results
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test
 from gfm_hil.telemetry.follow import Follower
 from gfm_runtime import LawError, discretise, get_law, load_law
@@ -35,6 +36,12 @@ from .conftest import Parser, Take
 from .mutations import blobs, texts
 
 CATALOGUE = Path(load_law.__code__.co_filename).parent / "laws"
+RESULTS = """
+{"version": "1.0", "inner": null, "under_test": {"droop": 0.01}, "laws": {"vsg-2": {"lab/jump": {
+"verdict": "pass", "parts": [{"part": "a", "verdict": "pass", "reason": "", "clauses": [
+{"clause": "opposes", "kind": "rise", "verdict": "pass", "value": 0.5, "unit": "s", "text": "x"}]},
+{"part": "b", "verdict": "cannot judge", "reason": "no", "clauses": []}]}}}}
+"""
 CAMPAIGN = """
 title = "two runs"
 scenario = "rig_pref_step"
@@ -224,6 +231,24 @@ def _conformity_files() -> st.SearchStrategy[bytes]:
     return texts(_shipped(*folders, *(folder / "miso" for folder in folders)))
 
 
+@contextlib.contextmanager
+def _conformity_results(place: Path) -> Iterator[Take]:
+    """An input is a report's results.json, compared with a good one, either way."""
+    file, good = place / "results.json", Results.model_validate_json(RESULTS)
+
+    def take(text: bytes) -> None:
+        file.write_bytes(text)
+        try:
+            given = read_results(file)
+        except UserError as problem:
+            short(str(problem))
+            return
+        for pair in ((given, good), (good, given)):
+            compare_results(*pair).page("old", "new")
+
+    yield take
+
+
 def short(text: str) -> None:
     """Check that an error message is readable."""
     assert len(text) < 20_000, f"{len(text)} characters"
@@ -396,6 +421,7 @@ FILES = (
     Parser("firmware", _firmware, lambda: texts(_reports())),
     Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
     Parser("conformity", _conformity, _conformity_files),
+    Parser("conformity_results", _conformity_results, lambda: texts([RESULTS])),
     Parser("run_folder", _run_folder, _run_files),
     Parser("segment", _segment, _segments),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import json
 import math
+import shlex
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,10 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, worst
-from gfm_hil.studies.conformity.model import Criterion, Part
+from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
+from gfm_hil.studies import envelopes
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, judge_nfp, worst
+from gfm_hil.studies.conformity.model import Criterion, Declared, Nfp, Part
 from gfm_hil.studies.conformity.sets import (
     Case,
     load_cases,
@@ -35,12 +37,15 @@ from gfm_hil.studies.conformity.sets import (
 from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 
+from ..support.firmware import cc
+
 Vector = NDArray[np.float64]
 
 JUMPS = {2.0: -10.0, 7.0: 10.0, 12.0: -25.0, 17.0: 25.0}  # s: degrees
 PEAK = {10.0: 0.3, 25.0: 0.6}  # p.u.
 F_SWING, RATIO = 2.0, 0.3
 
+OMEGA_B = 100 * math.pi  # rad/s
 UNDER = load_under_test(None)
 CRITERIA: TypeAdapter[Criterion] = TypeAdapter(Criterion)
 
@@ -317,7 +322,7 @@ def test_a_converter_of_ones_own_lies_beside_its_file(
 
 def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> None:
     cases = load_cases(["all"])
-    sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "withstand"}
+    sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "rte", "withstand"}
     assert {case.id.split("/")[0] for case in cases} == {*shipped_sets()} == sets
     for case in cases:
         for part in case.test.runs():
@@ -479,6 +484,8 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
         ("f_n = 50.0", 'f_n = 50.0\njudged = "twin"', "judged: 'twin'"),
         ("duration = 1.5", 'duration = 1.5\nlaw = "vsg-2"', "scenario.law"),
         ('known = "own"', 'known = "rumour"', "rumour"),
+        ('kind = "no_trip"', 'kind = "nfp"\nunknown = "why"', "nfp: must be its only criterion"),
+        ('kind = "no_trip"', 'kind = "nfp"', "bands, unknown: give one of them"),
         ("least = 0.05", "least = 0.05\nat = [7.0]", "at = 7"),
     ],
 )
@@ -500,6 +507,9 @@ def test_wrong_test_files_are_told_in_one_line(
         (["--law", "droop-3", "--workers", "0"], "--workers 0"),
         (["--law", "droop-3", "--converter", "nowhere.toml"], "nowhere.toml"),
         ([], "--law"),
+        (["--controller", "vsg-2.so"], "must be dll:FILE, fmu:FILE or c:FILE"),
+        (["--controller", "dll:nowhere.so"], "nowhere.so: there is no such file"),
+        (["--law", "droop-3", "--map", "map.toml"], "map.toml: is of a controller"),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(
@@ -508,6 +518,186 @@ def test_wrong_arguments_are_told_in_one_line(
     assert main(["conform", *arguments]) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
+
+
+@pytest.mark.compilers
+@pytest.mark.timeout(300)
+def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (lab / "strict.toml").write_text(STRICT)
+    built = str(lab.parent / "dll")
+    asked = ["firmware", "dll", "vsg-2", "--inner", "virtual-stator", "--real", "float64"]
+    assert main([*asked, "-o", built]) == 0
+    (library,) = Path(built).glob("*.so")
+    found = gfmhil.conform(
+        "vsg-2", lab, lab.parent / "out", inner="virtual-stator", controller=f"dll:{library}"
+    )
+    name = f"dll:{library.name}"
+    assert found.laws == ["vsg-2", name]
+    assert found.matrix[name, "lab/jump"] == found.matrix["vsg-2", "lab/jump"] == PASS
+    assert found.matrix[name, "lab/strict"] == found.matrix["vsg-2", "lab/strict"] == FAIL
+    for test in ("lab/jump", "lab/strict"):
+        (law,), (model,) = (found.of(of, test) for of in ("vsg-2", name))
+        for one, other in zip(law.verdicts, model.verdicts, strict=True):
+            assert other.value == pytest.approx(one.value, abs=1e-3) and other.text == one.text
+    # one controller cannot be both of a network
+    network = gfmhil.conform(against="miso/1-loss-of-last-machine", controller=f"dll:{library}")
+    assert set(network.matrix.values()) == {CANNOT}
+    assert "is one controller, and the test's network has several" in network.failures[0]
+    # the command that the report names repeats the run
+    again = shlex.split(found.of(name, "lab/jump")[0].again)
+    assert again[3:] == ["--controller", f"dll:{library}"]
+    assert main([*again[1:], "--out", str(lab.parent / "again"), "--no-figures", "--quiet"]) == 0
+    # what does not answer as the interface says is refused part by part
+    other = lab.parent / "other.so"
+    source = "int nothing(void) { return 0; }\n"
+    (lab.parent / "other.c").write_text(source)
+    assert cc(lab.parent, "-shared", "-fPIC", "other.c", "-o", "other.so").returncode == 0
+    refused = gfmhil.conform(against=lab / "jump.toml", controller=f"dll:{other}")
+    assert refused.matrix == {("dll:other.so", "lab/jump"): CANNOT}
+    assert "has no function Model_GetInfo" in refused.failures[0]
+
+
+def nfp_of(**more: Any) -> Nfp:
+    found = one("nfp", from_hz=0.1, to_hz=50.0, **more)
+    assert isinstance(found, Nfp)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("band", "verdict", "at"),
+    [
+        ({"low": 37.0, "high": 51.0}, PASS, 1.0),  # 51 - 49.75 is less than 39.04 - 37
+        ({"low": 40.0, "high": 51.0}, FAIL, 8.0),
+        ({"low": 37.0, "high": 49.5}, FAIL, 1.0),
+        ({"phase_high": -5.0}, PASS, 1.0),
+        ({"phase_low": -38.0}, FAIL, 8.0),
+        ({"high": 51.0, "from_hz": 1.1, "to_hz": 1.9}, CANNOT, None),
+    ],
+)
+def test_a_plot_is_judged_in_its_bands(band: dict[str, Any], verdict: str, at: Any) -> None:
+    """A gain of 50 behind a lag at 10 Hz: 50/(1 + (f/10)^2)^0.5 and -atan(f/10)."""
+    hz = np.array([0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0])
+    nfp = 50.0 / (1.0 + 1j * hz / 10.0)
+    asked = {"from_hz": 1.0, "to_hz": 10.0, **band}
+    (found,) = judge_nfp(hz, nfp, nfp_of(bands=[asked]))
+    assert found.verdict == verdict
+    if at is not None:
+        x = np.degrees(np.angle(nfp)) if "phase" in next(iter(band)) else np.abs(nfp)
+        assert found.value == pytest.approx(x[hz == at][0]) and f"At {at:.3g} Hz" in found.text
+
+
+NFP = """
+title = "plot"
+f_n = 50.0
+source = { document = "here", clause = "closed form", revision = "1", known = "own" }
+[scenario]
+duration = 1.0
+references = { P_ref = 0.0 }
+plant = { grid = { scr = 5.0, x_over_r = 10.0 } }
+[[criteria]]
+kind = "nfp"
+clause = "plot"
+from_hz = 2.0
+to_hz = 10.0
+points = 3
+"""
+
+
+def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
+    """dp/dw_g = -K w_b / (s + K w_b D_p / (1 + s T)), K = 1 / X (1 + s^2/w_b^2), X = X_p + 1/SCR:
+    the swing of a droop behind its low-pass, on a line that is a state of its own. Resistances, the
+    filter capacitor and the delay are within 1 %."""
+    gains = gfmhil.Law.load("droop-3").gains
+    s = 2j * np.pi * np.array([2.0, 10.0])
+    K = 1 / (load_converter("paper").pu()["L_f"] + 1 / 5.0) / (1 + (s / OMEGA_B) ** 2)
+    lag = 1 + s * gains["T"]
+    high, low = np.abs(K * OMEGA_B / (s + K * OMEGA_B * gains["D_p"] / lag))
+    limits = (0.99 * low, 1.01 * high), (0.99 * low, 0.99 * high), (1.01 * low, 1.01 * high)
+    bands = [{"from_hz": 2.0, "to_hz": 10.0, "low": a, "high": b} for a, b in limits]
+    text = ", ".join("{" + ", ".join(f"{k} = {v}" for k, v in b.items()) + "}" for b in bands)
+    (tmp_path / "plot.toml").write_text(f"{NFP}bands = [{text}]")
+    found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
+    (part,) = found.found
+    assert [v.verdict for v in part.verdicts] == [PASS, FAIL, FAIL]
+    report = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert report.count("data:image/png;base64,") == 1 and "gfmhil identify" in report
+
+
+def test_a_plot_without_known_limits_is_drawn_and_not_judged(tmp_path: Path) -> None:
+    (tmp_path / "plot.toml").write_text(NFP + 'unknown = "nobody knows them"')
+    found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
+    (part,) = found.of("droop-3", f"{tmp_path.name}/plot")
+    assert part.verdict == CANNOT and "nobody knows them" in part.words
+    assert part.figure is not None and part.figure.is_file()
+
+
+@pytest.mark.parametrize(
+    ("event", "answer"),
+    [
+        (
+            {"type": "grid-phase-jump", "degrees": -8.0},
+            lambda u, t: math.radians(8.0) / 0.6 * envelopes.jump_response(u, t, 0.6),
+        ),
+        (
+            {"type": "grid-frequency", "f_hz": 49.0, "rate": 1.0},
+            lambda u, t: envelopes.rocof_response(u, t, -0.02, 3.0, lasts=1.0),
+        ),
+        (
+            {"type": "grid-impedance", "scr": 10.0, "x_over_r": 6.0},
+            lambda u, t: envelopes.scr_jump_response(u, t, 3.0, 10.0, 0.5),
+        ),
+    ],
+    ids=["jump", "ramp", "scr"],
+)
+@pytest.mark.parametrize(
+    ("factor", "verdict"), [(1.0, PASS), (1.02, PASS), (2.0, FAIL), (0.1, FAIL), (-1.0, FAIL)]
+)
+def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
+    event: dict[str, Any], answer: Any, factor: float, verdict: str
+) -> None:
+    """On p as it is; the mean over a cycle moves it by less than the envelope is wide."""
+    unit = Declared(D=150.0, H=5.0, X_eff=0.6 - 1 / 3)
+    scenario = Scenario.model_validate(
+        {
+            "title": "event", "duration": 4.0, "link": {"type": "inproc"},
+            "plant": {"grid": {"scr": 3.0, "x_over_r": 6.0}}, "events": [{"t": 1.0, **event}],
+        }
+    )  # fmt: skip
+    t = np.arange(40_000) * 1e-4 - 1.0
+    change = answer(envelopes.Unit(unit.D, unit.H, unit.X_eff), np.maximum(t, 0.0))
+    run = run_of(scenario, p=0.5 + factor * np.where(t >= 0, change, 0.0))
+    asked = one("in_envelope")
+    (found,) = judge(run, [asked], UNDER.model_copy(update={"unit": unit}))
+    assert found.verdict == verdict
+    assert (found.value == 0.0) is (verdict == PASS)
+    assert found.curve is not None and "curve" not in found.plain()
+    (unknown,) = judge(run, [asked], UNDER)
+    assert unknown.verdict == CANNOT and "are not declared" in unknown.text
+    (other,) = judge(run, [one("in_envelope", at=[2.5])], UNDER.model_copy(update={"unit": unit}))
+    assert other.verdict == CANNOT and "not that of an event" in other.text
+
+
+def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
+    lab: Path,
+) -> None:
+    criterion = '[[criteria]]\nkind = "in_envelope"\nclause = "as expected"\n'
+    (lab / "jump.toml").write_text(LAB.split("[[criteria]]")[0] + criterion)
+    asked = {"law": "vsg-2", "against": lab, "inner": "virtual-stator"}
+    own = gfmhil.conform(**asked, folder=lab.parent / "out")
+    assert own.matrix == {("vsg-2", "lab/jump"): PASS}
+    assert "the envelope of D = 1" in own.found[0].verdicts[0].text  # 1 % droop: D = 100
+    (figure,) = (lab.parent / "out").rglob("figure.png")
+    assert figure.stat().st_size > 10_000
+    declared = lab.parent / "light.toml"
+    shipped = (folder / "conformity" / "converter.toml" for folder in SCENARIO_FOLDERS)
+    text = next(path for path in shipped if path.is_file()).read_text("utf-8")
+    declared.write_text(
+        text.replace("[plant]", "unit = { D = 5.0, H = 0.5, X_eff = 0.3 }\n\n[plant]")
+    )
+    light = gfmhil.conform(**asked, converter=declared)
+    assert light.matrix == {("vsg-2", "lab/jump"): FAIL}
 
 
 def test_parts_without_a_criterion_are_refused() -> None:
@@ -528,3 +718,107 @@ def test_the_gate_fails_a_test_with_each_part_and_the_report(lab: Path) -> None:
         conform("droop-3", against="lab")
     assert str(lab.parent / "second" / "report.html") in str(why.value)
     assert (lab.parent / "second" / "report.html").is_file()
+
+
+def clause_of(verdict: str, value: float | None = 1.0, words: str = "opposes") -> dict[str, Any]:
+    return {
+        "clause": words, "kind": "peak_delta_p", "verdict": verdict, "value": value,
+        "unit": "p.u.", "text": "It is so.",
+    }  # fmt: skip
+
+
+def results_of(path: Path, *clauses: dict[str, Any], law: str = "x", **more: Any) -> Path:
+    """The results.json of a report with one test."""
+    outcome = worst([c["verdict"] for c in clauses])
+    parts = [{"part": "up", "verdict": outcome, "reason": "", "clauses": [*clauses]}]
+    found = {"lab/jump": {"verdict": outcome, "parts": parts}}
+    content = {"version": "1", "inner": None, "under_test": {}, "laws": {law: found}, **more}
+    path.write_text(json.dumps(content), "utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changes", "code"),
+    [
+        ([PASS], [PASS], [], 0),
+        ([PASS], [FAIL], ["worse"], 1),
+        ([PASS], [CANNOT], ["worse"], 1),
+        ([CANNOT], [FAIL], ["worse"], 1),
+        ([FAIL], [CANNOT], ["better"], 0),
+        ([FAIL], [PASS], ["better"], 0),
+        ([PASS, PASS], [PASS], ["gone"], 1),
+        ([PASS, FAIL], [PASS], ["gone"], 0),  # what did not pass proves nothing
+        ([PASS], [PASS, FAIL], ["new"], 0),  # nothing is known of before
+        ([FAIL, PASS], [PASS, FAIL], ["worse", "better"], 1),
+    ],
+)
+def test_a_report_is_worse_if_a_verdict_is_or_a_proof_is_gone(
+    old: list[str], new: list[str], changes: list[str], code: int, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    files = [
+        str(results_of(tmp_path / name, *map(clause_of, verdicts)))
+        for name, verdicts in (("old", old), ("new", new))
+    ]
+    page = tmp_path / "diff.html"
+    assert main(["conform", "diff", *files, "--json", "--html", str(page)]) == code
+    found = json.loads(capsys.readouterr().out)
+    assert [row["change"] for row in found["rows"]] == changes
+    assert found["worse"] is bool(code)
+    assert page.read_text("utf-8").count("<td>lab/jump</td>") == len(changes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "share", "moved"),
+    [
+        (1.0, 1.04, "0.05", False),
+        (1.0, 1.06, "0.05", True),
+        (1.06, 1.0, "0.05", True),
+        (1.0, 1.06, "0.1", False),
+        (1e-5, 1e-3, "0.05", False),  # next to nothing either way
+        (-0.5, 0.5, "0.5", True),
+        (None, 0.5, "0.5", True),
+        (None, None, "0.0", False),
+    ],
+)
+def test_a_value_moves_by_a_share_of_the_larger(
+    old: float | None, new: float | None, share: str, moved: bool, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    files = [
+        str(results_of(tmp_path / name, clause_of(PASS, value)))
+        for name, value in (("old", old), ("new", new))
+    ]
+    assert main(["conform", "diff", *files, "--share", share]) == 0  # no verdict changed
+    said = capsys.readouterr().out
+    assert ("1 moved, 0 as before" in said) is moved and ("1 as before" in said) is not moved
+
+
+def test_a_law_of_another_name_and_a_test_that_is_gone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = results_of(tmp_path / "old", clause_of(PASS), law="mine")
+    new = results_of(tmp_path / "new", clause_of(PASS), law="mine-2", inner="cascaded")
+    assert main(["conform", "diff", str(old), str(new)]) == 0
+    said = capsys.readouterr().out
+    assert "The law was mine and is mine-2." in said and "each law's own and is cascaded" in said
+    content = json.loads(new.read_text("utf-8"))
+    content["laws"]["mine-2"] = {"lab/other": content["laws"]["mine-2"]["lab/jump"]}
+    new.write_text(json.dumps(content), "utf-8")
+    assert main(["conform", "diff", str(old), str(new)]) == 1
+    assert "1 gone, 1 new, 0 as before" in capsys.readouterr().out
+
+
+def test_a_report_as_the_command_writes_it_is_read_again(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (lab / "none.toml").write_text(LAB + NONE)
+    for law, name in (("droop-3", "old"), ("vsg-2", "new")):
+        gfmhil.conform(law, lab, lab.parent / name)
+    assert main(["conform", "diff", str(lab.parent / "old"), str(lab.parent / "new")]) == 0
+    assert "droop-3 and is vsg-2" in capsys.readouterr().out
+    (lab.parent / "old" / "results.json").write_text("[]")
+    assert main(["conform", "diff", str(lab.parent / "old"), str(lab.parent / "new")]) == 2
+    error = capsys.readouterr().err
+    assert "old/results.json: is no results.json" in error and error.count("\n") == 1
+    assert main(["conform", "diff", str(lab), str(lab.parent / "new"), "--share", "2"]) == 2

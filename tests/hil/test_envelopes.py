@@ -23,7 +23,9 @@ from gfmhil.envelopes import (
     fit_ramp,
     measure_unit,
     phase_jump,
+    rocof,
     rocof_response,
+    scr_jump,
     scr_jump_response,
 )
 
@@ -62,6 +64,34 @@ AMPLITUDE = """
 """
 
 
+#: S_Rocof1, OC1: 0.5 Hz/s for 3 s at SCR 2
+ROCOF = """
+3.334e-04;0.000e+00;-2.000e-02;2.000e-02
+9.436e-02;-8.658e-03;-3.434e-02;1.454e-02
+2.504e-01;-3.923e-02;-9.555e-02;-2.080e-03
+5.005e-01;-7.444e-02;-1.703e-01;-2.142e-02
+8.306e-01;-9.871e-02;-2.119e-01;-3.660e-02
+2.843e+00;-1.198e-01;-1.375e-01;-9.746e-02
+3.017e+00;-1.199e-01;-1.375e-01;-9.746e-02
+3.019e+00;-1.199e-01;-1.375e-01;-5.478e-02
+3.201e+00;-8.995e-02;-1.375e-01;-3.770e-02
+3.319e+00;-6.899e-02;-1.306e-01;-2.662e-02
+3.580e+00;-3.794e-02;-8.234e-02;-1.844e-03
+"""
+#: S_SCRdown1, OC4: from 10 to 2 at 0.95 p.u.
+SCR = """
+1.634e-02;9.500e-01;9.253e-01;9.747e-01
+1.834e-02;4.565e-01;3.331e-01;7.082e-01
+4.635e-02;4.632e-01;3.400e-01;7.120e-01
+4.835e-02;4.641e-01;3.409e-01;7.071e-01
+1.004e-01;4.979e-01;3.798e-01;7.239e-01
+2.004e-01;5.802e-01;4.696e-01;7.651e-01
+4.005e-01;7.151e-01;6.080e-01;8.325e-01
+5.005e-01;7.634e-01;6.606e-01;8.608e-01
+7.006e-01;8.323e-01;7.412e-01;9.174e-01
+"""
+
+
 def lines(text: str) -> list[list[float]]:
     return [[float(x) for x in line.split(";")] for line in text.split()]
 
@@ -85,6 +115,47 @@ def test_envelopes_are_the_published_ones_to_their_digits(made, curve) -> None:
             strict=True,
         ):
             assert value == pytest.approx(printed, abs=5.1e-5)  # half of the last digit
+
+
+@pytest.mark.parametrize(
+    ("made", "curve"),
+    [
+        (lambda t: rocof(OVERDAMPED, t, 0.5 / 50, 2.0, 0.0, lasts=3.0), ROCOF),
+        (lambda t: scr_jump(OVERDAMPED, t, 10.0, 2.0, 0.95), SCR),
+    ],
+    ids=["RoCoF", "SCR"],
+)
+def test_envelopes_of_ramps_and_scr_jumps_are_the_published_ones(made, curve) -> None:
+    step = 6.0 / 2999
+    t = 3.334e-4 + step * np.arange(2499)  # DyCoV's from -1 to 5 s, from the event on
+    found: Envelope = made(t)
+    for at, *printed in lines(curve):
+        k = round((at - t[0]) / step)
+        values = found.expected[k], found.lower[k], found.upper[k]
+        assert values == pytest.approx(printed, rel=5e-4, abs=5e-5), at  # of the last digit
+
+
+def test_an_underdamped_unit_stays_in_its_own_envelopes() -> None:
+    """And twice the answer, or a tenth of it, does not."""
+    t = np.linspace(0.0, 5.0, 3000)
+    unit = Unit(60.0, 5.0, 0.3)
+    late = 11  # samples: the 20 ms of the envelope
+    for made, answer in (
+        (lambda u: rocof(u, t, -0.03, 5.0, 0.2, lasts=2.0),
+         lambda u: rocof_response(u, t, -0.03, 5.0, lasts=2.0)),
+        (lambda u: rocof(u, t, 0.03, 5.0, 0.2, lasts=2.0),
+         lambda u: rocof_response(u, t, 0.03, 5.0, lasts=2.0)),
+        (lambda u: scr_jump(u, t, 10.0, 3.0, 0.5),
+         lambda u: scr_jump_response(u, t, 10.0, 3.0, 0.5)),
+        (lambda u: scr_jump(u, t, 3.0, 10.0, 0.5),
+         lambda u: scr_jump_response(u, t, 3.0, 10.0, 0.5)),
+    ):  # fmt: skip
+        allowed = made(unit)
+        assert (allowed.lower <= allowed.upper).all()
+        for factor, inside in ((1.0, True), (2.0, False), (0.1, False)):
+            change = factor * np.concatenate([np.zeros(late), answer(unit)[:-late]])
+            beyond = allowed.outside(t, allowed.expected[0] + change)
+            assert bool(beyond.max() < 2e-3) is inside, factor
 
 
 def test_a_ramp_of_frequency_is_the_published_one() -> None:
@@ -161,6 +232,12 @@ def test_a_law_makes_a_unit_of_its_converter() -> None:
     assert unit.X_eff == pytest.approx(load_converter("paper").pu()["L_f"], abs=0.005)
     more = measure_unit("vsg-2", inner="virtual-stator", plant__grid={"scr": 3.0, "x_over_r": 10.0})
     assert more.X_eff == pytest.approx(0.3, rel=0.1)  # X_v of the stage
+
+
+def test_a_law_without_inertia_makes_a_unit_of_almost_none() -> None:
+    at = {"plant__grid": {"scr": 10.0, "x_over_r": 10.0}, "references__P_ref": 0.0}
+    unit = measure_unit("droop-1", inner="virtual-stator", **at)
+    assert pytest.approx(100.0, rel=0.15) == unit.D and unit.H < 0.05
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+import gfmhil
 from gfm_plant import Plant, make_plant, plant_advance, plant_equilibrium
 from gfm_plant.grid import fault
 
@@ -37,6 +40,32 @@ def test_the_current_stays_within_the_limit_in_a_fault(R: float) -> None:
 
 
 def test_a_limit_that_is_not_reached_changes_nothing() -> None:
-    """The same circuit is solved in shorter pieces: E does not depend on v_dc here."""
-    once, often = (current(limit, 0.5, "unlimited") for limit in (None, 1e3))
-    assert np.abs(once - often).max() < 1e-11
+    """Near its limit the same circuit is solved in shorter pieces: E does not depend on v_dc
+    here."""
+    once = current(None, 0.5, "unlimited")
+    for limit in (1.3 * once.max(), 1e3):
+        assert np.abs(once - current(limit, 0.5, "unlimited")).max() < 1e-11
+
+
+@pytest.mark.parametrize("scr", [2.0, 20.0])
+@pytest.mark.parametrize(
+    "event",
+    [
+        {"type": "grid-phase-jump", "degrees": 60.0},
+        {"type": "grid-phase-jump", "degrees": -60.0},
+        {"type": "grid-voltage", "V_g": 0.0, "duration": 0.05},
+        {"type": "grid-unbalance", "retained": [0.0, 1.0, 1.0], "duration": 0.05},
+    ],
+    ids=["+60", "-60", "dip", "unbalance"],
+)
+def test_no_jump_of_the_grid_leads_beyond_the_limit(scr: float, event: dict[str, Any]) -> None:
+    """From far below it the limit looks in time; the bridge gives whatever voltage that takes."""
+    plant = {"i_peak": LIMIT, "modulation": "unlimited", "delay": {"fraction": 0.3},
+             "grid": {"scr": scr, "x_over_r": 6.0}}  # fmt: skip
+    plant |= {"protection": {n: {"enabled": False} for n in ("over_current", "under_voltage")}}
+    run = gfmhil.run(
+        {"title": "jump", "duration": 0.2, "plant": plant, "events": [{"t": 0.1, **event}]},
+        "droop-3", references={"P_ref": 0.5},
+    )  # fmt: skip
+    assert run.signals["i"].max() <= 1.01 * LIMIT
+    assert run.signals["i"][1000:].max() > 0.99 * LIMIT or scr < 3.0

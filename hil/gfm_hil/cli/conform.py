@@ -13,13 +13,22 @@ from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_folder, progress
+from gfm_hil.cli.common import (
+    EXIT_INTERRUPTED,
+    EXIT_OTHERWISE,
+    above,
+    add_map,
+    new_folder,
+    progress,
+)
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import fitting, terminal
 from gfm_hil.realtime.priority import processors
 from gfm_hil.studies.campaign.execute import WorkerLost
-from gfm_hil.studies.conformity.execute import Found, execute, make_jobs
+from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
+from gfm_hil.studies.conformity.execute import Found, execute, foreign_controller, make_jobs
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, load_under_test, shipped_sets
@@ -34,10 +43,33 @@ def add(command: argparse.ArgumentParser) -> None:
     command.description = (
         "Exit code 0: every clause passes; 1: one fails or cannot be judged; 2: wrong input."
     )
+    others = command.add_subparsers(metavar="{diff}", title="on reports")
+    diff = others.add_parser("diff", help="what changed between two reports")
+    diff.description = (
+        "Exit code 0: nothing got worse; 1: a verdict did, or a clause that passed is gone; 2: "
+        "wrong input."
+    )
+    diff.set_defaults(call=_diff)
+    diff.add_argument(
+        "old", type=Path, metavar="OLD", help="folder of a report, or its results.json"
+    )
+    diff.add_argument("new", type=Path, metavar="NEW", help="the same")
+    diff.add_argument(
+        "--share", type=float, default=SHARE, metavar="X",
+        help=f"values that moved by more than this part of the larger are told; {SHARE:g}",
+    )  # fmt: skip
+    diff.add_argument("--html", type=Path, metavar="FILE", help="write a page too")
+    diff.add_argument("--json", action="store_true", help="print all of it as JSON, nothing else")
     command.add_argument(
         "--law", action="append", metavar="LAW",
         help="catalogue name or law file; may be repeated; all: the whole catalogue",
     )  # fmt: skip
+    command.add_argument(
+        "--controller", metavar="KIND:FILE",
+        help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: a controller to test, with or without "
+        "laws beside it; it begins at the operating point of the first law",
+    )  # fmt: skip
+    add_map(command, "--controller")
     command.add_argument(
         "--inner", metavar="NAME",
         help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
@@ -66,11 +98,12 @@ def call(options: argparse.Namespace) -> int:
     if options.list:
         terminal().print(_list(cases))
         return 0
-    if not options.law:
-        raise UserError("--law: missing; name a law, or all")
+    if not options.law and options.controller is None:
+        raise UserError("--law: missing; name a law, or all, or a --controller")
     if options.workers is not None and not 1 <= options.workers <= 1024:
         raise UserError(f"--workers {options.workers}: must lie in [1, 1024]")
-    laws = list(dict.fromkeys(n for law in options.law for n in _names(law)))
+    foreign = foreign_controller(options.controller, options.map)
+    laws = list(dict.fromkeys(n for law in options.law or [] for n in _names(law)))
     for name in laws:
         law_file(name)
     if options.inner is not None:
@@ -81,8 +114,9 @@ def call(options: argparse.Namespace) -> int:
         raise UserError(f"{folder}: is not empty; choose another --out")
     files = {name: str(Path(name).absolute()) if name.endswith(".toml") else name for name in laws}
     jobs = make_jobs(
-        files, cases, options.inner, under, folder / "converters", folder, not options.no_figures
-    )
+        files, cases, options.inner, under, folder / "converters", folder, not options.no_figures,
+        foreign,
+    )  # fmt: skip
     found: list[Found] = []
     lost = None
     workers = options.workers or processors()
@@ -107,13 +141,37 @@ def call(options: argparse.Namespace) -> int:
         done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
         print(f"gfmhil: {why}; {done}", file=sys.stderr)
         return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
-    result = Conformity(laws, options.inner, under, cases, found, folder)
+    names = [*laws, *([foreign.name] if foreign else [])]
+    result = Conformity(names, options.inner, under, cases, found, folder)
     result.write(folder)
     if options.json:
         print(json.dumps(result.plain(), indent=1))
     else:
         _print(result, time.monotonic() - began)
     return 0 if result.passed else EXIT_FAILED
+
+
+def _diff(options: argparse.Namespace) -> int:
+    """Two reports beside each other; returns the exit code."""
+    found = compare_results(read_results(options.old), read_results(options.new), options.share)
+    if options.html is not None:
+        write_text(options.html, found.page(str(options.old), str(options.new)))
+    if options.json:
+        print(json.dumps(found.plain(), indent=1))
+    else:
+        console = terminal()
+        for note in found.notes:
+            console.print(escape(note), highlight=False, soft_wrap=True)
+        table = Table("", "law", "test", "part", "clause", "verdict", "measured", box=None,
+                      pad_edge=False)  # fmt: skip
+        for row in found.rows:
+            where = map(escape, (row.law, row.test, row.part, row.clause.clause))
+            shown = f"[red]{row.change}[/]" if row.counts else row.change
+            table.add_row(shown, *where, row.verdict, escape(row.value))
+        if found.rows:
+            console.print(table)
+        console.print(found.words, highlight=False)
+    return EXIT_FAILED if found.worse else 0
 
 
 def _names(law: str) -> Sequence[str]:

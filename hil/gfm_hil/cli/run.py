@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model
-from gfm_hil.results.runner import Notice, run_network, run_scenario
+from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 
@@ -78,7 +77,7 @@ def call(options: argparse.Namespace) -> int:
                 raise UserError("--modbus: a run in process takes no commands; choose --link")
             stack.enter_context(companion("modbus", folder, options.modbus))
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-            command = _model_command(scenario, folder, options, notice)
+            command = _model_command(scenario, options, notice)
             figures = not options.no_figures
             run = run_scenario(scenario, folder, progress, notice, figures, command)
         if options.json:
@@ -92,9 +91,7 @@ def call(options: argparse.Namespace) -> int:
     return exit_code(run.summary)
 
 
-def _model_command(
-    scenario: Scenario, folder: Path, options: argparse.Namespace, notice: Notice
-) -> list[str]:
+def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Notice) -> list[str]:
     """The program that steps the model of --controller; empty without one.
 
     Raises:
@@ -107,10 +104,7 @@ def _model_command(
     if scenario.link.type == INPROC:
         raise UserError("--controller: is a process, and a run in process has none; choose --link")
     compile_for_model(scenario, notice)
-    command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
-    command += ["--endpoint", "{endpoint}", "--out", str(folder.absolute()), "--quiet"]
-    command += ["--part", str(os.getpid()), "--model", options.controller]
-    return command + (["--map", str(options.map.absolute())] if options.map else [])
+    return model_command(options.controller, options.map)
 
 
 def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-from .model import Model, ModelError, Rig, open_model
+from .model import Model, ModelError, Rig, model_file, open_model
 from .ports import PortMap, read_map
 
-__all__ = ["Model", "ModelError", "PortMap", "Rig", "open_model", "read_map"]
+__all__ = ["Model", "ModelError", "PortMap", "Rig", "model_file", "open_model", "read_map"]

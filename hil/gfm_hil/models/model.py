@@ -80,12 +80,7 @@ def open_model(text: str, ports: PortMap, rig: Rig) -> Model:
     Raises:
         UserError: there is no such file, it is no such model, or its ports do not fit.
     """
-    kind, colon, file = text.partition(":")
-    if not colon or kind not in KINDS or not file:
-        raise UserError(f"controller {text!r}: must be {_FORMS}")
-    path = Path(file).absolute()
-    if not path.is_file():
-        raise UserError(f"{file}: there is no such file")
+    kind, path = model_file(text)
     if kind == "dll":
         from gfm_hil.models.dll import DllModel
 
@@ -97,6 +92,21 @@ def open_model(text: str, ports: PortMap, rig: Rig) -> Model:
     from gfm_hil.models.fmu import FmuModel
 
     return FmuModel(path, ports, rig.T_s, rig.inner)
+
+
+def model_file(text: str) -> tuple[str, Path]:
+    """The kind and the file of the model ``KIND:FILE``.
+
+    Raises:
+        UserError: there is no such kind or file.
+    """
+    kind, colon, file = text.partition(":")
+    if not colon or kind not in KINDS or not file:
+        raise UserError(f"controller {text!r}: must be {_FORMS}")
+    path = Path(file).absolute()
+    if not path.is_file():
+        raise UserError(f"{file}: there is no such file")
+    return kind, path
 
 
 def run_name(kind: str, model: str) -> str:

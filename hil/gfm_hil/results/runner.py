@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -54,7 +56,8 @@ def run_scenario(
         notice: told what a person should know while waiting.
         figures: draw the figures and write report.html.
         controller_command: program and arguments of another controller instead of ours, for a
-            link that is none of ``inproc``; see ``Processes``.
+            link that is none of ``inproc``; see ``Processes``. Here ``{folder}`` becomes the run
+            folder.
 
     Raises:
         UserError: the folder is in use, no operating point, an endpoint that is occupied. The
@@ -75,7 +78,8 @@ def run_scenario(
                 if scenario.in_process:
                     began = _run_here([bench], [folder], progress, interrupt)
                 else:
-                    command = tuple(controller_command)
+                    own = str(folder.absolute())
+                    command = tuple(x.replace("{folder}", own) for x in controller_command)
                     both = Processes(scenario, folder, progress, notice, interrupt, command)
                     began, outside = both.run()
         except UserError:
@@ -85,6 +89,19 @@ def run_scenario(
         wall_s = time.monotonic() - began
         labels = bench.controller.labels
         return finish(scenario, folder, labels, wall_s, figures, outside.get(""))
+
+
+def model_command(model: str, ports: Path | None) -> list[str]:
+    """The ``controller_command`` of a run whose controller steps a model in place of the law.
+
+    Args:
+        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``.
+        ports: file of the map of its ports.
+    """
+    command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
+    command += ["--endpoint", "{endpoint}", "--out", "{folder}", "--quiet"]
+    command += ["--part", str(os.getpid()), "--model", model]
+    return command + (["--map", str(ports.absolute())] if ports else [])
 
 
 def run_network(

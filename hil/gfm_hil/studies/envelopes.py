@@ -11,9 +11,10 @@ that a derivation would not give:
 - after a ramp of frequency the power settles at 2 H + D T_pll times the rate: the damping acts
   against a PLL and not against the nominal frequency, so that no droop is known.
 
-The tolerances of DyCoV change from version to version; those here are of the curves under
-docs/GFM_envelopes_curves at its commit b7576cb0. Its envelopes for RoCoF and SCR jumps follow other
-rules in every version; here these two events have the expected response alone.
+The tolerances and rules of DyCoV change from version to version; those here are of the curves under
+docs/GFM_envelopes_curves at its commit b7576cb0. No curve of an SCR jump of an underdamped unit was
+published there: this case follows the code of commit 013401e3. What DyCoV does at the limits of
+power is left out.
 """
 
 from __future__ import annotations
@@ -29,17 +30,20 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.studies.law import Law
-from gfm_hil.studies.notebook import run
+from gfm_hil.studies.law import Law, law_files
 from gfm_plant import make_plant
 
 Vector = NDArray[np.float64]
+Response = NDArray[np.complex128]
 
 OMEGA_B = 314.0  # rad/s, as DyCoV rounds it
 _APART = 1e-5  # of the poles' size; closer ones are moved this far from each other
+_FAR = 30.0  # of the logarithms of a fit, where there is none
 _TUNNEL_S, _TUNNEL_FROM = 0.3, 0.02  # s; how the tunnel opens
 _T_90 = 0.01  # s; reactive current after a step of the grid's voltage
+_HALF, _HALF_S, _HALF_LEAST = 0.5, 0.03, 0.005  # after an SCR jump: of the change, s, p.u.
 _WIDE_S = 0.08  # s; until when its upper limit is wider
 _REST_S, _SAMPLES = 0.1, 4000  # before the jump of a measurement, and at most in its fit
 
@@ -82,8 +86,9 @@ class Tolerance:
     """What an envelope allows; the defaults are those of DyCoV's published curves.
 
     Attributes:
-        low, high: of the expected change: it may be high times as large at the start, after
-            ``start_s``, and 1 + low times.
+        low, high: of the expected change. After a phase jump it may be high times as large at the
+            start, after ``start_s``, and 1 + low times. After a ramp or a jump of the SCR the lower
+            limit allows for low of it, and the upper one for high of it, either way.
         ratio: factors of D, at which H is divided by the same, whose responses are allowed too.
         part, least: the tunnel that opens around the response: a part of the first change, and
             least p.u.
@@ -158,6 +163,105 @@ def phase_jump(
     return Envelope(t, expected, np.minimum(one, other), np.maximum(one, other))
 
 
+def rocof(
+    unit: Unit,
+    t: Vector,
+    rate: float,
+    scr: float,
+    P_0: float,
+    T_pll: float = 0.01,
+    lasts: float = math.inf,
+    tolerance: Tolerance | None = None,
+) -> Envelope:
+    """The envelope of P during and after a ramp of the grid's frequency.
+
+    Args:
+        t, rate, scr, T_pll, lasts: as for ``rocof_response``; t evenly apart.
+        P_0: power before, p.u.
+
+    Raises:
+        UserError: a value that cannot be.
+    """
+    rule = tolerance or Tolerance(low=0.5, high=0.3, ratio=(0.8, 1.2))
+    units = [unit, *(unit.times(k, 1 / k) for k in rule.ratio)]
+    each = [rocof_response(one, t, rate, scr, T_pll, lasts) for one in units]
+    poles, weights = _ramp_modes(unit, scr, T_pll)
+    swings = (np.abs(poles.imag) > 0) & (weights != 0)  # the other poles are those of ramp and PLL
+    peak = abs(rate * np.sum(weights[poles == 0]).real)
+    if swings.any():  # DyCoV adds the amplitudes of all that is in it
+        peak = abs(rate) * abs(np.sum(weights[~swings]).real + np.sum(np.abs(weights[swings])))
+    tunnel = max(rule.least, rule.part * peak)
+    way = math.copysign(1.0, -rate)
+    up, down = 1 + way * rule.high, 1 - way * rule.low
+    most = P_0 + np.max(each, axis=0) * up + tunnel
+    least = P_0 + np.min(each, axis=0) * down - tunnel
+    settled = 4 * max(T_pll, *(-1 / np.roots(unit.swing(unit.X_eff + _reactance(scr))).real))
+    steady = (t >= settled) & (t < lasts)
+    if settled < lasts and steady.any():
+        level = P_0 + float(np.interp(settled, t, each[0]))
+        most, least = (
+            np.where(steady, level + x, limit) for x, limit in ((tunnel, most), (-tunnel, least))
+        )
+    after = t >= lasts
+    if after.any() and not after.all():  # what returns does not pass where it was
+        last = int(np.argmax(after)) - 1
+        if way < 0:
+            least = np.where(after, np.maximum(least, least[last]), least)
+        else:
+            most = np.where(after, np.minimum(most, most[last]), most)
+    return _delayed(rule, t, P_0, tunnel, P_0 + each[0], least, most)
+
+
+def scr_jump(
+    unit: Unit,
+    t: Vector,
+    before: float,
+    after: float,
+    P_0: float,
+    tolerance: Tolerance | None = None,
+) -> Envelope:
+    """The envelope of P after the short-circuit ratio jumps.
+
+    Args:
+        t, before, after, P_0: as for ``scr_jump_response``; t evenly apart.
+
+    Raises:
+        UserError: a value that cannot be.
+    """
+    rule = tolerance or Tolerance(low=0.2, high=0.2, ratio=(0.8, 1.2))
+    X = unit.X_eff + _reactance(after)
+    first = (_reactance(before) - _reactance(after)) * P_0 / X
+    units = [unit, *(unit.times(k, 1 / k) for k in rule.ratio)]
+    each = [scr_jump_response(one, t, before, after, P_0) for one in units]
+    tunnel = max(rule.least, rule.part * abs(first))
+    sign = math.copysign(1.0, first)
+    further, less = (rule.high, rule.low) if sign > 0 else (rule.low, rule.high)
+    # sign times the change: at most, and at least
+    most = [sign * x * (1 + further) + tunnel for x in each]
+    least = [sign * x * (1 - less) - tunnel for x in each]
+    for one in units:
+        if one.damping_ratio(X) < 1:  # around the decay of the oscillation
+            zero, decay = one.D / (2 * one.H), one.D / (4 * one.H)
+            beside = (zero - decay) / math.sqrt(one.swing(X)[2] - decay**2)
+            size = abs(first) * math.hypot(1.0, beside) * np.exp(-decay * t)
+            most.append(size * (1 + further) + tunnel)
+            least.append(-size * (1 - less) - tunnel)
+    half = _HALF * sign * np.array(each)
+    smallest = np.minimum(np.min(least, axis=0), half[0])
+    smallest = np.where(t <= _HALF_S, np.min(half, axis=0) - _HALF_LEAST, smallest)
+    one, other = P_0 + sign * np.max(most, axis=0), P_0 + sign * smallest
+    limits = np.minimum(one, other), np.maximum(one, other)
+    return _delayed(rule, t, P_0, tunnel, P_0 + each[0], *limits)
+
+
+def _delayed(
+    rule: Tolerance, t: Vector, P_0: float, tunnel: float, expected: Vector, low: Vector, up: Vector
+) -> Envelope:
+    """An envelope that is late, and before that around the power before."""
+    curves = (expected, P_0), (low, P_0 - tunnel), (up, P_0 + tunnel)
+    return Envelope(t, *(_late(t, rule.delay_s, x, first) for x, first in curves))
+
+
 def amplitude_step(
     unit: Unit, t: Vector, step: float, scr: float, tolerance: Tolerance | None = None
 ) -> Envelope:
@@ -194,15 +298,19 @@ def rocof_response(
         T_pll: time constant of the PLL against which the damping acts, s.
         lasts: how long the ramp lasts, s.
     """
-    X = unit.X_eff + _reactance(scr)
-    swing = unit.swing(X)
-    numerator = swing[2] * np.array([2 * unit.H * T_pll, 2 * unit.H + unit.D * T_pll])
-    poles = np.asarray(np.polymul([T_pll, 1.0, 0.0], swing), float)
+    poles, weights = _ramp_modes(unit, scr, T_pll)
 
     def ramp(since: Vector) -> Vector:
-        return np.where(since >= 0, _impulse(numerator, poles, np.maximum(since, 0.0)), 0.0)
+        return np.where(since >= 0, _sum(poles, weights, np.maximum(since, 0.0)), 0.0)
 
     return np.asarray(-rate * (ramp(t) - (ramp(t - lasts) if math.isfinite(lasts) else 0.0)))
+
+
+def _ramp_modes(unit: Unit, scr: float, T_pll: float) -> tuple[Response, Response]:
+    """The poles of the response to a ramp of -1 p.u./s, and their weights."""
+    swing = unit.swing(unit.X_eff + _reactance(scr))
+    numerator = swing[2] * np.array([2 * unit.H * T_pll, 2 * unit.H + unit.D * T_pll])
+    return _modes(numerator, np.asarray(np.polymul([T_pll, 1.0, 0.0], swing), float))
 
 
 def scr_jump_response(unit: Unit, t: Vector, before: float, after: float, P_0: float) -> Vector:
@@ -238,7 +346,7 @@ def fit_jump(
     at, p = t[used], change[used]
 
     def off(z: Vector) -> Vector:
-        X, zero, stiff = np.exp(z)
+        X, zero, stiff = np.exp(np.clip(z, -_FAR, _FAR))
         return -radians / X * _impulse([1.0, zero], [1.0, zero, stiff], at) - p
 
     largest = float(np.abs(p).max())
@@ -316,7 +424,9 @@ def measure_unit(
     content = start.model_dump(mode="json", exclude_none=True, include=kept)
     jump = {"type": "grid-phase-jump", "t": _REST_S, "degrees": degrees}
     more = {"title": start.title, "duration": _REST_S + seconds, "events": [jump]}
-    made = run(content | more, law)
+    with law_files([] if law is None else [law]) as files:
+        named = next(iter(files.values()), None)
+        made = run_in_memory(load_scenario(content | more, in_process=True, law=named))
     if made.status not in ("completed", "oscillating"):
         reason = made.summary["reason"]
         raise UserError(f"the run after the jump ended as {made.status}: {reason}")
@@ -342,17 +452,28 @@ def _reactance(scr: float) -> float:
 def _impulse(
     numerator: Sequence[float] | Vector, denominator: Sequence[float] | Vector, t: Vector
 ) -> Vector:
-    """The impulse response of a strictly proper transfer function, by its residues."""
+    """The impulse response of a strictly proper transfer function."""
+    return _sum(*_modes(numerator, denominator), t)
+
+
+def _modes(
+    numerator: Sequence[float] | Vector, denominator: Sequence[float] | Vector
+) -> tuple[Response, Response]:
+    """The poles of a strictly proper transfer function, and their residues."""
     poles = np.roots(denominator).astype(complex)
     size = max(float(np.abs(poles).max()), 1e-12)
     for k in range(1, len(poles)):
         while (np.abs(poles[k] - poles[:k]) < _APART * size).any():
             poles[k] += 2 * _APART * size
+    others = np.array([np.prod(pole - np.delete(poles, k)) for k, pole in enumerate(poles)])
+    return poles, np.polyval(numerator, poles) / others / denominator[0]
+
+
+def _sum(poles: Response, residues: Response, t: Vector) -> Vector:
     out = np.zeros(len(t), complex)
-    for k, pole in enumerate(poles):
-        others = np.prod(pole - np.delete(poles, k))
-        out += np.polyval(numerator, pole) / others * np.exp(pole * t)
-    return np.asarray(out.real / denominator[0])
+    for pole, residue in zip(poles, residues, strict=True):
+        out += residue * np.exp(pole * t)
+    return np.asarray(out.real)
 
 
 def _late(t: Vector, seconds: float, x: Vector, before: float) -> Vector:

@@ -13,6 +13,7 @@ from gfm_hil.results.figures import COLOURS, dress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from gfm_hil.studies.identification import Identification
 
@@ -71,11 +72,14 @@ def draw_passivity(of: Identification) -> list[Axes]:
     return panels
 
 
-def draw_nfp(of: Identification) -> list[Axes]:
-    """Gain and phase of the change of p over that of the grid's frequency."""
-    from matplotlib import pyplot
+def draw_nfp(of: Identification, figure: Figure | None = None) -> list[Axes]:
+    """Gain and phase of the change of p over that of the grid's frequency; in a figure of its own
+    if none is given."""
+    if figure is None:
+        from matplotlib import pyplot
 
-    _, (gain, phase) = pyplot.subplots(2, 1, sharex=True, figsize=(7.6, 5.6), layout="constrained")
+        figure = pyplot.figure(figsize=(7.6, 5.6), layout="constrained")
+    gain, phase = figure.subplots(2, 1, sharex=True)
     _bode(gain, phase, of.frequency, of.nfp, of.nfp_model)
     dress(gain, f"{of.name}: network frequency perturbation, |Δp / Δω_g| [p.u./p.u.]")
     dress(phase, "phase [°]")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import html
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +30,26 @@ if TYPE_CHECKING:
 def as_law(law: str | Path | Law) -> Law:
     """A law as it is, or that of a name or file."""
     return law if isinstance(law, Law) else Law.load(law)
+
+
+@contextmanager
+def law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
+    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts, which
+    messages call by the name of the law."""
+    with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
+        files: dict[str, str] = {}
+        for k, law in enumerate(laws):
+            if isinstance(law, Law):
+                files[law.name] = str(law.save(Path(place) / f"{k}.toml"))
+            else:
+                files[str(law)] = str(law)
+        try:
+            yield files
+        except UserError as problem:
+            text = str(problem)
+            for name, file in files.items():
+                text = text.replace(file, name)
+            raise UserError(text) from None
 
 
 def laws() -> tuple[str, ...]:

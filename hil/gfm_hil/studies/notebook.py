@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,7 @@ from gfm_hil.studies.campaign.worker import compile_once
 from gfm_hil.studies.conformity import execute as conformity
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test
-from gfm_hil.studies.law import Law
+from gfm_hil.studies.law import Law, law_files
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.toml_file import read_toml
@@ -53,7 +52,7 @@ def run(
         UserError: one line a mistake; or the scenario has no operating point.
         LawError: the law is none.
     """
-    with _law_files([] if law is None else [law]) as files:
+    with law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
         made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
@@ -83,26 +82,6 @@ def _named(made: Run, law: Law) -> Run:
     return replace(
         made, scenario=scenario, summary=summary, laws=laws, events=events, law_text=law.to_toml()
     )
-
-
-@contextmanager
-def _law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
-    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts, which
-    messages call by the name of the law."""
-    with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
-        files: dict[str, str] = {}
-        for k, law in enumerate(laws):
-            if isinstance(law, Law):
-                files[law.name] = str(law.save(Path(place) / f"{k}.toml"))
-            else:
-                files[str(law)] = str(law)
-        try:
-            yield files
-        except UserError as problem:
-            text = str(problem)
-            for name, file in files.items():
-                text = text.replace(file, name)
-            raise UserError(text) from None
 
 
 @dataclass(frozen=True, repr=False)
@@ -194,7 +173,7 @@ def campaign(
             given = read_toml(path)
         except ValueError as problem:
             raise UserError(f"{path}: {problem}") from None
-    with _law_files(laws or []) as files:
+    with law_files(laws or []) as files:
         content = {**given, **changes} | ({"laws": list(files)} if files else {})
         made = check_campaign(content, path, laws=files)
         axes, place = find_axes(made, None, None), None if folder is None else Path(folder)
@@ -210,23 +189,28 @@ def campaign(
 
 
 def conform(
-    law: str | Path | Law | Sequence[str | Path | Law],
+    law: str | Path | Law | Sequence[str | Path | Law] = (),
     against: str | Path | Sequence[str | Path] = ALL,
     folder: str | Path | None = None,
     *,
     inner: str | None = None,
     converter: str | Path | None = None,
+    controller: str | None = None,
+    ports: str | Path | None = None,
     workers: int = 1,
 ) -> Conformity:
     """Run the published tests of grid-forming converters, and judge them clause by clause.
 
     Args:
-        law: name, law file or ``Law``, or several of them.
+        law: name, law file or ``Law``, or several of them; none with a controller.
         against: shipped sets, ``all`` of them, or paths of your own.
         folder: where to write the report with figures, results.json and junit.xml; None writes
             nothing.
         inner: inner stage of every law; each law's own if None.
         converter: file of the converter under test; the shipped one if None.
+        controller: a model to test beside the laws, ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``. It
+            begins at the operating point of the first law, or of ``mimo-gfm`` without any.
+        ports: file of the map of the model's ports.
         workers: as for ``campaign``.
 
     Raises:
@@ -236,6 +220,9 @@ def conform(
     if not 1 <= workers <= 1024:
         raise UserError(f"workers = {workers}: must lie in [1, 1024]")
     given = [law] if isinstance(law, str | Path | Law) else list(law)
+    foreign = conformity.foreign_controller(controller, ports)
+    if not given and foreign is None:
+        raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
     place = None if folder is None else Path(folder)
     if place is not None and place.exists() and any(place.iterdir()):
@@ -244,13 +231,14 @@ def conform(
     if inner is not None:
         named_inner(inner)
     found: list[conformity.Found] = []
-    with _law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
+    with law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
         for file in files.values():
             law_file(file)
         converters = Path(temporary) if place is None else place / "converters"
-        jobs = conformity.make_jobs(files, cases, inner, under, converters, place, True)
+        jobs = conformity.make_jobs(files, cases, inner, under, converters, place, True, foreign)
         conformity.execute(jobs, workers, found.append)
-    made = Conformity(list(files), inner, under, cases, found, place)
+    names = [*files, *([foreign.name] if foreign else [])]
+    made = Conformity(names, inner, under, cases, found, place)
     if place is not None:
         made.write(place)
     return made

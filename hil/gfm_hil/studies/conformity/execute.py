@@ -3,24 +3,60 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compiled_bench, compiled_benches
+from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
+from gfm_hil.models import model_file, read_map
 from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory, run_network_in_memory
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.results.runner import (
+    model_command,
+    run_in_memory,
+    run_network_in_memory,
+    run_scenario,
+)
+from gfm_hil.scenario.model import Link, Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
-from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, worst
-from gfm_hil.studies.conformity.model import Part, UnderTest
+from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, judge_nfp, worst
+from gfm_hil.studies.conformity.model import Criterion, Declared, InEnvelope, Nfp, Part, UnderTest
 from gfm_hil.studies.conformity.sets import Case, scenario_of
+from gfm_hil.studies.envelopes import measure_unit
+from gfm_hil.studies.identification import identify
 
 _POLL_S = 0.2
+
+
+_LINK = Link(type="shm", peer_timeout_s=10.0)  # of a model
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """A model as the controller, in place of a law.
+
+    Attributes:
+        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``.
+        ports: file of the map of its ports.
+    """
+
+    model: str
+    ports: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """What reports call it: its kind and the name of its file.
+
+        Raises:
+            UserError: there is no such file.
+        """
+        kind, path = model_file(self.model)
+        return f"{kind}:{path.name}"
 
 
 @dataclass(frozen=True)
@@ -28,13 +64,15 @@ class Job:
     """A part of a test under a law.
 
     Attributes:
-        law, file: its name, and what a scenario calls it.
+        law, file: its name, and what a scenario calls it. Of a model: its name, and the law at
+            whose operating point a run begins.
         case, part: what to run.
         inner: stage of every law; the law's own if None.
         under: the converter under test.
         converters: folder for converter files, which lasts while jobs run.
         folder: where the scenario and the figure go; None writes neither.
         figures: whether to draw one.
+        foreign: the model that computes u in place of the law, or None.
     """
 
     law: str
@@ -46,6 +84,7 @@ class Job:
     converters: Path
     folder: Path | None
     figures: bool
+    foreign: Foreign | None = None
 
     @property
     def name(self) -> str:
@@ -61,7 +100,7 @@ class Found:
         law, test, part: names; the part of a test without parts is empty.
         status, reason: how the run ended; ``none`` if it did not take place.
         verdicts: one a clause and time.
-        scenario: folder of the scenario that repeats the run, or None.
+        again: the command that repeats the run; empty if no scenario was written.
         figure: file, or None.
     """
 
@@ -71,7 +110,7 @@ class Found:
     status: str
     reason: str
     verdicts: list[Verdict]
-    scenario: Path | None = None
+    again: str = ""
     figure: Path | None = None
 
     @property
@@ -88,6 +127,22 @@ class Found:
         return told[0].text if told else self.reason
 
 
+def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign | None:
+    """The model that a user names, checked as far as that goes without loading it.
+
+    Raises:
+        UserError: there is no such file, the map is none, or there is a map but no model.
+    """
+    if model is None:
+        if ports is not None:
+            raise UserError(f"map {ports}: is of a controller; name it too")
+        return None
+    kind, path = model_file(model)
+    file = None if ports is None else Path(ports).absolute()
+    read_map(file)
+    return Foreign(f"{kind}:{path}", file)
+
+
 def slug(name: str) -> str:
     """A name as that of a file."""
     return re.sub(r"[^\w.+-]+", "-", name.removesuffix(".toml")).strip("-")
@@ -101,12 +156,18 @@ def make_jobs(
     converters: Path,
     folder: Path | None,
     figures: bool,
+    foreign: Foreign | None = None,
 ) -> list[Job]:
-    """A job for each part of each test under each law; ``laws`` are files by name, and the rest as
-    for ``Job``."""
+    """A job for each part of each test under each law, and then under the model; ``laws`` are files
+    by name, of which the first one, or else that of a scenario without a law, also says where the
+    model begins. The rest is as for ``Job``."""
+    each: list[tuple[str, str, Foreign | None]] = [(*law, None) for law in laws.items()]
+    if foreign is not None:
+        start = next(iter(laws.values()), Scenario.model_fields["law"].default)
+        each.append((foreign.name, start, foreign))
     return [
-        Job(law, file, case, part, inner, under, converters, folder, figures)
-        for law, file in laws.items()
+        Job(law, file, case, part, inner, under, converters, folder, figures, model)
+        for law, file, model in each
         for case in cases
         for part in case.test.runs()
     ]
@@ -161,22 +222,37 @@ def _finish(future: Future[Found], job: Job, keep: Callable[[Found], None]) -> N
 
 def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
-    seen: set[tuple[bool, int]] = set()
+    seen: set[tuple[bool, int, bool]] = set()
     for job in jobs:
         if job.part.cannot is not None:
             continue
         try:
             scenario = _scenario(job)
-            kind = scenario.has_inner, len(scenario.converters)
-            if kind not in seen:
+            kind = scenario.has_inner, len(scenario.converters), job.foreign is not None
+            if kind in seen:
+                continue
+            if job.foreign is not None:
+                compiled_bench(scenario, notice, ("plant",))
+                compile_for_model(scenario, notice)
+            else:
                 (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
-                seen.add(kind)
+            seen.add(kind)
         except UserError:  # which the verdict will say
             continue
 
 
 def _scenario(job: Job) -> Scenario:
-    return scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
+    """The scenario of a job.
+
+    Raises:
+        UserError: it cannot be run.
+    """
+    found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
+    if job.foreign is None:
+        return found
+    if found.network is not None:
+        raise UserError(f"{job.law} is one controller, and the test's network has several")
+    return found.model_copy(update={"link": _LINK})
 
 
 def run_part(job: Job) -> Found:
@@ -187,32 +263,114 @@ def run_part(job: Job) -> Found:
     if part.cannot is not None:
         reason = f"Cannot be judged: {part.cannot}"
         return Found(*names, "none", reason, cannot(criteria, reason))
+    if isinstance(criteria[0], Nfp):
+        return _plot(job, criteria[0])
+    with ExitStack() as stack:
+        try:
+            scenario = _scenario(job)
+            run, others = _run(job, scenario, stack)
+        except UserError as problem:
+            return _no_run(job, criteria, problem)
+        verdicts = judge(run, criteria, _declared(job, scenario, criteria), others)
+        again, figure = "", None
+        if job.folder is not None:
+            place = _place(job.folder, job, scenario)
+            again = _again(place, job.foreign)
+            if job.figures and run.ticks:
+                from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
+
+                figure = place / "figure.png"
+                draw_part(figure, _title(job, scenario), run, verdicts)
+        reason = str(run.summary["reason"])
+        return Found(*names, run.status, reason, verdicts, again, figure)
+
+
+def _declared(job: Job, scenario: Scenario, criteria: Sequence[Criterion]) -> UnderTest:
+    """What the owner declares, with the unit that is measured where it is asked for."""
+    under = job.under
+    if under.unit is not None or not any(isinstance(c, InEnvelope) for c in criteria):
+        return under
+    if job.foreign is not None:  # which runs over a link alone
+        return under
+    try:
+        found = measure_unit(None, scenario)
+    except UserError:
+        return under
+    unit = Declared(D=found.D, H=found.H, X_eff=found.X_eff)
+    return under.model_copy(update={"unit": unit})
+
+
+def _plot(job: Job, asked: Nfp) -> Found:
+    """Measure, judge and draw a network-frequency-perturbation plot."""
+    foreign = job.foreign
     try:
         scenario = _scenario(job)
-        run, others = _run(scenario, test.judged)
+        found = identify(
+            None, scenario, start_hz=asked.from_hz, stop_hz=asked.to_hz, points=asked.points,
+            controller_command=model_command(foreign.model, foreign.ports) if foreign else (),
+        )  # fmt: skip
     except UserError as problem:
-        text = str(problem).replace("\n", "; ").replace(job.file, job.law)
-        reason = f"Cannot be judged: there is no such run: {text}"
-        return Found(*names, "none", reason, cannot(criteria, reason))
-    verdicts = judge(run, criteria, job.under, others)
-    place = figure = None
+        return _no_run(job, [asked], problem)
+    again, figure = "", None
     if job.folder is not None:
-        place = job.folder / "runs" / slug(job.law) / slug(job.name)
-        place.mkdir(parents=True, exist_ok=True)
-        write_scenario(place, scenario)
-    if place is not None and job.figures and run.ticks:
-        from gfm_hil.studies.conformity.figure import draw_part  # takes half a second to import
+        place = _place(job.folder, job, scenario)
+        if foreign is None:
+            again = shlex.join(
+                ["gfmhil", "identify", str(place / "scenario.toml"), "--from", f"{asked.from_hz:g}",
+                 "--to", f"{asked.to_hz:g}", "--points", str(asked.points)]
+            )  # fmt: skip
+        if job.figures:
+            from gfm_hil.studies.conformity.figure import draw_plot
 
-        figure = place / "figure.png"
-        draw_part(figure, f"{job.law} · {job.name} · {scenario.title}", run, verdicts)
-    reason = str(run.summary["reason"])
-    return Found(*names, run.status, reason, verdicts, place, figure)
+            figure = place / "figure.png"
+            draw_plot(figure, _title(job, scenario), found, asked)
+    verdicts = judge_nfp(found.frequency, found.nfp, asked)
+    return Found(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
 
 
-def _run(scenario: Scenario, judged: str | None) -> tuple[Run, Mapping[str, Run]]:
-    """The run that is judged, and those of the other converters."""
+def _no_run(job: Job, criteria: Sequence[Criterion], problem: UserError) -> Found:
+    text = str(problem).replace("\n", "; ").replace(job.file, job.law)
+    reason = f"Cannot be judged: there is no such run: {text}"
+    told = cannot(criteria, reason)
+    return Found(job.law, job.case.id, job.part.name, "none", reason, told)
+
+
+def _title(job: Job, scenario: Scenario) -> str:
+    return f"{job.law} · {job.name} · {scenario.title}"
+
+
+def _place(folder: Path, job: Job, scenario: Scenario) -> Path:
+    """The folder of a part, with its scenario."""
+    place = folder / "runs" / slug(job.law) / slug(job.name)
+    place.mkdir(parents=True, exist_ok=True)
+    write_scenario(place, scenario)
+    return place
+
+
+def _again(place: Path, foreign: Foreign | None) -> str:
+    """The command that repeats the run of the scenario in a folder."""
+    words = ["gfmhil", "run", str(place / "scenario.toml")]
+    if foreign is not None:
+        words += ["--controller", foreign.model]
+        words += ["--map", str(foreign.ports)] if foreign.ports else []
+    return shlex.join(words)
+
+
+def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[str, Run]]:
+    """The run that is judged, and those of the other converters.
+
+    Args:
+        stack: keeps what a run of a model is read from.
+    """
+    if job.foreign is not None:
+        folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
+        command = model_command(job.foreign.model, job.foreign.ports)
+        run = run_scenario(scenario, folder, figures=False, controller_command=command)
+        if run.status == "interrupted":
+            raise KeyboardInterrupt
+        return run, {}
     if scenario.network is None:
         return run_in_memory(scenario), {}
     runs = run_network_in_memory(scenario)
-    name = judged or scenario.converters[0]
+    name = job.case.test.judged or scenario.converters[0]
     return runs[name], {other: run for other, run in runs.items() if other != name}

@@ -15,7 +15,10 @@ from gfm_hil.recording.columns import unit_of
 from gfm_hil.recording.run import RecordedRun, nominal_frequency
 from gfm_hil.results.cycles import cycle_means, cycle_ticks
 from gfm_hil.results.figures import COLOURS, draw_panel
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Verdict
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Verdict, judge_nfp
+from gfm_hil.studies.conformity.model import Nfp
+from gfm_hil.studies.identification import Identification
+from gfm_hil.studies.identification_figures import draw_nfp
 
 #: Okabe and Ito's green, vermilion and grey: pass, fail, cannot judge
 VERDICT_COLOURS = {PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999"}
@@ -55,11 +58,35 @@ def draw_part(path: Path, title: str, run: RecordedRun, verdicts: Sequence[Verdi
     _save(figure, path)
 
 
+def draw_plot(path: Path, title: str, found: Identification, asked: Nfp) -> None:
+    """Draw the network-frequency-perturbation plot with the limits of its bands."""
+    figure = Figure(figsize=(7.6, 5.6), layout="constrained")
+    gain, phase = draw_nfp(found, figure)
+    verdicts = iter(judge_nfp(found.frequency, found.nfp, asked))
+    for band in asked.bands:
+        for axes, low, high in (
+            (gain, band.low, band.high),
+            (phase, band.phase_low, band.phase_high),
+        ):
+            limits = [x for x in (low, high) if x is not None]
+            colour = VERDICT_COLOURS[next(verdicts).verdict] if limits else ""
+            for limit in limits:
+                span = [band.from_hz, band.to_hz]
+                axes.plot(span, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    _save(figure, path)
+
+
 def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:
     row = 0
     for v in verdicts:
         colour = VERDICT_COLOURS[v.verdict]
-        if v.limited is not None:
+        if v.curve is not None:
+            t, edges = v.curve[0], v.curve[1:]
+            axes.fill_between(t, edges[0], edges[1], color=colour, alpha=0.12, lw=0)
+            for edge in edges:
+                axes.plot(t, edge, color=colour, lw=1.2, ls=(0, (3, 1.5)))
+        elif v.limited is not None:
             for limit in (v.low, v.high):
                 if limit is not None:
                     axes.plot(v.limited, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -20,12 +21,15 @@ from gfm_hil.results import checks
 from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
 from gfm_hil.results.modes import swing
 from gfm_hil.results.ripple import remaining_ripple
+from gfm_hil.scenario.events import GridFrequency, GridImpedance, PhaseJump
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.conformity.model import (
     Criterion,
     Damped,
     Energy,
+    InEnvelope,
     InStep,
+    Nfp,
     NoOscillation,
     NoTrip,
     PeakDelta,
@@ -34,6 +38,7 @@ from gfm_hil.studies.conformity.model import (
     StaysWithin,
     UnderTest,
 )
+from gfm_hil.studies.envelopes import Envelope, Unit, phase_jump, rocof, scr_jump
 
 Outcome = Literal["pass", "fail", "cannot judge"]
 PASS: Final = "pass"
@@ -42,6 +47,7 @@ CANNOT: Final = "cannot judge"
 SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?"}
 
 _LASTED = ("completed", "oscillating")
+_CURVE = 600  # points of a limit in the figure
 _NO_RISE = 0.02  # p.u.; of a smaller peak no rise time is told
 
 Vector = NDArray[np.float64]
@@ -63,6 +69,7 @@ class Verdict:
         text: one sentence.
         low, high: limits of the signal itself between ``limited`` s, for the figure.
         limited: from when to when they hold, s.
+        curve: t, s, and limits that change with it, shape (K,) each, for the figure.
     """
 
     clause: str
@@ -78,10 +85,11 @@ class Verdict:
     low: float | None = None
     high: float | None = None
     limited: tuple[float, float] | None = None
+    curve: tuple[Vector, Vector, Vector] | None = None
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""
-        return asdict(self)
+        return {name: x for name, x in asdict(replace(self, curve=None)).items() if name != "curve"}
 
 
 def judge(
@@ -103,6 +111,50 @@ def judge(
         for criterion in criteria
         for at in criterion.at or [_first(run)]
     ]
+
+
+def judge_nfp(hz: Vector, nfp: NDArray[np.complex128], asked: Nfp) -> list[Verdict]:
+    """The verdicts on a network-frequency-perturbation plot, one a band.
+
+    Args:
+        hz: frequencies, Hz, shape (K,).
+        nfp: change of p over that of the grid's frequency, p.u. over p.u., shape (K,).
+        asked: its bands, or why there are none.
+    """
+    made = partial(Verdict, asked.clause, asked.kind, "p", 0.0, 0.0)
+    gain, phase = np.abs(nfp), np.degrees(np.angle(nfp))
+    span = f"From {hz[0]:.3g} to {hz[-1]:.3g} Hz the gain lies between {gain.min():.4g} and "
+    span += f"{gain.max():.4g} p.u./p.u."
+    if asked.unknown is not None:
+        text = f"Cannot be judged: {asked.unknown}. {span}"
+        return [made(CANNOT, float(gain.max()), "p.u./p.u.", "", text)]
+    found = []
+    for band in asked.bands:
+        inside = (hz >= band.from_hz) & (hz <= band.to_hz)
+        where = f"{band.from_hz:g} to {band.to_hz:g} Hz"
+        if not inside.any():
+            found.append(made(CANNOT, None, "", where, f"No point lies between {where}."))
+            continue
+        for x, low, high, unit, name in (
+            (gain, band.low, band.high, "p.u./p.u.", "gain"),
+            (phase, band.phase_low, band.phase_high, "°", "phase"),
+        ):
+            if low is None and high is None:
+                continue
+            beyond = np.maximum(
+                -math.inf if low is None else low - x, -math.inf if high is None else x - high
+            )
+            k = int(np.argmax(np.where(inside, beyond, -math.inf)))
+            ok = bool(beyond[k] <= 0)
+            limits = [f"at least {low:g} {unit}"] if low is not None else []
+            limits += [f"at most {high:g} {unit}"] if high is not None else []
+            text = (
+                f"At {hz[k]:.3g} Hz the {name} is {x[k]:.4g} {unit}, the nearest to its limits "
+                f"or the furthest beyond them between {where}."
+            )
+            limit = f"{' and '.join(limits)}, {where}"
+            found.append(made(PASS if ok else FAIL, float(x[k]), unit, limit, text))
+    return found
 
 
 def cannot(criteria: Sequence[Criterion], reason: str) -> list[Verdict]:
@@ -164,6 +216,7 @@ class _Judge:
             NoTrip: self._no_trip,
             NoOscillation: self._no_oscillation,
             InStep: self._in_step,
+            InEnvelope: self._in_envelope,
         }
         c = self.c
         if not isinstance(c, NoTrip):
@@ -390,6 +443,62 @@ class _Judge:
             else f"The converter falls out of step: its angle to the grid moves by {far:.4g}°."
         )
         return self._made(far < 180, far, "°", "less than 180°", text, "delta")
+
+    def _in_envelope(self, c: InEnvelope) -> Verdict:
+        declared, P_0 = self.under.unit, self._before("p")
+        if declared is None:
+            return self._cannot(
+                "D, H and X_eff are not declared, and no swing equation fits the answer to a small "
+                "phase jump"
+            )
+        unit = Unit(declared.D, declared.H, declared.X_eff)
+        after = self.T_s * np.arange(self.last - self.tick, dtype=np.float64)
+        found = self._expected(unit, after, P_0)
+        if found is None:
+            return self._cannot("its time is not that of an event with an envelope")
+        # As DyCoV measures: the mean of the last cycle, and the limits are late by a cycle. In the
+        # first one the mean is of before and after, and is not judged.
+        cycle = whole_ticks(self.width)
+        self.first = max(self.first, self.tick + cycle + 1)
+        x = self._means("p", self.first - cycle, self.last)
+        low, high = (y[self.first - self.tick :][: len(x)] for y in (found.lower, found.upper))
+        t = self.T_s * (self.first + np.arange(len(low), dtype=np.float64))
+        w = checks.Window("p", t, x[: len(low)], P_0, self.at)
+        wrong = checks.envelope(w, low, high, c.longest_s)
+        beyond = float(np.max(np.maximum(np.maximum(low - w.x, w.x - high), 0.0)))
+        words = f"D = {unit.D:.3g}, H = {unit.H:.3g} s, X_eff = {unit.X_eff:.3g}"
+        if wrong is None:
+            text = f"p stays in the envelope of {words}" + (
+                f", but for {beyond:.2g} p.u. for a time." if beyond > 0 else "."
+            )
+        else:
+            text = f"{wrong.text} The envelope is that of {words}."
+        every = max(1, len(t) // _CURVE)
+        curve = t[::every], low[::every], high[::every]
+        made = self._made(wrong is None, beyond, "p.u.", "beyond the envelope: 0 p.u.", text, "p")
+        return replace(made, curve=curve)
+
+    def _expected(self, unit: Unit, t: Vector, P_0: float) -> Envelope | None:
+        """The envelope of the event at ``at``, or None if there is none; t: s after it."""
+        scenario, scr = self.run.scenario, self.run.scenario.plant.grid.scr
+        event = None
+        for e in sorted(scenario.events, key=lambda e: e.at(self.T_s)):
+            if e.at(self.T_s) == self.tick:
+                event = e
+            elif isinstance(e, GridImpedance) and e.at(self.T_s) < self.tick:
+                scr = e.scr
+        if scr is None:
+            return None
+        match event:
+            case PhaseJump():
+                return phase_jump(unit, t, math.radians(event.degrees), scr, P_0)
+            case GridFrequency(rate=float(rate)):
+                df = event.f_hz - self.f_n * float(self._raw("omega_g")[self.tick - 1])
+                slope = math.copysign(rate / self.f_n, df)
+                return rocof(unit, t, slope, scr, P_0, lasts=abs(df) / rate)
+            case GridImpedance(scr=float(after)):
+                return scr_jump(unit, t, scr, after, P_0)
+        return None
 
 
 def sorted_limits(

@@ -146,8 +146,74 @@ class InStep(_Windowed):
     kind: Literal["stays_in_step"] = Field(description="kind of criterion")
 
 
+class InEnvelope(_Windowed):
+    """The means of p over the last cycle stay in the envelope that DyCoV draws around what a unit
+    of the declared or measured damping, inertia and reactance is expected to do. The event at the
+    time is a phase jump, a ramp of the grid's frequency or a jump of its short-circuit ratio."""
+
+    kind: Literal["in_envelope"] = Field(description="kind of criterion")
+    longest_s: float = Field(0.0, ge=0, description="s that p may be beyond, in one piece")
+
+
+class Band(_Model):
+    """Limits of a gain and a phase between two frequencies."""
+
+    from_hz: float = Field(gt=0, description="of the perturbation, Hz")
+    to_hz: float = Field(gt=0, description="the same")
+    low: float | None = Field(None, description="least gain, p.u. of power over p.u. of frequency")
+    high: float | None = Field(None, description="largest gain, in the same unit")
+    phase_low: float | None = Field(None, description="least phase, degrees from -180 to 180")
+    phase_high: float | None = Field(None, description="largest phase, in the same unit")
+
+    @model_validator(mode="after")
+    def _limited(self) -> Band:
+        if self.from_hz >= self.to_hz:
+            raise ValueError(f"from_hz = {self.from_hz:g}: must be < to_hz = {self.to_hz:g}")
+        if {self.low, self.high, self.phase_low, self.phase_high} == {None}:
+            raise ValueError("low, high, phase_low, phase_high: give one of them")
+        return self
+
+
+class Nfp(_Criterion):
+    """The network-frequency-perturbation plot, measured by small sines of the grid's frequency:
+    gain and phase of the change of p over the change of the grid's frequency stay within bands. A
+    part with this criterion has no other one, and no events count."""
+
+    kind: Literal["nfp"] = Field(description="kind of criterion")
+    from_hz: float = Field(1.0, ge=0.01, description="lowest frequency of the plot, Hz")
+    to_hz: float = Field(100.0, gt=0, description="highest frequency of the plot, Hz")
+    points: int = Field(21, ge=2, le=1000, description="evenly apart on a logarithmic axis")
+    bands: list[Band] = Field([], description="limits; each gives a verdict")
+    unknown: str | None = Field(
+        None, description="without bands: why none are known; the plot is drawn, but not judged"
+    )
+
+    @model_validator(mode="after")
+    def _judged_or_not(self) -> Nfp:
+        if bool(self.bands) == (self.unknown is not None):
+            raise ValueError("bands, unknown: give one of them")
+        if self.at is not None:
+            raise ValueError("at: a plot has no time")
+        if not self.from_hz < self.to_hz:
+            raise ValueError(f"from_hz = {self.from_hz:g}: must be < to_hz = {self.to_hz:g}")
+        for band in self.bands:
+            if not self.from_hz <= band.from_hz < band.to_hz <= self.to_hz:
+                raise ValueError(f"bands: from {band.from_hz:g} Hz: must lie in the plot")
+        return self
+
+
 Criterion = Annotated[
-    StaysWithin | Settles | PeakDelta | Rise | Damped | Energy | NoTrip | NoOscillation | InStep,
+    StaysWithin
+    | Settles
+    | PeakDelta
+    | Rise
+    | Damped
+    | Energy
+    | NoTrip
+    | NoOscillation
+    | InStep
+    | InEnvelope
+    | Nfp,
     Field(discriminator="kind"),
 ]
 
@@ -203,12 +269,23 @@ class Test(_Model):
         if len(set(names)) < len(names):
             raise ValueError(f"parts: names {names}: each once")
         for part in self.runs():
-            if part.cannot is None and not [*self.criteria, *part.criteria]:
+            asked = [*self.criteria, *part.criteria]
+            if any(isinstance(c, Nfp) for c in asked) and len(asked) > 1:
+                raise ValueError(f"parts {part.name!r}: nfp: must be its only criterion")
+            if part.cannot is None and not asked:
                 raise ValueError(f"parts {part.name!r}: no criterion; give some to it or the test")
         own = sorted({"title", "law", "inner", "link", "mode"} & {*self.scenario})
         if own:
             raise ValueError(f"scenario.{own[0]}: is not the test's to set")
         return self
+
+
+class Declared(_Model):
+    """The grid-forming unit that the converter is declared to be."""
+
+    D: float = Field(ge=0, description="damping, p.u. of power over p.u. of frequency")
+    H: float = Field(gt=0, description="inertia constant, s")
+    X_eff: float = Field(gt=0, description="effective reactance, p.u.")
 
 
 class UnderTest(_Model):
@@ -220,3 +297,6 @@ class UnderTest(_Model):
     )
     P_max: float = Field(description="declared: most power in the steady state, p.u.")
     P_min: float = Field(description="declared: least power in the steady state, p.u.")
+    unit: Declared | None = Field(
+        None, description="declared, for in_envelope; measured by a small phase jump if none"
+    )

@@ -36,7 +36,7 @@ class Conformity:
     """What the tests showed.
 
     Attributes:
-        laws: names, in order.
+        laws: names, in order; with a model its name is the last one.
         inner: stage of every law; None: each law's own.
         under: the converter under test.
         cases: the tests, in order.
@@ -171,12 +171,12 @@ class Conformity:
     def _page(self, law: str) -> str:
         body = [self._head(f"{law}: conformity")]
         rows = [
-            [_status(self.matrix[law, c.id]), _link(c), html.escape(c.test.source.words())]
+            [status(self.matrix[law, c.id]), _link(c), html.escape(c.test.source.words())]
             for c in self.cases
         ]
-        body.append(_table(["verdict", "test", "source"], rows))
+        body.append(table(["verdict", "test", "source"], rows))
         body += [self._section(law, case) for case in self.cases]
-        return _document(f"{law}: conformity", "\n".join(body))
+        return document(f"{law}: conformity", "\n".join(body))
 
     def _overview(self, picture: Path) -> str:
         heads = "".join(f'<th class="tall">{html.escape(c.id)}</th>' for c in self.cases)
@@ -185,12 +185,12 @@ class Conformity:
             page = f"report-{slug(law)}.html"
             cells = "".join(
                 f'<td><a href="{page}#{slug(c.id)}" title="{html.escape(c.test.title)}">'
-                f"{_status(self.matrix[law, c.id], short=True)}</a></td>"
+                f"{status(self.matrix[law, c.id], short=True)}</a></td>"
                 for c in self.cases
             )
             rows += f'<tr><th><a href="{page}">{html.escape(law)}</a></th>{cells}</tr>'
         matrix = f'<div class="scroll"><table class="matrix"><tr><th></th>{heads}</tr>{rows}'
-        sources = _table(
+        sources = table(
             ["test", "source", "known"],
             [
                 [html.escape(c.id), html.escape(c.test.source.words()),
@@ -200,7 +200,7 @@ class Conformity:
         )  # fmt: skip
         body = f"{self._head('Conformity of laws')}{matrix}</table></div><h2>Sources</h2>{sources}"
         body += f'<h2>Figure</h2><img alt="matrix" src="{inline(picture)}">'
-        return _document("Conformity of laws", body)
+        return document("Conformity of laws", body)
 
     def _head(self, title: str) -> str:
         under = self.under
@@ -216,26 +216,23 @@ class Conformity:
     def _section(self, law: str, case: Case) -> str:
         test = case.test
         text = [
-            f'<h2 id="{slug(case.id)}">{_status(self.matrix[law, case.id])} '
+            f'<h2 id="{slug(case.id)}">{status(self.matrix[law, case.id])} '
             f"{html.escape(f'{case.id}: {test.title}')}</h2>",
             f"<p>{html.escape(test.description)}</p>",
             f"<p>Source: {html.escape(test.source.words())}, {KNOWN[test.source.known]}.</p>",
         ]
         for f in self.of(law, case.id):
             if f.part:
-                text.append(f"<h3>{_status(f.verdict)} {html.escape(f.part)}</h3>")
+                text.append(f"<h3>{status(f.verdict)} {html.escape(f.part)}</h3>")
             if f.verdicts:
-                text.append(_table(_HEADS, [_row(v) for v in f.verdicts]))
+                text.append(table(_HEADS, [_row(v) for v in f.verdicts]))
             else:
                 text.append(f"<p>{html.escape(f.reason)}</p>")
             if f.figure is not None:
                 alt = html.escape(f"{f.test} {f.part}")
                 text.append(f'<img alt="{alt}" src="{inline(f.figure)}">')
-            if f.scenario is not None:
-                text.append(
-                    f"<p><code>gfmhil run {html.escape(str(f.scenario / 'scenario.toml'))}</code> "
-                    "repeats the run.</p>"
-                )
+            if f.again:
+                text.append(f"<p><code>{html.escape(f.again)}</code> repeats the run.</p>")
         return "\n".join(text)
 
     def __repr__(self) -> str:
@@ -249,11 +246,13 @@ _HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "wha
 
 def _row(v: Verdict) -> list[str]:
     measured = "–" if v.value is None else f"{cell(v.value)} {v.unit}".rstrip()
-    plain = (v.clause, v.signal or "–", f"{v.start:g} … {v.stop:g}", measured, v.limit, v.text)
-    return [_status(v.verdict), *map(html.escape, plain)]
+    window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
+    plain = (v.clause, v.signal or "–", window, measured, v.limit, v.text)
+    return [status(v.verdict), *map(html.escape, plain)]
 
 
-def _status(verdict: str, short: bool = False) -> str:
+def status(verdict: str, short: bool = False) -> str:
+    """A verdict in its colour, as a word or its sign."""
     look = verdict.split()[0]
     return f'<span class="status {look}">{SIGNS[verdict] if short else verdict}</span>'
 
@@ -263,14 +262,15 @@ def _link(case: Case) -> str:
     return f'<a href="#{slug(case.id)}">{name}</a>'
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table whose cells are HTML already."""
     top = "".join(f"<th>{head}</th>" for head in heads)
     body = "".join(f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in rows)
     return f'<div class="scroll text"><table><tr>{top}</tr>{body}</table></div>'
 
 
-def _document(title: str, body: str) -> str:
+def document(title: str, body: str) -> str:
+    """A whole page of HTML."""
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

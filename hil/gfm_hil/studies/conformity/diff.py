@@ -1,0 +1,292 @@
+"""What changed between two reports of the same tests: verdicts, measured values, what came or went.
+
+A clause is found again by law, test, part, its words and its kind, and where a part asks the same
+several times, by its turn. If each report has one law, these two are compared whatever they are
+called, so that a changed law may have another name or path.
+"""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.results.report import cell
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Outcome
+from gfm_hil.studies.conformity.result import document, status, table
+from gfm_runtime.errors import printable
+
+Change = Literal["worse", "better", "gone", "new", "moved"]
+
+SHARE = 0.05
+_SMALL = 1e-3  # in the unit of a value: what moves by less has not moved
+_RANK = {PASS: 0, CANNOT: 1, FAIL: 2}
+_ORDER: tuple[Change, ...] = ("worse", "gone", "moved", "better", "new")
+
+
+class _Read(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True)
+
+
+class Clause(_Read):
+    """What results.json says of a clause; a part without clauses is one without words.
+
+    Attributes:
+        clause, kind: its words and its criterion.
+        verdict: pass, fail or cannot judge.
+        value: measured, in ``unit``, or None.
+        unit: of the value.
+        text: one sentence.
+    """
+
+    clause: str
+    kind: str
+    verdict: Outcome
+    value: float | None
+    unit: str
+    text: str
+
+
+class _Part(_Read):
+    part: str
+    verdict: Outcome
+    reason: str
+    clauses: list[Clause]
+
+
+class _Test(_Read):
+    verdict: Outcome
+    parts: list[_Part]
+
+
+class Results(_Read):
+    """What results.json holds, as far as it is compared.
+
+    Attributes:
+        version: of gfmhil.
+        inner: stage of every law, or None.
+        under_test: the converter under test.
+        laws: tests by law and id.
+    """
+
+    version: str
+    inner: str | None
+    under_test: dict[str, Any]
+    laws: dict[str, dict[str, _Test]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A clause that is not what it was.
+
+    Attributes:
+        change: worse or better: of its verdict; moved: its value; new, gone: in one report only.
+        law, test, part: where it is.
+        old, new: what the reports say; None where it is missing.
+        counts: whether the new report is worse for it.
+    """
+
+    change: Change
+    law: str
+    test: str
+    part: str
+    old: Clause | None
+    new: Clause | None
+    counts: bool
+
+    @property
+    def clause(self) -> Clause:
+        """What is there now, or was."""
+        found = self.new or self.old
+        assert found is not None
+        return found
+
+    @property
+    def value(self) -> str:
+        """The measured values, ``old → new``."""
+        both = [_value(x) for x in (self.old, self.new)]
+        return " → ".join(both) if both[0] != both[1] else both[0]
+
+    @property
+    def verdict(self) -> str:
+        """The verdicts, ``old → new``."""
+        both = [x.verdict if x else "–" for x in (self.old, self.new)]
+        return " → ".join(both) if both[0] != both[1] else both[0]
+
+    def plain(self) -> dict[str, Any]:
+        """As data for JSON."""
+        of = {"change": self.change, "counts": self.counts, "law": self.law, "test": self.test}
+        both = {n: x.model_dump() if x else None for n, x in (("old", self.old), ("new", self.new))}
+        return {**of, "part": self.part, **both}
+
+
+@dataclass(frozen=True)
+class ReportDiff:
+    """Two reports beside each other.
+
+    Attributes:
+        rows: what changed, the worst first.
+        notes: what differs in how the reports were made, one sentence each.
+        same: how many clauses are what they were.
+        share: by which part of the larger a value had to move.
+    """
+
+    rows: list[Row]
+    notes: list[str]
+    same: int
+    share: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether a verdict got worse, or a clause that passed is gone."""
+        return any(row.counts for row in self.rows)
+
+    @property
+    def words(self) -> str:
+        """How many clauses changed in which way."""
+        count = Counter(row.change for row in self.rows)
+        told = [f"{count[change]} {change}" for change in _ORDER if change in count]
+        return ", ".join([*told, f"{self.same} as before"])
+
+    def plain(self) -> dict[str, Any]:
+        """As data for JSON."""
+        return {
+            "worse": self.worse,
+            "share": self.share,
+            "same": self.same,
+            "notes": self.notes,
+            "rows": [row.plain() for row in self.rows],
+        }
+
+    def page(self, old: str, new: str) -> str:
+        """As an HTML page; the arguments are the reports' names."""
+        title = "Conformity: what changed"
+        body = [f"<h1>{title}</h1><p>{html.escape(old)} → {html.escape(new)}: {self.words}.</p>"]
+        body += [f"<p>{html.escape(note)}</p>" for note in self.notes]
+        rows = [
+            [
+                row.change,
+                *map(html.escape, (row.law, row.test, row.part, row.clause.clause)),
+                " → ".join(status(x.verdict) if x else "–" for x in (row.old, row.new)),
+                *map(html.escape, (row.value, row.clause.text)),
+            ]
+            for row in self.rows
+        ]
+        heads = ("change", "law", "test", "part", "clause", "verdict", "measured", "what was found")
+        body.append(table(heads, rows) if rows else "<p>Nothing.</p>")
+        return document(title, "\n".join(body))
+
+
+def read_results(path: str | Path) -> Results:
+    """A report's results.json, or that in a report's folder.
+
+    Raises:
+        UserError: it cannot be read, or is none.
+    """
+    file = Path(path)
+    file = file / "results.json" if file.is_dir() else file
+    try:
+        return Results.model_validate_json(file.read_bytes())
+    except OSError as problem:
+        raise UserError(f"{file}: {problem.strerror}") from None
+    except ValidationError as problem:
+        told = lines(problem, Results)[0]
+        raise UserError(
+            printable(f"{file}: is no results.json of gfmhil conform: {told}")
+        ) from None
+
+
+def compare_results(old: Results, new: Results, share: float = SHARE) -> ReportDiff:
+    """Lay two reports beside each other.
+
+    Args:
+        old, new: the reports.
+        share: a value has moved if it changed by more than this part of the larger of both, and
+            by more than 1e-3 in its unit.
+
+    Raises:
+        UserError: the share cannot be one.
+    """
+    if not 0.0 <= share < 1.0:
+        raise UserError(f"share = {share:g}: must lie in [0, 1)")
+    tests_old, tests_new = _tests(old), _tests(new)
+    if len(old.laws) == len(new.laws) == 1:
+        (law,) = new.laws
+        tests_old = {(law, test): found for (_, test), found in tests_old.items()}
+    rows, same = [], 0
+    for at in {**tests_old, **tests_new}:
+        a, b = tests_old.get(at), tests_new.get(at)
+        if a is None or b is None:  # a test that one report has not is one row
+            there = a or b
+            assert there is not None
+            proven = any(c.verdict == PASS for part in there.parts for c in part.clauses)
+            whole = _bare(there.verdict, "")
+            if a is None:
+                rows.append(Row("new", *at, "", None, whole, False))
+            else:
+                rows.append(Row("gone", *at, "", whole, None, proven))
+            continue
+        before, after = _clauses(a), _clauses(b)
+        for key in {**before, **after}:
+            one, other = before.get(key), after.get(key)
+            found = _change(one, other, share)
+            if found is None:
+                same += 1
+                continue
+            counts = found == "worse" or (one is not None and other is None and one.verdict == PASS)
+            rows.append(Row(found, *at, key[0], one, other, counts))
+    rows.sort(key=lambda row: (not row.counts, _ORDER.index(row.change)))
+    return ReportDiff(rows, list(_notes(old, new)), same, share)
+
+
+def _tests(of: Results) -> dict[tuple[str, str], _Test]:
+    return {(law, test): found for law, tests in of.laws.items() for test, found in tests.items()}
+
+
+def _clauses(of: _Test) -> dict[tuple[str, str, str, int], Clause]:
+    """The clauses by part, words, kind and turn."""
+    found = {}
+    for part in of.parts:
+        turn: Counter[tuple[str, str]] = Counter()
+        for clause in part.clauses or [_bare(part.verdict, part.reason)]:
+            what = clause.clause, clause.kind
+            found[(part.part, *what, turn[what])] = clause
+            turn[what] += 1
+    return found
+
+
+def _bare(verdict: Outcome, text: str) -> Clause:
+    return Clause(clause="", kind="", verdict=verdict, value=None, unit="", text=text)
+
+
+def _change(old: Clause | None, new: Clause | None, share: float) -> Change | None:
+    if old is None or new is None:
+        return "new" if old is None else "gone"
+    if old.verdict != new.verdict:
+        return "worse" if _RANK[new.verdict] > _RANK[old.verdict] else "better"
+    if old.value is None or new.value is None:
+        return None if old.value is new.value else "moved"
+    moved = abs(new.value - old.value)
+    return "moved" if moved > max(share * max(abs(old.value), abs(new.value)), _SMALL) else None
+
+
+def _notes(old: Results, new: Results) -> Iterator[str]:
+    if old.version != new.version:
+        yield f"gfmhil was {old.version} and is {new.version}."
+    if old.inner != new.inner:
+        was, now = (x or "each law's own" for x in (old.inner, new.inner))
+        yield f"The inner stage was {was} and is {now}."
+    if old.under_test != new.under_test:
+        yield "The converter under test is another one."
+    if len(old.laws) == len(new.laws) == 1 and [*old.laws] != [*new.laws]:
+        yield f"The law was {next(iter(old.laws))} and is {next(iter(new.laws))}."
+
+
+def _value(of: Clause | None) -> str:
+    return "–" if of is None or of.value is None else f"{cell(of.value)} {of.unit}".rstrip()
