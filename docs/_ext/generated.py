@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from _ext import (
+    component_pages,
     conformity_pages,
     connect_pages,
     design_pages,
@@ -34,6 +35,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "conformity-criteria": conformity_pages.criteria,
     "inner-keys": scenario_pages.inner_tables,
     "network-keys": scenario_pages.network_tables,
+    "check-keys": scenario_pages.check_table,
     "law-keys": scenario_pages.law_tables,
     "law-mistakes": outputs.mistakes,
     "scenario-keys": scenario_pages.scenario_tables,
@@ -41,6 +43,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "scenario-mistakes": outputs.scenario_mistakes,
     "event-keys": scenario_pages.event_tables,
     "command": outputs.command,
+    "components": component_pages.components,
     "modbus-droops": modbus_pages.droops,
     "modbus-registers": modbus_pages.registers,
     "codes": connect_pages.codes,

@@ -43,9 +43,11 @@ NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[network.converters.NAME]", scenario.Member),
     ("[network.lines.NAME]", options.Line),
     ("[network.loads.NAME]", options.Load),
+    ("[network.constant_power.NAME]", options.ConstantPowerLoad),
     ("[network.capacitors.NAME]", options.CapacitorBank),
     ("[network.machines.NAME]", options.Machine),
 )
+CHECK = ("check", events.SynchroCheck)
 OVERLOAD = ("[[plant.protection.overload]]", options.Overload)
 TRIP = ("one protection, e.g. [plant.protection.over_current]", options.Trip)
 EVENTS = get_args(get_args(events.Event)[0])
@@ -140,6 +142,11 @@ def _tables(tables: tuple[tuple[str, type[BaseModel]], ...]) -> str:
 def scenario_tables() -> str:
     """Every table of a scenario file."""
     return _tables((*TABLES, TRIP, OVERLOAD))
+
+
+def check_table() -> str:
+    """The keys of a synchro-check."""
+    return _tables((CHECK,))
 
 
 def end_reasons() -> str:

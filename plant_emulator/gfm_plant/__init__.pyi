@@ -8,22 +8,26 @@ from .emulator import (
     plant_truth,
 )
 from .grid import (
+    Checked,
     breaker,
+    check_synchronism,
     clear_fault,
     fault,
+    finish_check,
     grid_frequency,
     grid_impedance,
     grid_load,
     grid_unbalance,
     grid_voltage,
     phase_jump,
+    start_again,
     take_out,
 )
 from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .network import Network
 from .options import NetworkParts, Plant
 from .parameters import ConverterParameters, load_converter
-from .protection import trip_reason
+from .protection import trip_reason, wait_reason
 from .records import PlantRecords
 from .sensors import plant_sample
 from .steady_state import NoEquilibrium, plant_equilibrium
@@ -34,6 +38,7 @@ __all__ = [
     "TRIP_REASONS",
     "TRUTH",
     "Bases",
+    "Checked",
     "ConverterParameters",
     "Network",
     "NetworkParts",
@@ -41,8 +46,10 @@ __all__ = [
     "Plant",
     "PlantRecords",
     "breaker",
+    "check_synchronism",
     "clear_fault",
     "fault",
+    "finish_check",
     "grid_frequency",
     "grid_impedance",
     "grid_load",
@@ -59,6 +66,8 @@ __all__ = [
     "plant_sample",
     "plant_step",
     "plant_truth",
+    "start_again",
     "take_out",
     "trip_reason",
+    "wait_reason",
 ]

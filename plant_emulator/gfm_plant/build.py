@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt, Sink
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
 from gfm_plant.options import (
     COMMANDS,
     MEASURED,
+    ConstantPowerLoad,
     FiniteGrid,
     Grid,
     Machine,
@@ -42,6 +43,7 @@ from gfm_plant.wiring import Unit, Wiring
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
 
+_LAG = 5.0  # shortest lag of a load of constant power, in sampling periods
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 
 
@@ -82,6 +84,7 @@ def make_network(
             or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
     names = [*converters, *parts.lines, *parts.loads, *parts.capacitors, *parts.machines]
+    names += parts.constant_power
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise ValueError(f"network: {twice[0]} is the name of two parts")
     branches = [Branch(name, x.start, x.end, x.L, x.R) for name, x in parts.lines.items()]
@@ -100,10 +103,13 @@ def make_network(
     banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
     opened = {name for name, line in parts.lines.items() if not line.closed}
     opened |= {name for name, load in parts.loads.items() if not load.closed}
-    return _make(
+    opened |= {name for name, load in parts.constant_power.items() if not load.closed}
+    network = _make(
         converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks,
-        frozenset(opened), parts.machines,
+        frozenset(opened), parts.machines, parts.constant_power,
     )  # fmt: skip
+    network.net["joins"] = 1
+    return network
 
 
 def _make(
@@ -116,6 +122,7 @@ def _make(
     capacitors: Sequence[Capacitor] = (),
     opened: frozenset[str] = frozenset(),
     machines: Mapping[str, Machine] = MappingProxyType({}),
+    constant_power: Mapping[str, ConstantPowerLoad] = MappingProxyType({}),
 ) -> Network:
     """Return a plant; elements in p.u. of the first converter."""
     if not (math.isfinite(T_s) and T_s > 0):
@@ -123,7 +130,7 @@ def _make(
     N = len(converters)
     # one more for a fault within a branch
     states = N_OWN * N + len(branches) + len(capacitors) + len(machines) + 1
-    net_dtype, now_dtype = network_dtypes(size_for(N, states, len(machines)))
+    net_dtype, now_dtype = network_dtypes(size_for(N, states, len(machines), len(constant_power)))
     records = PlantRecords(
         np.zeros(N, converter_par_dtype),
         np.zeros(N, converter_state_dtype),
@@ -142,7 +149,15 @@ def _make(
         _pack_protection(one, options.protection, T_s)
     net["omega_b"], net["T_s"], net["n_converters"] = first.bases.omega_b, T_s, N
     _pack_timing(records)
-    net["n_machines"] = len(machines)
+    net["n_machines"], net["n_sinks"] = len(machines), len(constant_power)
+    for j, (name, load) in enumerate(constant_power.items()):
+        if load.tau_s < _LAG * T_s:
+            raise ValueError(
+                f"network.constant_power.{name}: tau_s = {load.tau_s:g}: must be >="
+                f" {_LAG * T_s:g} s at this T_s"
+            )
+        net["S_sink"][0, j] = load.P, load.Q
+        net["tau_sink"][0, j], net["least_v2"][0, j] = load.tau_s, load.V_least**2
     if grid.finite is not None and grid_node is not None:
         _pack_grid(records, units, grid.finite)
     for j, (name, machine) in enumerate(machines.items(), 1):
@@ -162,6 +177,7 @@ def _make(
         tuple(branches),
         tuple(shunts),
         tuple(capacitors),
+        tuple(Sink(name, load.node) for name, load in constant_power.items()),
         tuple(MachineParts(name, m.node, m.X / m.S, m.R / m.S) for name, m in machines.items()),
         grid_node,
         opened=opened,
@@ -189,6 +205,7 @@ def _check_paths(wiring: Wiring) -> None:
     ends += [(b.name, node) for b in wiring.branches for node in (b.start, b.end)]
     ends += [(shunt.name, shunt.node) for shunt in wiring.shunts]
     ends += [(capacitor.name, capacitor.node) for capacitor in wiring.capacitors]
+    ends += [(sink.name, sink.node) for sink in wiring.sinks]
     ends += [(machine.name, machine.node) for machine in wiring.machines]
     ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
     for name, node in ends:

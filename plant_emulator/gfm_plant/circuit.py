@@ -65,6 +65,14 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Sink:
+    """A current from a node with a capacitor to ground, p.u."""
+
+    name: str
+    node: str
+
+
+@dataclass(frozen=True)
 class Modes:
     """What ``find_modes`` returns, for w of n_w states, n modes and n_s sources.
 
@@ -72,7 +80,7 @@ class Modes:
         rates: eigenvalues, (n,), 1/s.
         states: w of the modes, (n_w, n); a state that the circuit does not have is zero.
         modes: the modes of w, (n, n_w); it projects by stored energy.
-        drive: rate of the modes per source voltage, (n, n_s), 1/s.
+        drive: rate of the modes per source voltage, and per current of the sinks, (n, n_s), 1/s.
     """
 
     rates: NDArray[np.complex128]
@@ -88,6 +96,7 @@ def find_modes(
     omega_b: float,
     order: Sequence[str],
     shunts: Sequence[Shunt] = (),
+    sinks: Sequence[Sink] = (),
 ) -> Modes:
     """Return the modes of a circuit; those of the last circuits are kept, so that an event of a
     scenario that has been tried before its run costs no eigenvalues in real time.
@@ -96,13 +105,15 @@ def find_modes(
         omega_b: rad/s, also the speed of the common frame.
         order: the names of the states as w has them; those of other circuits may be among them.
         shunts: at most one a node, none at a source.
+        sinks: their currents follow the sources in ``Modes.drive``.
 
     Raises:
         ValueError: an L or C is not positive, a node hangs on one branch alone, two sources or
-            capacitors share a node, or the modes are too close to each other to be told apart.
+            capacitors share a node, a sink is at a node without a capacitor, or the modes are too
+            close to each other to be told apart.
     """
     parts = tuple(branches), tuple(capacitors), tuple(sources)
-    return _find_modes(*parts, omega_b, tuple(order), tuple(shunts))
+    return _find_modes(*parts, omega_b, tuple(order), tuple(shunts), tuple(sinks))
 
 
 @lru_cache(maxsize=256)
@@ -113,6 +124,7 @@ def _find_modes(
     omega_b: float,
     order: tuple[str, ...],
     shunts: tuple[Shunt, ...],
+    sinks: tuple[Sink, ...],
 ) -> Modes:
     stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
     for name, value in stored.items():
@@ -125,7 +137,7 @@ def _find_modes(
 
     through = {shunt.node: shunt.R for shunt in shunts}
     n_b, n_c = len(branches), len(capacitors)
-    n_s = len(sources)
+    n_s = len(sources) + len(sinks)
     M = np.zeros((n_b + n_c, n_b + n_c))  # of the stored quantities: L i' = M w + B s, C v' = M w
     B = np.zeros((n_b + n_c, n_s))
     meets: dict[str, NDArray[np.float64]] = {}
@@ -139,6 +151,13 @@ def _find_modes(
                 M[n_b + charged[node], j] = -sign
             elif node != GROUND:
                 meets.setdefault(node, np.zeros(n_b + n_c))[j] = sign
+    for j, sink in enumerate(sinks, len(sources)):
+        if sink.node not in charged:
+            raise ValueError(
+                f"node {sink.node}: {sink.name} draws constant power, so the node needs a bank of"
+                " network.capacitors"
+            )
+        B[n_b + charged[sink.node], j] = -1.0
     for node, k in charged.items():
         if node in through:
             if not through[node] > 0:
@@ -168,6 +187,58 @@ def _find_modes(
     for array in (rates, states, modes, drive):
         array.flags.writeable = False
     return Modes(rates, states, modes, drive)
+
+
+def find_voltage(
+    node: str,
+    branches: Sequence[Branch],
+    capacitors: Sequence[Capacitor],
+    sources: Sequence[Source],
+    order: Sequence[str],
+    shunts: Sequence[Shunt] = (),
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the voltage of a node as factors of w, (n_w,), and of the sources, (n_s,).
+
+    That of a node where branches alone meet is the one under which their currents go on adding up
+    to nothing: with D for which branches meet where, D L^-1 D' v = D L^-1 (R i - what the other
+    ends give).
+
+    Args:
+        branches, capacitors, sources, order, shunts: as for ``find_modes``.
+    """
+    charged = {part.node: order.index(part.name) for part in capacitors}
+    fixed = _places("source", sources)
+    through = {shunt.node: shunt.R for shunt in shunts}
+    n_w, n_s = len(order), len(sources)
+    ends = [end for branch in branches for end in (branch.start, branch.end)]
+    known = {GROUND, *charged, *fixed, *through}
+    free = [one for one in dict.fromkeys(ends) if one not in known]
+    rows: dict[str, NDArray[np.float64]] = {GROUND: np.zeros(n_w + n_s)}
+    for one, place in charged.items():
+        rows[one] = np.eye(n_w + n_s)[place]
+    for one, place in fixed.items():
+        rows[one] = np.eye(n_w + n_s)[n_w + place]
+    for one in through:
+        if one not in rows:
+            rows[one] = np.zeros(n_w + n_s)
+            for branch in branches:
+                if one in (branch.start, branch.end):
+                    sign = 1.0 if branch.end == one else -1.0
+                    rows[one][order.index(branch.name)] = sign * through[one]
+    if node in rows:
+        return rows[node][:n_w], rows[node][n_w:]
+    D = np.zeros((len(free), len(branches)))
+    right = np.zeros((len(branches), n_w + n_s))
+    for j, branch in enumerate(branches):
+        right[j, order.index(branch.name)] = branch.R
+        for end, sign in ((branch.start, 1.0), (branch.end, -1.0)):
+            if end in rows:
+                right[j] -= sign * rows[end]
+            else:
+                D[free.index(end), j] = sign
+    DL = D / [branch.L for branch in branches]
+    found = np.linalg.lstsq(DL @ D.T, DL @ right, rcond=None)[0][free.index(node)]
+    return found[:n_w], found[n_w:]
 
 
 def _places(kind: str, parts: Sequence[Source | Capacitor]) -> dict[str, int]:

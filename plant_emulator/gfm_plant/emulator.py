@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_plant.constant_power import draw_power, measure, see_middle
 from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.model import DELTA, V_DC, terminal
-from gfm_plant.names import BAD_COMMAND, DIVERGED
-from gfm_plant.protection import protect, trip
+from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
+from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid, brought, given, settle
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
@@ -33,6 +34,7 @@ from gfm_plant.solution import (
     read_states,
     state,
 )
+from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
@@ -120,6 +122,8 @@ def plant_step(plant: PlantRecords) -> None:
         now.unit_before[k, 0], now.unit_before[k, 1] = now.unit[k, 0], now.unit[k, 1]
     for i in range(n.n_states):
         now.w_before[i, 0], now.w_before[i, 1] = now.w[i, 0], now.w[i, 1]
+    for j in range(n.n_sinks):
+        now.v_sink_before[j, 0], now.v_sink_before[j, 1] = now.v_sink[j, 0], now.v_sink[j, 1]
     for part in range(n.n_parts):
         if n.stretch[part] > 0.0:
             _stretch(plant, part)
@@ -134,6 +138,8 @@ def plant_step(plant: PlantRecords) -> None:
         for k in range(n.n_converters):
             _write_x(plant, k)
         for k in range(n.n_converters):
+            if plant.st[k].trip != 0:
+                follow_voltage(plant, k)
             protect(plant, k)
     else:
         _go_back(plant)
@@ -146,6 +152,8 @@ def plant_step(plant: PlantRecords) -> None:
             now.unbalance_left = now.sequence[0, 1] = 0.0
             now.sequence[1, 0] = now.sequence[1, 1] = 0.0
             now.sequence[0, 0] = 1.0
+    if now.check == WATCHING:
+        watch(plant)
     if now.faulted:
         now.fault_left -= n.T_s
         if now.fault_left < 0.5 * n.T_s:
@@ -187,6 +195,8 @@ def _go_back(plant: PlantRecords) -> None:
         now.unit[k, 0], now.unit[k, 1] = now.unit_before[k, 0], now.unit_before[k, 1]
     for i in range(n.n_states):
         now.w[i, 0], now.w[i, 1] = now.w_before[i, 0], now.w_before[i, 1]
+    for j in range(n.n_sinks):
+        now.v_sink[j, 0], now.v_sink[j, 1] = now.v_sink_before[j, 0], now.v_sink_before[j, 1]
 
 
 @compiled
@@ -327,7 +337,12 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
         omega = now.omega[j] + 0.5 * n.T_s * now.slope[j]
         drive(n, now, c, part, machine_source(n, j), n.E[j], 0.0, omega)
 
+    if n.n_sinks > 0:
+        draw_power(n, now, c, part)
+
     half_step(n, now, c, part, 0)
+    if n.n_sinks > 0:
+        see_middle(n, now, c)
     if swings:
         read_states(n, now, c)
     else:
@@ -344,6 +359,8 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
 
     half_step(n, now, c, part, 2)
     read_states(n, now, c)
+    if n.n_sinks > 0:
+        measure(n, now, part)
     if swings:
         _bring(n, now, now.unit, n.half_h[part] / 3.0)
     for k in range(n.n_converters):
@@ -399,6 +416,37 @@ def _sense(n: Any, s: Any, k: int, j: int, part: int, f_0: float, f_1: float, f_
         + n.sensor_weights[part, k, 2] * f_1
         + n.sensor_weights[part, k, 3] * f_2
     )
+
+
+@cached
+def synchronise(plant: PlantRecords, k: int) -> None:
+    """Start the bridge of converter k, whose block is out of the circuits already, on the voltage
+    of its capacitor: in phase with it, at its speed and of its size, so that no current flows yet.
+
+    Its DC link has been charged to its reference meanwhile, and its DC source starts from zero.
+    """
+    s, now, i = plant.st[k], plant.now[0], own(k) + V
+    v_r, v_i = now.w[i, 0], now.w[i, 1]
+    size = math.sqrt(v_r * v_r + v_i * v_i)
+    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
+    s.x[DELTA] += math.atan2(v_i * u_r - v_r * u_i, v_r * u_r + v_i * u_i)
+    now.unit[k, 0], now.unit[k, 1] = v_r / size, v_i / size
+    s.x[V_DC] = s.sensed[0] = 1.0
+    s.i_reg = s.i_source = 0.0
+    for j in range(N_COMMANDS):
+        s.u_now[j] = 0.0
+    s.u_now[1], s.u_now[2] = s.omega_seen, size
+    for age in range(MAX_DELAY + 2):
+        for j in range(N_COMMANDS):
+            s.u[age, j] = s.u_now[j]
+    s.E[0], s.E[1] = size, 0.0
+    s.looked = 0
+    s.sums[0] = s.sums[1] = s.i_rms = 0.0
+    for j in range(len(s.crossed)):
+        s.crossed[j] = 0
+    s.trip, s.trip_tick, s.trip_value, s.waits = 0, 0, 0.0, NOT_ASKED
+    enter(plant.net[0], now, circuit(plant.net[0], now))
+    _write_x(plant, k)
 
 
 @cached

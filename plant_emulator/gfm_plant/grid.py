@@ -8,12 +8,14 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from gfm_plant.emulator import reconnect
+from gfm_plant.circuit import GROUND
+from gfm_plant.emulator import reconnect, synchronise
 from gfm_plant.model import DELTA
 from gfm_plant.network import Network
-from gfm_plant.wiring import FaultPlace
+from gfm_plant.synchro_check import NONE, TIME_OVER, WATCHING
+from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, Wiring
 
 LEAST_FAULT_R = 1e-4
 """p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
@@ -186,8 +188,8 @@ def phase_jump(plant: Network, degrees: float) -> None:
 def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     """Set the line to `L_g` and `R_g` times the elements of the converter file.
 
-    Its current is continuous, but in an island, where the flux of line and load is. Factors of the
-    options are not applied on top.
+    The line's current does not jump. In an island the flux of line and load does not jump, so that
+    the current may. The ``factors`` of the options are not applied again.
 
     Raises:
         ValueError: If L_g <= 0 or R_g < 0, or a mode becomes too fast for the DC link. The plant
@@ -222,7 +224,7 @@ def breaker(plant: Network, closed: bool) -> None:
         raise ValueError(
             "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
         )
-    plant.rewire(replace(plant.wiring, closed=closed))
+    plant.rewire(replace(_without_check(plant, ""), closed=closed))
     plant.now["closed"] = closed
 
 
@@ -239,23 +241,143 @@ def line_breaker(plant: Network, name: str, closed: bool) -> None:
     Raises:
         ValueError: If there is no such breaker.
     """
+    part, *_ = _breaker(plant, name)
+    wiring, one = _without_check(plant, name), frozenset({part})
+    plant.rewire(replace(wiring, opened=wiring.opened - one if closed else wiring.opened | one))
+
+
+def check_synchronism(
+    plant: Network,
+    name: str,
+    V: float,
+    omega: float,
+    degrees: float,
+    lasting: float,
+    within: float,
+) -> None:
+    """Let a synchro-check close an open breaker: as soon as its two sides have agreed for a time.
+
+    What is closed already stays closed, without a check. To switch the breaker in another way ends
+    its check. The plant says in ``now["check"]`` when the time has come, and `finish_check` then
+    acts.
+
+    Args:
+        plant: The plant.
+        name: Of a line or a machine, or of the converter whose line it is; "": the grid's breaker.
+        V: Largest difference of the voltages, p.u., >= 0.
+        omega: Of the speeds, p.u., >= 0.
+        degrees: Of the angles, >= 0.
+        lasting: For how long all three must be within, s.
+        within: After this time the breaker stays open, s.
+
+    Raises:
+        ValueError: If there is no such breaker with two sides, a value is out of range, or another
+            check is not over yet. The plant is then unchanged.
+    """
     wiring = plant.wiring
-    breakers = {shown: line.name for shown, line in wiring.named_lines().items()}
-    breakers |= {part: part for part in wiring.parts}
+    if name:
+        part, *sides = _breaker(plant, name)
+        opened = part in wiring.opened
+    elif wiring.grid is None:
+        raise ValueError("network.grid: not set; an island has no grid breaker")
+    else:
+        sides, opened = [wiring.grid, GRID_SOURCE], not wiring.closed
+    if GROUND in sides:
+        raise ValueError(f"name = {name!r}: a load has one side; a check is for what has two")
+    for what, value in (("V", V), ("omega", omega), ("degrees", degrees), ("lasting", lasting)):
+        _require(what, value, value >= 0, ">= 0")
+    _require("within", within, within > lasting, f"> {lasting:g} s, for which it must last")
+    if not opened:
+        return
+    if wiring.check is not None:
+        other = wiring.check.name or "the grid's breaker"
+        raise ValueError(f"check: that of {other} is not over yet; there can be one at a time")
+    plant.connect(replace(wiring, check=Check(name, (sides[0], sides[1]))))
+    plant.net["check_limits"] = V, omega * wiring.omega_b, math.radians(degrees)
+    plant.net["check_lasting"] = lasting
+    now = plant.now
+    now["check"], now["check_looks"], now["check_lasted"] = WATCHING, 0, 0.0
+    now["check_seen"], now["check_left"] = 0.0, within
+
+
+@dataclass(frozen=True)
+class Checked:
+    """How a synchro-check ended.
+
+    Attributes:
+        name: of the breaker; "" for that of the grid.
+        closed: whether it has closed.
+        V, omega, degrees: the differences by then, of the first side to the second: p.u. and
+            degrees.
+    """
+
+    name: str
+    closed: bool
+    V: float
+    omega: float
+    degrees: float
+
+
+def finish_check(plant: Network) -> Checked | None:
+    """Close the breaker whose synchro-check has agreed, or end a check whose time is over; None if
+    there is nothing to do."""
+    state, check = int(plant.now[0]["check"]), plant.wiring.check
+    if check is None or state in (NONE, WATCHING):
+        return None
+    V, speed, angle = (float(x) for x in plant.now[0]["check_seen"])
+    if state == TIME_OVER:
+        plant.wiring = _without_check(plant, check.name)
+    elif check.name:
+        line_breaker(plant, check.name, True)
+    else:
+        breaker(plant, True)
+    differences = V, speed / plant.wiring.omega_b, math.degrees(angle)
+    return Checked(check.name, state != TIME_OVER, *differences)
+
+
+def _breaker(plant: Network, name: str) -> tuple[str, str, str]:
+    """The branch or shunt that a breaker opens, and the nodes at its ends.
+
+    Raises:
+        ValueError: If there is no such breaker.
+    """
+    breakers = plant.wiring.breakers()
     if name not in breakers:
         raise ValueError(f"name = {name!r}: must be one of {sorted(breakers)}")
-    one = frozenset({breakers[name]})
-    plant.rewire(replace(wiring, opened=wiring.opened - one if closed else wiring.opened | one))
+    return breakers[name]
+
+
+def _without_check(plant: Network, name: str) -> Wiring:
+    """The wiring without the synchro-check of a breaker, which is thereby over."""
+    check = plant.wiring.check
+    if check is None or check.name != name:
+        return plant.wiring
+    plant.now["check"] = NONE
+    return replace(plant.wiring, check=None)
 
 
 def take_out(plant: Network) -> None:
     """Make the circuits for the next trip, after one of several converters has tripped."""
     row = int(plant.now[0]["row"])
-    if row == 0 or len(plant.par) == 1:
+    if row == 0 or not plant.net[0]["joins"]:
         return
     out = plant.wiring.blocked | {row - 1}
     plant.now["row"] = 0
     plant.rewire(replace(plant.wiring, blocked=out))
+
+
+def start_again(plant: Network, k: int) -> None:
+    """Start the bridge of a converter of a network that has tripped, on the voltage of its
+    capacitor.
+
+    Its protection's trip is cleared. The others go on.
+
+    Args:
+        plant: a network, after `take_out`.
+        k: index of the converter, whose `protection.start_condition` is MAY_START.
+    """
+    plant.rewire(replace(plant.wiring, blocked=plant.wiring.blocked - {k}))
+    synchronise(plant.records, k)
 
 
 def _grid_source(plant: Network) -> int:

@@ -38,6 +38,10 @@ NO_FRESH_U = "no fresh u for longer than late_policy.hold allows"
 CONTROLLER_GONE = "the controller's process is gone"
 CONTROLLER_LEFT = "the controller was stopped"
 
+#: what a bridge that is to start again waits for: nothing was asked, nothing is in the way, or from
+#: here on the protection (its place in TRIPS) that would trip it again
+NOT_ASKED, MAY_START, WOULD_TRIP = 0, 1, 2
+
 SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
 """Indices of the y that pass the sensors; omega_u is a command and known exactly."""
 

@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from gfm_plant.constant_power import PowerLoad
 from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.model import DELTA
 from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords, Record
 from gfm_plant.wiring import GRID_SOURCE, Wiring
 
 _DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
-_PIECE = 0.5  # largest angle through which a mode turns in half a piece of Simpson's rule
+_PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
-_MOST = 500  # steps, or pieces, in a period
+_ROUNDS = 100  # of the search for the currents of loads of constant power
+_MOST = 500  # steps of the DC link, or intervals of Simpson's rule, in a period
 
 
 @dataclass
@@ -33,6 +35,18 @@ class Network:
 
     records: PlantRecords
     wiring: Wiring
+
+    @property
+    def loads(self) -> list[PowerLoad]:
+        """The loads of constant power."""
+        n = self.net[0]
+        return [
+            PowerLoad(
+                sink.name, sink.node, complex(*n["S_sink"][j]), float(n["tau_sink"][j]),
+                math.sqrt(n["least_v2"][j]),
+            )
+            for j, sink in enumerate(self.wiring.sinks)
+        ]  # fmt: skip
 
     @property
     def par(self) -> Record:
@@ -64,15 +78,18 @@ class Network:
         self.wiring = kept.wiring
 
     def start(
-        self, x: NDArray[np.float64], u: NDArray[np.float64], machines: Sequence[float] = ()
+        self,
+        x: NDArray[np.float64],
+        u: NDArray[np.float64],
+        machines: Sequence[tuple[float, float]] = (),
     ) -> None:
         """Put a plant fresh from `make_plant` into an equilibrium.
 
         Args:
             x: states of each converter, (N, 8); (8,) for one.
             u: its commands, (N, 4); for one also (4,), or (3,) without the q component of the
-                bridge's voltage. All turn at the speed of the grid.
-            machines: angle of each machine's voltage, rad.
+                bridge's voltage. What closed lines connect turns at one speed.
+            machines: angle of each machine's voltage, rad, and its speed, p.u.
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
         u = np.pad(u, ((0, 0), (0, N_COMMANDS - u.shape[1])))
@@ -83,17 +100,42 @@ class Network:
         volts = {
             unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(self.wiring.units)
         }
-        volts[GRID_SOURCE] = complex(now["V_g"])
-        for j, (machine, angle) in enumerate(zip(self.wiring.machines, machines, strict=True), 1):
+        turns = {unit.bridge: float(u[k, 1]) for k, unit in enumerate(self.wiring.units)}
+        volts[GRID_SOURCE], turns[GRID_SOURCE] = complex(now["V_g"]), float(now["omega_g"])
+        for j, (machine, (angle, omega)) in enumerate(
+            zip(self.wiring.machines, machines, strict=True), 1
+        ):
             unit = np.exp(1j * angle)
             now["unit"][N + 1 + j] = unit.real, unit.imag
-            now["omega"][j] = u[0, 1]
+            now["omega"][j] = turns[machine.emf] = omega
             volts[machine.emf] = float(self.net[0]["E"][j]) * unit
-        if self.net[0]["reference"]:
-            now["omega_g"] = u[0, 1]
-        speed = float(self.net[0]["omega_b"]) * (u[0, 1] - 1.0)
-        z = modes.drive @ [volts[name] for name in sources] / (1j * speed - modes.rates)
-        w = modes.states @ z
+        if reference := int(self.net[0]["reference"]):
+            now["omega_g"] = now["omega"][reference]
+        at_node = {load.node: float(u[k, 1]) for k, load in enumerate(self.wiring.units)}
+        at_node |= {machine.node: turns[machine.emf] for machine in self.wiring.machines}
+        if self.wiring.grid is not None and self.wiring.closed:
+            at_node[self.wiring.grid] = turns[GRID_SOURCE]
+        for load in self.loads:
+            island = next(nodes for nodes in self.wiring.islands() if load.node in nodes)
+            turns[load.name] = next((at_node[node] for node in island if node in at_node), 1.0)
+            volts[load.name] = 0j
+
+        def resting() -> NDArray[np.complex128]:
+            z = np.zeros(len(modes.rates), complex)
+            for omega in {turns[name] for name in sources}:
+                speed = float(self.net[0]["omega_b"]) * (omega - 1.0)
+                those = [volts[name] if turns[name] == omega else 0.0 for name in sources]
+                z += modes.drive @ those / (1j * speed - modes.rates)
+            return np.asarray(modes.states @ z)
+
+        w = resting()
+        for _ in range(_ROUNDS if self.loads else 0):  # their currents follow from the voltages
+            for j, load in enumerate(self.loads):
+                v = complex(w[self.net[0]["voltage_at"][j]])
+                slip = float(self.net[0]["omega_b"]) * (turns[load.name] - 1.0)
+                f, volts[load.name] = load.at_rest(v, slip)
+                now["v_sink"][j] = f.real, f.imag
+            w = resting()
         for k, row in enumerate(x):  # as they are given: all digits
             i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))
             current = float(self.par[k]["current"])
@@ -138,19 +180,25 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():
         net["to_grid"][0, order.index(name)] = factor
-    found = {}
+    found, which = {}, {}
     for k in range(N + 1):
-        blocked = wiring.blocked | ({k - 1} if k > 0 else set())
+        blocked = frozenset(wiring.blocked | ({k - 1} if k > 0 else set()))
         for fault in (False, True) if wiring.fault else (False,):
-            found[k + (N + 1) * fault] = wiring.modes(frozenset(blocked), fault)
+            which[k + (N + 1) * fault] = blocked, fault
+            found[k + (N + 1) * fault] = wiring.modes(blocked, fault)
     _pack_pieces(records, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     running = [j for j, m in enumerate(wiring.machines, 1) if m.name not in wiring.opened]
     net["reference"] = running[0] if running and wiring.grid is None else 0
     places: dict[str, tuple[int, ...]] = {unit.bridge: (k,) for k, unit in enumerate(wiring.units)}
     places[GRID_SOURCE] = (N, N + 1)
+    for j, sink in enumerate(wiring.sinks):
+        places[sink.name] = (N + 2 + len(wiring.machines) + j,)
+        bank = next(bank.name for bank in wiring.capacitors if bank.node == sink.node)
+        net["voltage_at"][0, j] = order.index(bank)
     for j, machine in enumerate(wiring.machines, 1):
         places[machine.emf] = (N + 1 + j,)
         net["current_at"][0, j] = order.index(machine.name)
+    net["check_w"] = net["check_s"] = 0.0
     cuts = 2 * int(net[0]["n_parts"])
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][0, circuit] = len(modes.rates)
@@ -163,6 +211,14 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
         for j, source in enumerate(sources):
             for place in places[source]:
                 _set(net["drive"][0, circuit, :n, place], modes.drive[:, j])
+        for side, node in enumerate(wiring.check.sides if wiring.check else ()):
+            if node == GRID_SOURCE:
+                net["check_s"][0, circuit, side, N] = 1.0
+                continue
+            by_w, by_s = wiring.voltage(node, *which[circuit])
+            net["check_w"][0, circuit, side, : len(order)] = by_w
+            for factor, source in zip(by_s, sources, strict=False):  # sinks follow
+                net["check_s"][0, circuit, side, places[source][0]] = factor
 
 
 def _set(field: NDArray[np.float64], values: NDArray[np.complex128]) -> None:
@@ -198,6 +254,10 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
         r["dc_steps"] = max(1, math.ceil(rate * max(net["half_h"][0, :parts]) / _DC_STEP))
         for part, half in enumerate(net["half_h"][0, : 2 * parts]):
             net["sensor_weights"][0, part, k] = _low_pass(float(r["omega_s"] * 2 * half))
+    for j in range(int(net[0]["n_sinks"])):
+        for part, half in enumerate(net["half_h"][0, : 2 * parts]):
+            lag = float(net[0]["tau_sink"][j])
+            net["sink_weights"][0, part, j] = _low_pass(2 * half / lag)
 
 
 @lru_cache(maxsize=256)

@@ -330,7 +330,7 @@ class Line(Options):
     end: str = Field(min_length=1, description="node at its end")
     L: Positive = Field(description="p.u. of the first converter")
     R: NonNegative = Field(0.0, description="p.u. of the first converter")
-    closed: bool = Field(True, description="its breaker at the start")
+    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
 
 
 class Load(Options):
@@ -338,15 +338,34 @@ class Load(Options):
     frequency; without Q a resistor."""
 
     node: str = Field(min_length=1, description="where it is")
-    P: NonNegative = Field(description="active power at nominal voltage, p.u. of the first one")
-    Q: NonNegative = Field(0.0, description="reactive power there, p.u.")
-    closed: bool = Field(True, description="its breaker at the start")
+    P: NonNegative = Field(
+        description="active power at nominal voltage, p.u. of the first converter"
+    )
+    Q: NonNegative = Field(
+        0.0, description="reactive power at nominal voltage, p.u. of the first converter"
+    )
+    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
 
     @model_validator(mode="after")
     def _draws_something(self) -> Load:
         if self.P == self.Q == 0.0:
             raise ValueError("P = 0, Q = 0: must draw something")
         return self
+
+
+class ConstantPowerLoad(Options):
+    """A load whose control holds P and Q, such as a drive or a charger: it draws the current
+    conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
+    as the filter of such a load is."""
+
+    node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
+    P: float = Field(description="active power, p.u. of the first one; negative: it feeds in")
+    Q: float = Field(0.0, description="reactive power, p.u.")
+    tau_s: Positive = Field(0.005, description="lag of its measurement of the voltage, s")
+    V_least: Positive = Field(
+        0.7, description="below this voltage it is an impedance that draws P and Q there, p.u."
+    )
+    closed: bool = Field(True, description="its breaker at the start")
 
 
 class CapacitorBank(Options):
@@ -381,5 +400,6 @@ class NetworkParts(Options):
     )
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
     loads: dict[str, Load] = Field({}, description="by name")
+    constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
     machines: dict[str, Machine] = Field({}, description="by name")

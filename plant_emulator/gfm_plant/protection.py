@@ -21,12 +21,15 @@ from gfm_plant.names import (
     DIVERGED,
     GONE,
     LEFT,
+    MAY_START,
     NO_FRESH_U,
+    NOT_ASKED,
     OVERLOAD,
     SAFE_STATE,
     SILENT,
     TRIP_REASONS,
     TRIPS,
+    WOULD_TRIP,
 )
 from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecords
 from gfm_plant.solution import I_F, V, circuit, enter, own
@@ -38,6 +41,7 @@ _BLOCKED = {
     GONE: CONTROLLER_GONE,
     LEFT: CONTROLLER_LEFT,
 }
+_FOLLOW_S = 0.02
 _LEAST_V = 0.2  # p.u.; a smaller voltage has no angle that a relay could read
 
 
@@ -54,11 +58,44 @@ def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
         s.trip = reason
         s.trip_tick = s.tick
         s.trip_value = value
+        s.waits, s.omega_seen = NOT_ASKED, s.u_now[1]
         i = own(k) + I_F
         s.x[0] = s.x[1] = now.w[i, 0] = now.w[i, 1] = s.i_source = s.E[0] = s.E[1] = 0.0
         now.row = 1 + k
         enter(n, now, circuit(n, now))
         s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, now.omega_g, 0.0, 0.0
+
+
+@compiled
+def follow_voltage(plant: PlantRecords, k: int) -> None:
+    """Follow the speed of the capacitor's voltage of the blocked converter k over the last tick,
+    p.u., through a low-pass of 20 ms: what a phase-locked loop would tell it."""
+    n, s, now, i = plant.net[0], plant.st[k], plant.now[0], own(k) + V
+    a, b, c, d = now.w_before[i, 0], now.w_before[i, 1], now.w[i, 0], now.w[i, 1]
+    if min(a * a + b * b, c * c + d * d) > _LEAST_V * _LEAST_V:
+        omega = 1.0 + math.atan2(a * d - b * c, a * c + b * d) / (n.omega_b * n.T_s)
+        s.omega_seen += (1.0 - math.exp(-n.T_s / _FOLLOW_S)) * (omega - s.omega_seen)
+
+
+@compiled
+def start_condition(plant: PlantRecords, k: int) -> int:
+    """Return whether the blocked bridge of converter k may start on the voltage of its capacitor:
+    MAY_START, or WOULD_TRIP + the place in ``TRIPS`` of what would trip it again.
+
+    The voltage and its frequency must lie within the thresholds of the protections that are in
+    service; a voltage below 0.2 p.u. has no angle that the bridge could start at.
+    """
+    r, s = plant.par[k], plant.st[k]
+    v = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
+    if v <= _LEAST_V or (r.trip_ticks[2] >= 0 and v < r.trip_limit[2]):
+        return WOULD_TRIP + 2
+    if r.trip_ticks[1] >= 0 and v > r.trip_limit[1]:
+        return WOULD_TRIP + 1
+    if r.trip_ticks[5] >= 0 and s.omega_seen > r.trip_limit[5]:
+        return WOULD_TRIP + 5
+    if r.trip_ticks[6] >= 0 and s.omega_seen < r.trip_limit[6]:
+        return WOULD_TRIP + 6
+    return MAY_START
 
 
 @compiled
@@ -125,6 +162,24 @@ def _watch(plant: PlantRecords, k: int, what: int, value: float, sign: float) ->
     if s.crossed[what] >= r.trip_ticks[what]:
         trip(plant, k, what + 1 if what < N_TRIPS else OVERLOAD, value)
     s.crossed[what] += 1
+
+
+def wait_reason(plant: PlantRecords, k: int) -> str:
+    """Say why converter k, which was reset, does not start; "" if nothing is in the way."""
+    r, s = plant.par[k], plant.st[k]
+    what = int(s["waits"]) - WOULD_TRIP
+    if what < 0:
+        return ""
+    name, quantity, sign = TRIPS[what]
+    value, limit = math.hypot(s["x"][2], s["x"][3]), float(r["trip_limit"][what])
+    if quantity == "omega_u":
+        value, quantity = float(s["omega_seen"]), "omega of V"
+    elif sign < 0:
+        limit = max(_LEAST_V, limit if r["trip_ticks"][what] >= 0 else 0.0)
+    return (
+        f"{name.replace('_', '-')}: {quantity} = {value:.6g} p.u. at its capacitor, must be"
+        f" {'at most' if sign > 0 else 'at least'} {limit:.6g} p.u."
+    )
 
 
 def trip_reason(plant: PlantRecords, k: int = 0) -> str:

@@ -27,18 +27,23 @@ N_RING = 256  # places of a ring that holds one cycle
 SIZES = {1: 5, 2: 16, 4: 32, 12: 96}
 """Records come in sizes, because each is compiled once a computer: converters, and states of the
 circuit, that fit in."""
+N_SINKS = 4  # loads of constant power that fit; into the records of one converter, one
 N_MACHINES = 4  # that fit into the records of two converters and more; into those of one, none
 
 
-def size_for(converters: int, states: int, machines: int = 0) -> int:
-    """Return the key of `SIZES` for so many converters, states of the circuit, and machines.
+def size_for(converters: int, states: int, machines: int = 0, sinks: int = 0) -> int:
+    """Return the key of `SIZES` for so many converters, states of the circuit, machines, and loads
+    of constant power.
 
     Raises:
         ValueError: If there are too many.
     """
     for size, most in SIZES.items():
-        if size >= converters and most >= states and machines <= N_MACHINES * (size > 1):
+        fits = machines <= N_MACHINES * (size > 1) and sinks <= (N_SINKS if size > 1 else 1)
+        if size >= converters and most >= states and fits:
             return size
+    if sinks > N_SINKS:
+        raise ValueError(f"network.constant_power: {sinks}; at most {N_SINKS}")
     if machines > N_MACHINES:
         raise ValueError(f"network.machines: {machines}; at most {N_MACHINES}")
     raise ValueError(
@@ -157,6 +162,10 @@ converter_state_dtype = np.dtype(
         ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
         ("trip_tick", "i8"),
         ("trip_value", "f8"),
+        # of a bridge that is to start again, see `protection.start_condition`; the speed of the
+        # capacitor's voltage that a blocked one sees
+        ("waits", "i8"),
+        ("omega_seen", "f8"),
     ],
     align=True,
 )
@@ -168,15 +177,18 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
 
     Circuits come in pairs of one row each without and with the fault: row 0 as the converters are,
     and row 1 + k with the bridge of converter k blocked besides. Sources are the bridges, then the
-    positive and the negative sequence of the grid, then the machines. What swings is the grid, if
+    positive and the negative sequence of the grid, then the machines, then the currents of the
+    loads of constant power. What swings is the grid, if
     it is finite, in place 0, and the machines.
     """
     n_m = N_MACHINES * (converters > 1)
-    n_w, n_s, n_parts = SIZES[converters], converters + 2 + n_m, converters + 1
+    n_l = N_SINKS if converters > 1 else 1
+    n_w, n_s, n_parts = SIZES[converters], converters + 2 + n_m + n_l, converters + 1
     n_c, n_swing = 2 * (converters + 1), 1 + n_m
     par = np.dtype(
         [
             ("omega_b", "f8"),  # rad/s
+            ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
             # swing equations and governors, on their own ratings (H = 0: an ideal grid); their
             # ratings over the network's
             ("n_machines", "i8"),
@@ -189,6 +201,14 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("E", "f8", (n_swing,)),
             ("current_at", "i8", (n_swing,)),
             ("reference", "i8"),  # without a grid: the machine whose speed is omega_g (0: none)
+            # loads of constant power: P and Q, p.u. of the network; the lag of their measurement,
+            # s, and its weights as below; the square of their least voltage; its place in w
+            ("n_sinks", "i8"),
+            ("S_sink", "f8", (n_l, 2)),
+            ("tau_sink", "f8", (n_l,)),
+            ("sink_weights", "f8", (2 * n_parts, n_l, 4)),
+            ("least_v2", "f8", (n_l,)),
+            ("voltage_at", "i8", (n_l,)),
             ("to_grid", "f8", (n_w,)),  # what each state of w brings to the grid, as a current
             # one sampling period in stretches, between the instants at which a command begins to
             # act; each is cut into pieces for Simpson's rule, and each piece in halves. Another cut
@@ -210,6 +230,12 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("drive", "f8", (n_c, n_w, n_s, 2)),
             ("states", "f8", (n_c, n_w, n_w, 2)),
             ("modes", "f8", (n_c, n_w, n_w, 2)),
+            # of a synchro-check: the voltages of its two sides by w and by the sources; the largest
+            # difference of voltage, p.u., speed, rad/s, and angle, rad; how long, and until when, s
+            ("check_w", "f8", (n_c, 2, n_w)),
+            ("check_s", "f8", (n_c, 2, n_s)),
+            ("check_limits", "f8", (3,)),
+            ("check_lasting", "f8"),
         ],
         align=True,
     )
@@ -229,6 +255,11 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("halfway", "f8", (n_s, 2)),  # the unit phasors in the middle of a piece
             ("w_before", "f8", (n_w, 2)),  # w at the last tick
             ("unit_before", "f8", (n_s, 2)),
+            # the voltage that a load of constant power has measured, now, at the last tick, and
+            # the true one at the beginning and in the middle of a piece
+            ("v_sink", "f8", (n_l, 2)),
+            ("v_sink_before", "f8", (n_l, 2)),
+            ("v_seen", "f8", (n_l, 2, 2)),
             ("row", "i8"),  # of the circuits, without the fault
             # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
             ("closed", "i8"),
@@ -255,6 +286,14 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("omega", "f8", (n_swing,)),  # of the machines; that of the grid is omega_g
             ("slope", "f8", (n_swing,)),
             ("brought", "f8", (n_swing,)),
+            # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
+            # `check_limits`, for how long they have been within, and the time that is left, s;
+            # ticks in a row in which both sides were alive
+            ("check", "i8"),
+            ("check_looks", "i8"),
+            ("check_seen", "f8", (3,)),
+            ("check_lasted", "f8"),
+            ("check_left", "f8"),
         ],
         align=True,
     )

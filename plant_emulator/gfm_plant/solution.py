@@ -43,6 +43,12 @@ def machine_source(n: Any, j: int) -> int:
 
 
 @compiled
+def sink_source(n: Any, j: int) -> int:
+    """Return the place among the sources of the current of load j of constant power."""
+    return n.n_converters + 2 + n.n_machines + j
+
+
+@compiled
 def turned(x: float) -> tuple[float, float]:
     """Return cos x and sin x; by their series where they are exact to rounding."""
     if abs(x) < 0.03:
@@ -85,6 +91,23 @@ def drive(
     u_r, u_i = h_r * cos - h_i * sin, h_r * sin + h_i * cos
     length = 1.5 - 0.5 * (u_r * u_r + u_i * u_i)  # takes the rounding out of it
     now.unit[k, 0], now.unit[k, 1] = u_r * length, u_i * length
+
+
+@compiled
+def draw(
+    n: Any, now: Any, c: int, part: int, k: int,
+    first_r: float, first_i: float, second_r: float, second_i: float,
+) -> None:  # fmt: skip
+    """Add to the forcing of every mode what source k does to it, which is held at one value in the
+    first half of a piece and at another in the second, in the common frame."""
+    if now.gain_omega[k] != 1.0 or now.gain_part[k] != part:
+        _find_gains(n, now, c, part, k, 1.0)
+    for m in range(n.n_modes[c]):
+        g_r, g_i = now.gain[k, m, 0], now.gain[k, m, 1]
+        now.forced[m, 0] += g_r * first_r - g_i * first_i
+        now.forced[m, 1] += g_r * first_i + g_i * first_r
+        now.forced[m, 2] += g_r * second_r - g_i * second_i
+        now.forced[m, 3] += g_r * second_i + g_i * second_r
 
 
 @compiled

@@ -8,7 +8,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Shunt, Source, find_modes
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_plant.circuit import (
+    GROUND,
+    Branch,
+    Capacitor,
+    Modes,
+    Shunt,
+    Sink,
+    Source,
+    find_modes,
+    find_voltage,
+)
 
 GRID_SOURCE = "grid"
 
@@ -89,6 +102,19 @@ class FaultPlace:
 
 
 @dataclass(frozen=True)
+class Check:
+    """The synchro-check of an open breaker.
+
+    Attributes:
+        name: of the breaker; "" for that of the grid.
+        sides: the nodes at its two ends, or GRID_SOURCE for the grid itself.
+    """
+
+    name: str
+    sides: tuple[str, str]
+
+
+@dataclass(frozen=True)
 class Wiring:
     """The connections of a plant.
 
@@ -98,12 +124,14 @@ class Wiring:
         branches: lines between nodes, and loads with an inductor, which end at `circuit.GROUND`.
         shunts: loads that are resistors.
         capacitors: banks of them.
+        sinks: loads of constant power.
         machines: the synchronous machines, whose breakers have their names.
         grid: node of the grid, None: there is none.
         closed: whether the grid's breaker is closed.
         opened: names of branches whose breakers are open.
         fault: where one is, or may be again, or None.
         blocked: indices of converters whose bridges are out of every circuit.
+        check: the synchro-check that waits to close a breaker, or None.
     """
 
     omega_b: float
@@ -111,12 +139,14 @@ class Wiring:
     branches: tuple[Branch, ...] = ()
     shunts: tuple[Shunt, ...] = ()
     capacitors: tuple[Capacitor, ...] = ()
+    sinks: tuple[Sink, ...] = ()
     machines: tuple[Machine, ...] = ()
     grid: str | None = None
     closed: bool = True
     opened: frozenset[str] = frozenset()
     fault: FaultPlace | None = None
     blocked: frozenset[int] = frozenset()
+    check: Check | None = None
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -135,6 +165,7 @@ class Wiring:
         ends += [node for branch in self.branches for node in (branch.start, branch.end)]
         ends += [machine.node for machine in self.machines]
         ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
+        ends += [sink.node for sink in self.sinks]
         return tuple(dict.fromkeys(node for node in ends if node != GROUND))
 
     @property
@@ -158,15 +189,11 @@ class Wiring:
         return own | {b.name: b for b in self.branches if b.end != GROUND}
 
     @property
-    def parts(self) -> list[str]:
-        """Names of the lines, loads and machines, without the converters' lines."""
-        lines = (*self.branches, *self.machine_branches)
-        return [branch.name for branch in lines] + [shunt.name for shunt in self.shunts]
-
-    @property
     def has_load(self) -> bool:
         """Whether anything is left to feed without the grid."""
-        return bool(self.shunts) or any(branch.end == GROUND for branch in self.branches)
+        return bool(self.shunts or self.sinks) or any(
+            branch.end == GROUND for branch in self.branches
+        )
 
     def to_grid(self) -> dict[str, float]:
         """What each state brings to the grid, as a factor of its current."""
@@ -178,8 +205,27 @@ class Wiring:
                 found[branch.name] = 1.0 if branch.end == self.grid else -1.0
         return found
 
+    def islands(self) -> list[tuple[str, ...]]:
+        """The nodes in groups that closed lines connect, each in the order of ``nodes``."""
+        groups = {node: {node} for node in self.nodes}
+        for line in self.branches:
+            if line.end != GROUND and line.name not in self.opened:
+                both = groups[line.start] | groups[line.end]
+                groups.update(dict.fromkeys(both, both))
+        each = (tuple(n for n in self.nodes if n in groups[node]) for node in self.nodes)
+        return list(dict.fromkeys(each))
+
+    def breakers(self) -> dict[str, tuple[str, str, str]]:
+        """By the name that people use: the branch or shunt that a breaker opens, and the nodes at
+        its two ends."""
+        found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
+        lines = (*self.branches, *self.machine_branches)
+        found |= {b.name: (b.name, b.start, b.end) for b in lines}
+        to_ground: tuple[Shunt | Sink, ...] = (*self.shunts, *self.sinks)
+        return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
+
     def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
-        """The modes of a circuit, and the names of its sources in their order.
+        """The modes of a circuit, and the names of its sources and sinks in their order.
 
         Args:
             blocked: indices of the converters whose bridges block.
@@ -188,6 +234,40 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
+        branches, capacitors, sources, shunts, _ = self._circuit(blocked, faulted)
+        sinks = [sink for sink in self.sinks if sink.name not in self.opened]
+        parts = branches, capacitors, sources
+        modes = find_modes(*parts, self.omega_b, self.order, shunts, sinks)
+        return modes, [part.name for part in sources] + [part.name for part in sinks]
+
+    def voltage(
+        self, node: str, blocked: frozenset[int], faulted: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The voltage of a node in a circuit as factors of w and of the sources, see
+        ``find_voltage``; of a node where no current can flow, that of what it hangs on.
+
+        Args:
+            blocked, faulted: as for ``modes``.
+        """
+        branches, capacitors, sources, shunts, hanging = self._circuit(blocked, faulted)
+        there = {end for branch in branches for end in (branch.start, branch.end)}
+        there |= {part.node for part in capacitors} | {part.node for part in sources}
+        seen, reached = {node}, [node]
+        while reached:
+            here = reached.pop(0)
+            if here in there or here == GROUND:
+                return find_voltage(here, branches, capacitors, sources, self.order, shunts)
+            for branch in hanging:
+                if here in (branch.start, branch.end):
+                    other = branch.end if branch.start == here else branch.start
+                    reached += [other] if other not in seen else []
+                    seen.add(other)
+        return np.zeros(len(self.order)), np.zeros(len(sources))
+
+    def _circuit(
+        self, blocked: frozenset[int], faulted: bool
+    ) -> tuple[list[Branch], list[Capacitor], list[Source], list[Shunt], list[Branch]]:
+        """The parts of a circuit, and the branches that an open breaker has left hanging."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         if faulted and self.fault is not None:
@@ -208,13 +288,15 @@ class Wiring:
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
             sources.append(Source(GRID_SOURCE, self.grid))
+        hanging: list[Branch] = []
         if self.opened or not self.closed:
+            whole = branches
             held = {GROUND} | {c.node for c in capacitors} | {s.node for s in shunts}
             branches = _without_ends(branches, held | {source.node for source in sources})
             met = {node for branch in branches for node in (branch.start, branch.end)}
             shunts = [s for s in shunts if s.node in met]
-        modes = find_modes(branches, capacitors, sources, self.omega_b, self.order, shunts)
-        return modes, [source.name for source in sources]
+            hanging = [branch for branch in whole if branch not in branches]
+        return branches, capacitors, sources, shunts, hanging
 
     def _whole(self, branches: Sequence[Branch]) -> Iterator[Branch]:
         """Those that are closed; a split one as two."""

@@ -10,6 +10,11 @@ numba keeps what it compiles on disk, and takes it for current as long as the fu
 has not changed. But a compiled function contains its callees, which are in other files: after an
 update, a stale one would compute something else without a word. Here any change of any of our
 compiled code makes all of it compile again.
+
+numba names a compiled function by its arguments, and a record among them by a number that counts
+the types of the process. The records of two sizes of plants, compiled by two processes, could so
+have one name: a third process that loads both would call either for both. Here a record is named by
+what it holds.
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import njit, types
 from numba.core.caching import IndexDataCacheFile, _SourceFileBackedLocatorMixin
 
 #: options of njit and cfunc
@@ -83,3 +88,11 @@ def _load_index(file: Any) -> Any:
 
 _own_load_index = IndexDataCacheFile._load_index
 IndexDataCacheFile._load_index = _load_index  # type: ignore[method-assign]
+
+
+def _name_of_record(record: Any) -> tuple[str, tuple[int]]:
+    """By what numba names a record among the arguments of a function."""
+    return "Record", (int.from_bytes(hashlib.sha256(record.name.encode()).digest()[:8]),)
+
+
+types.Record.mangling_args = property(_name_of_record)  # type: ignore[method-assign,assignment]

@@ -5,7 +5,8 @@ therefore one njit call, the same for every link, in lockstep and in real time.
 States: INIT -> READY -> RUNNING -> SAFE (latched) -> STOPPED. In SAFE the outputs stay at the
 last good u, every frame carries the state, and the plant blocks the bridge. If the scenario waits
 after that, a reset takes the controller to READY, at rest. The plant then returns to its own start
-and stops sending SAFE, and the controller goes to RUNNING.
+and stops sending SAFE, and the controller goes to RUNNING. In a network the others have gone on:
+there the controller begins with the voltage and the frequency that it measures.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from gfm_runtime.states import (
     SAFE,
     STALE,
 )
-from gfm_runtime.switchover import change_law
+from gfm_runtime.switchover import change_law, settle_into
 
 MAX_STAGES = 8
 
@@ -42,6 +43,7 @@ controller_dtype = np.dtype(
         ("active", "i8"),  # index into the laws
         ("request", "i8"),  # index to change to at the next tick, or -1
         ("changes", "i8"),
+        ("joins", "i8"),  # the first tick in RUNNING begins with what is measured, see ``measured``
         ("bump", "f8"),  # of the last change, p.u.
         ("stale", "i8"),  # ticks in a row without a fresh y
         ("hold", "i8"),  # how many of them are allowed
@@ -180,6 +182,29 @@ def accept(c, y):
     return True
 
 
+@inlined
+def measured(y, u):
+    """Write u (3,) for a bridge without current on a capacitor that others keep charged, p.u.: its
+    frequency and its voltage."""
+    u[0], u[1], u[2] = 0.0, y[2], y[4]
+
+
+@inlined
+def _join(law, state, c, inner):
+    """Set the law's state so that its output begins with what is measured."""
+    measured(c.y, c.u)
+    for j in range(NY):
+        c.ref_seen[j] = c.ref[j]
+        if j < NU:
+            state.trend[j] = 0
+    if inner and law.k_pll > 0.0:
+        c.ref_seen[2] = c.u[1]
+    settle_into(law, state, c.ref_seen, c.y, c.u, state.trend)
+    if inner:
+        take_measurements(state, c.y)
+        settle_inner(law, state, c.u, c.u[2], 0.0)
+
+
 @compiled
 def bad_output(ctl, channel):
     """SAFE, because output ``channel`` is not finite."""
@@ -200,6 +225,9 @@ def control(ctl, laws, states, est, y, u):
     if c.state != RUNNING or not accept(c, y):
         return
     inner = len(y) > NY
+    if c.joins:
+        c.joins = 0
+        _join(laws[c.active], states[c.active], c, inner)
     if c.stages > 0:
         _schedule(c, est[0], c.y)
     if c.request >= 0:

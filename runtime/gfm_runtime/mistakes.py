@@ -35,8 +35,9 @@ def lines(
 
 
 def _line(error: Any, model: Any) -> str:
-    path = ".".join(str(part) for part in error["loc"])
-    text = error["msg"].removeprefix("Value error, ")
+    loc = error["loc"]
+    path = ".".join(str(part) for k, part in enumerate(loc) if not _chooses(model, loc[: k + 1]))
+    text = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     if error["type"] == "value_error":
         return f"{path}: {text}" if path else text
     if error["type"] == "missing":
@@ -53,7 +54,10 @@ def _line(error: Any, model: Any) -> str:
         )
     if error["type"] == "extra_forbidden":
         *parents, last = error["loc"]
-        return f"{path} = {shown}: unknown key" + meant(last, _fields(model, parents))
+        known = _fields(model, parents)
+        close = meant(last, known)
+        allowed = "" if close or not known else f"; use one of {', '.join(sorted(known))}"
+        return f"{path} = {shown}: unknown key{close}{allowed}"
     if error["type"] in ("model_type", "dict_type", "model_attributes_type"):
         models = _models_at(model, error["loc"])
         keys = [k for m in models for k, field in m.model_fields.items() if field.is_required()]
@@ -84,6 +88,12 @@ def _models_at(model: Any, path: Sequence[str | int]) -> list[type[BaseModel]]:
         else:  # an index, a name in a table, or the type that chooses one of several models
             models = [m for m in models if part in _tags(m)] or models
     return models
+
+
+def _chooses(model: Any, path: Sequence[str | int]) -> bool:
+    """Whether a path ends on the type that chooses one of several models, which is no key."""
+    *parents, last = path
+    return bool(parents) and any(last in _tags(m) for m in _models_at(model, parents))
 
 
 def _models(hint: Any) -> list[type[BaseModel]]:

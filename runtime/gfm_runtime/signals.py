@@ -68,7 +68,7 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("ref", "P_ref", "P_{ref}", "p.u.", "S_n", 2e-4, -2.0, 2.0, 0.5, "active power"),
     Signal("ref", "omega_g", r"\omega_g", "p.u.", "omega_n", 1e-5, 0.8, 1.2, 1.0, "frequency"),
     Signal("ref", "Q_ref", "Q_{ref}", "p.u.", "S_n", 2e-4, -2.0, 2.0, 0.0, "reactive power"),
-    Signal("ref", "V_ref", "V_{ref}", "p.u.", "V_n", 1e-4, 0.5, 1.5, 1.0, "voltage magnitude"),
+    Signal("ref", "V_ref", "V_{ref}", "p.u.", "V_n", 1e-4, 0.0, 1.5, 1.0, "voltage magnitude"),
     Signal("d", "omega_g", r"\omega_g", "p.u.", "omega_n", 1e-5, 0.8, 1.2, 1.0, "grid frequency"),
     Signal("d", "V_g", "V_g", "p.u.", "V_n", 1e-4, 0.0, 1.5, 1.0, "grid voltage magnitude"),
     Signal("y_inner", "i_d", "i_d", "p.u.", "S_n/V_n", 2e-4, -6.0, 6.0, 0.0, "current of L_f, d"),

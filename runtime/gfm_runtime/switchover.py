@@ -15,8 +15,8 @@ from gfm_runtime.signals import NU, NY
 
 @compiled
 def settle_into(law, state, ref, y, u, trend):
-    """Set a law's state so that its output at (ref, y) is u (3,) in p.u. and continues with the
-    slope ``trend`` (3,) per tick.
+    """Set a law's state so that its output at the references ``ref`` (5,) and measurements y (5,),
+    p.u., is u (3,), p.u., and continues with the slope ``trend`` (3,), p.u. per tick.
 
     If u lies outside the law's limits the output is the limit, and the difference is a bump.
     """

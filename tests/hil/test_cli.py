@@ -324,11 +324,11 @@ def test_options_that_do_not_fit_the_scenario_are_named_with_it(arguments, blame
     assert err.startswith(f"gfmhil: short.toml with {blamed}: events.0: ")
 
 
-def test_unknown_options_are_argparse_s_to_refuse(capsys):
-    with pytest.raises(SystemExit) as found:
-        main(["run", "short.toml", "--speed", "3"])
-    assert found.value.code == 2
-    assert "--speed" in capsys.readouterr().err
+def test_unknown_options_are_refused_with_the_one_that_was_meant(capsys):
+    assert main(["run", "short.toml", "--zzz", "3"]) == 2
+    assert capsys.readouterr().err == "gfmhil: --zzz 3: gfmhil run does not know it\n"
+    assert main(["firmware", "export", "vsg-1", "--reel", "float32", "-o", "x"]) == 2
+    assert "does not know it; did you mean '--real'?" in capsys.readouterr().err
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():

@@ -120,10 +120,10 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
             "inner.type = 'stator': must be one of 'virtual-stator', 'cascaded',",
         ),
         ('{type = "virtual-stator", X_v = 0.0}', "inner.X_v: 0.0 must be > 0"),
-        ('{type = "virtual-stator", I_thr = 1.0}', "inner.virtual-stator.I_thr = 1.0: unknown key"),
+        ('{type = "virtual-stator", I_thr = 1.0}', "inner.I_thr = 1.0: unknown key"),
         (
             '{type = "cascaded", priority = "e"}',
-            "priority: Input should be 'circular', 'd', 'q' or",
+            "priority: must be 'circular', 'd', 'q' or",
         ),
         ('{type = "cascaded", I_max = "x"}', "inner.I_max: unknown parameter 'x'; known: ['D_p',"),
         (

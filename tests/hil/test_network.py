@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
+from gfm_hil.recording.log import read_log
 from gfm_hil.results.network_run import NetworkRun
+from gfm_hil.results.runner import run_network
 from gfm_hil.scenario.model import find_scenario, load_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 
@@ -96,6 +100,61 @@ def test_one_that_trips_leaves_the_load_to_the_other() -> None:
     assert a["p"][-1] == pytest.approx(0.0, abs=0.01) and b["p"][-1] == pytest.approx(0.6, abs=0.03)
 
 
+def with_a_reset(**changes: Any) -> dict[str, Any]:
+    """A takes more than its protection allows at 0.1 s, and is reset at 0.6 s."""
+    given = content(duration=5.0, after_trip="wait", law="vsg-2", **changes)
+    limits = {"over_current": {"threshold": 0.9}}
+    given["network"]["converters"]["A"]["plant"] = {"protection": limits}
+    given["events"] = [
+        {"type": "reference", "t": 0.1, "P_ref": 1.5, "converter": "A"},
+        {"type": "reset", "t": 0.6, "converter": "A"},
+    ]
+    return given
+
+
+@pytest.mark.parametrize("inner", [None, "virtual-stator"])
+def test_a_reset_converter_starts_on_the_voltage_that_the_other_keeps(inner: str | None) -> None:
+    """The common equilibrium is that of the start, as it is the only one; the start itself draws no
+    current."""
+    run = gfmhil.run_network(with_a_reset(inner=inner))
+    assert run.status == "completed"
+    a, b = run["A"].signals, run["B"].signals
+    k = 6000  # the tick of the reset
+    assert a["true_trip"][k - 1] > 0 and a["true_trip"][k + 1] == 0
+    assert np.abs(a["true_i"][k - 100 : k]).max() == 0.0
+    assert a["true_i"][k + 1 : k + 4].max() < 2e-3  # no inrush: others keep the voltage
+    v = np.asarray(a["true_v_re"][: k + 2]) + 1j * np.asarray(a["true_v_im"][: k + 2])
+    turned = 1 + np.angle(v[1:] / v[:-1]) / (2 * np.pi * 50 * 1e-4)
+    part = -np.expm1(-1e-4 / 0.02)  # the blocked converter sees the speed through a low-pass
+    seen = lfilter([part], [1, part - 1], turned)
+    assert a["u_omega_u"][k + 1] == pytest.approx(seen[-1], abs=1e-6)
+    assert a["u_E_u"][k + 1] == pytest.approx(abs(v[-1]), abs=1e-9)
+    assert a["ref_P_ref"][-1] == 0.3
+    for name in ("p", "q", "V", "omega_u", "v_dc"):
+        for s in (a, b):
+            assert s[name][-1] == pytest.approx(s[name][0], abs=2e-5), name
+    assert [e["label"] for e in run["B"].summary["events"]] == []
+
+
+def test_a_reset_converter_waits_for_a_voltage_that_it_can_start_on(tmp_path: Path) -> None:
+    """Without B the bus is dead; the log says what A waits for."""
+    given = with_a_reset()
+    given["duration"] = 0.8
+    given["network"]["converters"] = {"A": given["network"]["converters"]["A"]}
+    given["network"]["loads"] = {"base": {**BUS, "P": 0.3},
+                                 "step": {**BUS, "P": 1.2, "Q": 0.1, "closed": False}}  # fmt: skip
+    given["events"][0] = {"type": "breaker", "name": "step", "t": 0.1, "closed": True}
+    run = run_network(load_scenario(given), tmp_path / "run", figures=False)["A"]
+    assert run.status == "tripped" and run.signals["true_trip"][-1] > 0
+    log = read_log(tmp_path / "run" / "A" / "events.jsonl")
+    (line,) = [e for e in log if e["event"] == "waits"]
+    assert line["tick"] == 6000
+    assert re.fullmatch(
+        r"under-voltage: V = [\d.e-]+ p.u. at its capacitor, must be at least 0.4 p.u.",
+        line["reason"],
+    )
+
+
 def test_events_find_their_converter_and_everyone_sees_those_of_the_network() -> None:
     given = content()
     given["events"].append({"type": "reference", "t": 0.1, "V_ref": 1.02, "converter": "B"})
@@ -155,7 +214,8 @@ def test_a_run_on_disk_is_that_in_memory(
         ({"network": {"converters": {"A": {**BUS, "link": {"type": "smh"}}}}},
          "network.converters.A.link: type = 'smh': must be one of"),
         ({"mode": "realtime"}, "link.type = 'inproc': runs in lockstep only"),
-        ({"after_trip": "wait"}, "after_trip = 'wait': a network has no reset yet"),
+        ({"events": [{"type": "reset", "t": 0.1, "converter": "A"}]},
+         "events.0: nothing to reset with after_trip = 'end'; use 'wait'"),
         ({"events": [{"type": "breaker", "name": "stop", "t": 0.1, "closed": True}]},
          r"events.0: name = 'stop': must be one of \['A', 'B', 'base', 'step'\]"),
         ({"events": [{"type": "reference", "t": 0.1, "P_ref": 0.1, "converter": "C"}]},
@@ -167,7 +227,7 @@ def test_a_run_on_disk_is_that_in_memory(
           "events": []}, "network.converters.A.law"),
         ({"network": {"converters": {"A": {"node": "x"}}, "grid": "y"}}, "the grid is at node 'y'"),
         ({"network": {"converters": {"A": {"node": "x"}}, "lines": {"l": {**LINE, "L": 0.0}}}},
-         "network.lines.l.L: Input should be greater than 0"),
+         "network.lines.l.L: must be greater than 0"),
         ({"network": {"converters": {"A": {"node": "x", "plant": {"grid": {"V_g": 0.9}}}}}},
          "plant.grid: is the scenario's own"),
     ],
@@ -226,3 +286,23 @@ def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole() -> Non
     for name in "AB":
         assert part.of(name) == whole.of(name).model_copy(update={"converter": name})
     assert (part.of("A").law, part.of("A").inner) == ("droop-3", None)
+
+
+def test_a_load_of_constant_power_draws_it_at_any_voltage() -> None:
+    """And a resistor draws with the square of it."""
+    taken = {}
+    for kind in ("constant_power", "loads"):
+        given = content(duration=3.0, law="vsg-2", inner="virtual-stator")
+        given["network"]["loads"] = {}
+        given["network"]["capacitors"] = {"filter": {**BUS, "Q": 0.2}}
+        given["network"][kind] = {"x": {**BUS, "P": 0.6}}
+        given["events"] = [{"type": "reference", "t": 0.2, "V_ref": 0.9, "ramp_s": 0.3}]
+        run = gfmhil.run_network(given)
+        assert run.status == "completed"
+        p = sum(np.asarray(one.signals["p"][:]) for one in run.values())
+        assert p[:1900] == pytest.approx(p[0], abs=1e-6)  # at rest until then
+        taken[kind] = p[0], p[-1]
+    before, after = taken["constant_power"]
+    assert before == pytest.approx(0.6, abs=0.01) and after == pytest.approx(before, abs=0.005)
+    before, after = taken["loads"]
+    assert after / before == pytest.approx(0.9**2, rel=0.03)

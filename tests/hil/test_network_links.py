@@ -92,21 +92,30 @@ def started(folder: Path, given: dict[str, Any]) -> Iterator[subprocess.Popen[st
 
 @pytest.mark.parametrize("link", ["zmq", "shm"])
 def test_over_links_a_run_is_that_in_process(link: str, tmp_path: Path) -> None:
-    """Over two links at a time, and with a trip on the way, after which the other goes on."""
-    trip = {"plant": {"protection": {"over_current": {"threshold": 0.4, "delay_s": 0.01}}}}
-    members = with_members(A={"link": over(link)}, B={**trip, "expect": "tripped"})
-    given = load_scenario(content(network=members))
+    """Over two links at a time, and with a trip on the way, after which the other goes on until the
+    converter is reset."""
+    trip = {"plant": {"protection": {"over_current": {"threshold": 0.55, "delay_s": 0.05}}}}
+    events = [
+        *content()["events"],
+        {"type": "breaker", "name": "step", "t": 0.3, "closed": False},
+        {"type": "reset", "t": 0.4, "converter": "B"},
+    ]
+    members = with_members(A={"link": over(link)}, B=trip)
+    members["loads"]["step"]["P"] = 0.6
+    given = load_scenario(content(network=members, events=events, after_trip="wait", duration=2.0))
     found = run_network(given, tmp_path / "run", figures=False)
     memory = gfmhil.run_network(given)
-    assert found.status == memory.status == "A completed, B tripped"
+    assert found.status == memory.status == "completed"
     for name in "AB":
         columns = signals(tmp_path / "run" / name)
         assert set(memory[name].columns) <= set(columns)
         for key, there in memory[name].columns.items():
             np.testing.assert_array_equal(columns[key], there[:], err_msg=f"{name} {key}")
-        assert len(log(tmp_path / "run" / name, "breaker")) == 1
+        assert len(log(tmp_path / "run" / name, "breaker")) == 2
     assert found["A"].summary["link"] == link
-    assert found["B"].summary["reason"] == memory["B"].summary["reason"]
+    (tripped, *_) = log(tmp_path / "run" / "B", "tripped")
+    assert "over-current" in tripped["reason"] and tripped["tick"] < 4000
+    assert {line["tick"] for line in log(tmp_path / "run" / "B", "recovered")} == {4000}
 
 
 def test_a_controller_that_is_killed_trips_its_converter_and_no_other(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "converter file with mistakes": (
         {"plant": {"converter": "converter.toml"}},
-        ["L_f: Input should be greater than 0, not -0.001", "C_dc", "not 'big'"],
+        ["L_f: must be greater than 0, not -0.001", "C_dc", "not 'big'"],
     ),
     "unknown key": ({"durration": 3}, ["durration = 3", "unknown key"]),
     "unknown key inside": ({"link": {"baud": 9600}}, ["link.baud = 9600", "unknown key"]),
@@ -89,7 +89,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no tick": ({"duration": 1e-5}, ["duration = 1e-05", "T_s = 0.0001"]),
     "reference out of range": ({"references": {"P_ref": 10.0}}, ["P_ref = 10.0", "[-2, 2]"]),
     "reference out of range in an event": (
-        event(type="reference", V_ref=9.0), ["events.0", "V_ref = 9.0", "[0.5, 1.5]"],
+        event(type="reference", V_ref=9.0), ["events.0", "V_ref = 9.0", "[0, 1.5]"],
     ),
     "no reference": (event(type="reference"), ["events.0", "no reference given"]),
     "realtime in process": (

@@ -43,7 +43,7 @@ def rest(plant: Network, angles: list[float]) -> np.ndarray:
     own = w[:3] * np.exp(-0.02j)
     x[0, 0:6:2], x[0, 1:6:2] = own.real, own.imag
     u[0, 0] = u[0, 2] * own[0].real
-    plant.start(x, u, angles)
+    plant.start(x, u, [(angle, 1.0) for angle in angles])
     return u
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -66,3 +68,28 @@ def test_a_cache_that_names_a_type_of_an_older_version_is_as_good_as_none(tmp_pa
     assert index._load_index() == {"signature": kept}
     del globals()["Gone"]
     assert index._load_index() == {}
+
+
+@pytest.mark.processes
+def test_what_two_processes_compiled_for_two_records_does_not_mix_in_a_third(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "theirs.py").write_text(
+        "import sys\n"
+        "import numpy as np\n"
+        "from gfm_runtime.compiled import compiled\n"
+        "@compiled\n"
+        "def tick(r):\n"
+        "    return r[0].a[len(r[0].a) - 1]\n"
+        "for n in map(int, sys.argv[1:]):\n"
+        "    r = np.zeros(1, [('a', 'f8', (n,))])\n"
+        "    r['a'] = range(n)\n"
+        "    print(tick(r))\n"
+    )
+    found = [
+        subprocess.run(
+            [sys.executable, "theirs.py", *sizes], cwd=tmp_path, capture_output=True, text=True
+        ).stdout.split()
+        for sizes in (["2"], ["3"], ["2", "3"])
+    ]
+    assert found == [["1.0"], ["2.0"], ["1.0", "2.0"]]

@@ -426,6 +426,15 @@ def test_a_missing_toolchain_is_named(
     assert "apt-get install" in said and package in said and said.count("\n") == 1
 
 
+def test_what_an_earlier_export_left_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for law, left in (("vsg-1", ""), ("droop-1", "gfm_vsg_1.c, gfm_vsg_1.h of an earlier export")):
+        assert main(["firmware", "export", law, "-o", str(tmp_path)]) == 0
+        said = capsys.readouterr().err
+        assert left in said and bool(left) == bool(said)
+
+
 def test_the_command_writes_what_the_function_gives(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

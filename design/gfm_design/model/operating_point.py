@@ -21,6 +21,7 @@ from gfm_plant.circuit import GROUND
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
 from gfm_plant.records import Record
+from gfm_plant.wiring import Wiring
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.tustin import DiscreteLaw
@@ -90,20 +91,21 @@ def operating_point(
 
 def operating_points(
     plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]
-) -> tuple[list[OperatingPoint], list[float]]:
+) -> tuple[list[OperatingPoint], list[tuple[float, float]]]:
     """Solve for the common operating point of several converters, each under its law.
 
     Unknowns are those of each converter, the voltages of the nodes, and the angles of the machines;
-    of an island also the frequency. The currents that meet at a node add up to nothing, and each
-    machine gives what its governor asks for.
+    of each island also the frequency. The currents that meet at a node add up to nothing, and each
+    machine gives what its governor asks for. An island is what closed lines connect, but not to the
+    grid, with a converter or a machine in it; a part of the network without any is dead.
 
     Args:
         plant: as it is to start.
         laws, refs: of each converter, as for ``operating_point``.
 
     Returns:
-        That of each converter, its angle against the grid or, in an island, the first node; and the
-        angle of each machine's voltage, rad.
+        That of each converter, its angle against the grid or, in an island, its first node; and of
+        each machine the angle of its voltage, rad, and its speed, p.u.
 
     Raises:
         NoEquilibrium: there is none, or Newton's method does not find it.
@@ -115,34 +117,43 @@ def operating_points(
     ]
     fixed = wiring.grid if wiring.closed else None
     free = [node for node in wiring.nodes if node != fixed]
-    island = fixed is None
+    feeding = {unit.node for unit in wiring.units} | {one.node for one in wiring.machines}
+    islands = [nodes for nodes in wiring.islands() if fixed not in nodes and feeding & {*nodes}]
+    island_of = {node: k for k, nodes in enumerate(islands) for node in nodes}
+    alive = {*island_of} | {node for nodes in wiring.islands() if fixed in nodes for node in nodes}
     sizes = [side.size for side in sides]
     ends = np.cumsum(sizes)
 
     n, M = plant.net[0], len(wiring.machines)
     nodes_end = ends[-1] + 2 * len(free)
 
-    def parts(z: Vector) -> tuple[list[Vector], dict[str, complex], float]:
+    def parts(z: Vector) -> tuple[list[Vector], dict[str, complex], dict[str, float]]:
         own = np.split(z[: ends[-1]], ends[:-1])
         pairs = z[ends[-1] : nodes_end].reshape(-1, 2)
         volts = {node: complex(*pair) for node, pair in zip(free, pairs, strict=True)}
         if fixed is not None:
             volts[fixed] = complex(now["V_g"])
-        return own, volts, float(z[-1]) if island else float(now["omega_g"])
+        omegas = z[len(z) - len(islands) :]
+        by_grid = float(now["omega_g"])
+        speeds = {
+            node: float(omegas[island_of[node]]) if node in island_of else by_grid
+            for node in wiring.nodes
+        }
+        return own, volts, speeds
 
     def residual(z: Vector) -> Vector:
-        own, volts, omega = parts(z)
+        own, volts, speeds = parts(z)
         missing = dict.fromkeys(wiring.nodes, 0j)  # current that comes to each node
         rows = []
         for side, unit, mine in zip(sides, wiring.units, own, strict=True):
-            v = volts[unit.node]
+            v, omega = volts[unit.node], speeds[unit.node]
             rows.append(side.residual(mine, abs(v), omega, cmath.phase(v)))
             i_o = complex(mine[4], mine[5]) * cmath.exp(1j * mine[DELTA])
             missing[unit.node] += i_o / float(side.par[0]["current"])
         for branch in wiring.branches:
             if branch.name not in wiring.opened:
                 ends_of = volts.get(branch.start, 0j) - volts.get(branch.end, 0j)
-                i = ends_of / complex(branch.R, omega * branch.L)
+                i = ends_of / complex(branch.R, speeds[branch.start] * branch.L)
                 missing[branch.start] -= i
                 if branch.end != GROUND:
                     missing[branch.end] += i
@@ -151,28 +162,55 @@ def operating_points(
                 continue
             missing[shunt.node] -= volts[shunt.node] / shunt.R
         for capacitor in wiring.capacitors:
+            omega = speeds[capacitor.node]
             missing[capacitor.node] -= 1j * omega * capacitor.C * volts[capacitor.node]
+        for load in plant.loads:
+            if load.name not in wiring.opened:
+                slip = wiring.omega_b * (speeds[load.node] - 1.0)
+                missing[load.node] -= load.at_rest(volts[load.node], slip)[1]
         for j, machine in enumerate(wiring.machines, 1):
+            omega = speeds[machine.node]
             emf = float(n["E"][j]) * cmath.exp(1j * z[nodes_end + j - 1])
             i = (emf - volts[machine.node]) / complex(machine.R, omega * machine.X)
             missing[machine.node] += i
             asked = now["P_set"][j] - (omega - 1.0) * (1.0 / n["droop"][j] + n["D"][j])
             rows.append(np.array([(emf * i.conjugate()).real / n["S"][j] - asked]))
         met = [part for node in free for part in (missing[node].real, missing[node].imag)]
-        return np.concatenate([*rows, met, [volts[free[0]].imag] if island else []])
+        return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in islands]])
 
-    starts = [side.first(1.0, 1.0) for side in sides]
-    volts = np.tile([1.0, 0.0], len(free))
-    z0 = np.concatenate([*starts, volts, np.zeros(M), [1.0] if island else []])
+    first = _first_voltages(wiring, refs)
+    starts = [side.first(first[u.node], 1.0) for u, side in zip(wiring.units, sides, strict=True)]
+    volts = np.array([[first[node] if node in alive else 0.0, 0.0] for node in free]).ravel()
+    z0 = np.concatenate([*starts, volts, np.zeros(M), np.ones(len(islands))])
     z = _newton(residual, z0)
     if z is None:
         names = [
             f"{u.name} ({side.law.law.name})" for u, side in zip(wiring.units, sides, strict=True)
         ]
         raise NoEquilibrium(f"{', '.join(names)}: have no common steady state")
-    own, _, omega = parts(z)
-    points = [side.found(mine, omega) for side, mine in zip(sides, own, strict=True)]
-    return points, [float(angle) for angle in z[nodes_end : nodes_end + M]]
+    own, _, speeds = parts(z)
+    points = [
+        side.found(mine, speeds[unit.node])
+        for side, unit, mine in zip(sides, wiring.units, own, strict=True)
+    ]
+    angles = z[nodes_end : nodes_end + M]
+    return points, [
+        (float(angle), speeds[machine.node])
+        for angle, machine in zip(angles, wiring.machines, strict=True)
+    ]
+
+
+def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
+    """Where the search for the voltage of each node begins, p.u.: at the nominal one, but where
+    only converters far below it feed, as at a black start, at theirs."""
+    found = dict.fromkeys(wiring.nodes, 1.0)
+    stiff = {machine.node for machine in wiring.machines}
+    stiff |= {wiring.grid} if wiring.grid is not None and wiring.closed else set()
+    for nodes in wiring.islands():
+        own = [ref[4] for unit, ref in zip(wiring.units, refs, strict=True) if unit.node in nodes]
+        if own and not stiff & {*nodes} and max(own) < 0.5:
+            found.update(dict.fromkeys(nodes, max(own)))
+    return found
 
 
 class _Side:

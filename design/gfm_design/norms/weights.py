@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 
 
 class Sizes:
-    """Sizes of some weights."""
+    """Magnitudes |W(j omega)| of several weights."""
 
     def __init__(self, weights: Sequence[Weight]) -> None:
         self._num, self._den = (
@@ -34,7 +34,8 @@ class Sizes:
         return np.asarray(num / den)
 
     def bend(self, omega: Vector, which: NDArray[np.intp]) -> Vector:
-        """Second derivative of ln |W| over omega, at omega (K,) of the weights ``which`` (K,)."""
+        """Second derivative of ln |W| with respect to omega, at omega (K,), for the weights
+        ``which`` (K,)."""
         y, out = omega * omega, np.zeros(len(omega))
         for sign, c in ((0.5, self._num[which]), (-0.5, self._den[which])):
             k = np.arange(c.shape[1])

@@ -36,6 +36,7 @@ def polish(
         loops: T(s) at given coordinates; rows of coordinates give loops stacked on axis 0.
         weights: W_ij.
         start: a stable point; an unstable one is returned unchanged.
+        low, high: limits of each coordinate.
         rounds: most steps.
     """
     at, reach = np.clip(start, low, high), _FIRST

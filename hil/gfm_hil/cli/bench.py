@@ -101,7 +101,9 @@ def _add_compare(kinds: Any) -> None:
         "--what", default="latency --mode lockstep --load idle",
         help="what they measure, with its options (default: %(default)s)",
     )  # fmt: skip
-    command.add_argument("--out", help="folder for what was measured; runs/bench-compare-… else")
+    command.add_argument(
+        "-o", "--out", help="folder for what was measured; runs/bench-compare-… else"
+    )
     command.add_argument("--json", action="store_true", help="print JSON")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.set_defaults(call=compare_call)

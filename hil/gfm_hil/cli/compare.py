@@ -36,7 +36,7 @@ def add(command: argparse.ArgumentParser) -> None:
     )
     add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
-    command.add_argument("--out", help="folder; runs/<scenario>-compare-<time> by default")
+    command.add_argument("-o", "--out", help="folder; runs/<scenario>-compare-<time> by default")
     command.add_argument("--json", action="store_true", help="print the summaries as JSON")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
 

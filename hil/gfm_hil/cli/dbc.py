@@ -19,7 +19,7 @@ _RATES = {
 
 def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
-    command.add_argument("--out", metavar="FILE", help="where to write; else to the screen")
+    command.add_argument("-o", "--out", metavar="FILE", help="where to write; else to the screen")
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")
     command.add_argument(
         "--inner", action="store_true", help="with --budget: of a run with an inner stage"

@@ -21,7 +21,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "Write what is in deploy/: units of systemd, container files, units of CAN "
         "interfaces and the script that tunes a machine for real time."
     )
-    command.add_argument("--out", required=True, metavar="DIR", help="folder; new or empty")
+    command.add_argument("-o", "--out", required=True, metavar="DIR", help="folder; new or empty")
 
 
 def call(options: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.resources import files
@@ -115,6 +116,12 @@ def call_export(options: argparse.Namespace) -> int:
     for name, text in files.items():
         write_text(options.out / name, text)
     print(f"{options.out}: {', '.join(files)}")
+    stale = sorted({path.name for path in options.out.glob("gfm_*.[ch]")} - set(files))
+    if stale:
+        print(
+            f"gfmhil: {options.out} also holds {', '.join(stale)} of an earlier export",
+            file=sys.stderr,
+        )
     return 0
 
 

@@ -14,7 +14,7 @@ from gfm_hil.cli.common import new_folder, progress
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import find_scenario
+from gfm_hil.scenario.model import find_scenario, shipped_scenarios
 from gfm_hil.studies.identification import (
     AMPLITUDE,
     POINTS,
@@ -22,7 +22,8 @@ from gfm_hil.studies.identification import (
     Identification,
     identify,
 )
-from gfm_runtime import law_names
+from gfm_runtime import law_names, tuned_names
+from gfm_runtime.errors import meant
 from gfm_runtime.toml_file import read_toml
 
 _ROWS = 12  # of the table
@@ -121,8 +122,11 @@ def _which(what: str, scenario: str | None) -> tuple[str | None, str]:
     try:
         find_scenario(what)
     except UserError:
+        if what.endswith(".toml"):
+            raise UserError(f"{what}: there is no such file") from None
+        close = meant(what, [*law_names(), *tuned_names(), *shipped_scenarios()])
         raise UserError(
-            f"{what!r}: is neither a law (gfmhil laws) nor a scenario (gfmhil scenarios)"
+            f"{what!r}: is neither a law (gfmhil laws) nor a scenario (gfmhil scenarios){close}"
         ) from None
     return None, what
 

@@ -10,7 +10,7 @@ from gfm_hil.core.roles import ROLES
 
 def add(command: argparse.ArgumentParser) -> None:
     command.description = "Make a key pair per role, for ZeroMQ between two machines (CURVE)."
-    command.add_argument("--out", default="keys", help="folder (%(default)s)")
+    command.add_argument("-o", "--out", default="keys", help="folder (%(default)s)")
     command.add_argument("--force", action="store_true", help="replace the keys that are there")
 
 

@@ -12,7 +12,7 @@ import errno
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -95,7 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
             why = "-- cannot be a value; for a file of that name write ./--"
             return _refuse(OSError(errno.EINVAL, why, text))
-    options = parser(given[0] if given else None).parse_args(given)
+    top = parser(given[0] if given else None)
+    options, unknown = top.parse_known_args(given)
+    if unknown:
+        return _refuse(_unknown(top, options.command, unknown))
     try:
         return int(options.call(options))
     except KeyboardInterrupt:
@@ -105,6 +108,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except Exception as problem:
         return _refuse(problem)
+
+
+def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Exception:
+    """The error that a command does not know some of the words given to it."""
+    from gfm_hil.core.errors import UserError
+    from gfm_runtime.errors import meant
+
+    def options(of: argparse.ArgumentParser) -> Iterator[str]:
+        for action in of._actions:
+            yield from action.option_strings
+            for inside in action.choices.values() if isinstance(action.choices, dict) else ():
+                yield from options(inside)
+
+    close = meant(words[0].partition("=")[0], set(options(top)))
+    return UserError(f"{' '.join(words)}: gfmhil {command} does not know it{close}")
 
 
 def _refuse(problem: Exception) -> int:

@@ -37,7 +37,7 @@ def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--converter", help="of a network: the one that this controller controls")
-    command.add_argument("--out", help="run folder; runs/<role>-<time> by default")
+    command.add_argument("-o", "--out", help="run folder; runs/<role>-<time> by default")
     command.add_argument("--quiet", action="store_true", help="say nothing but errors")
     command.add_argument(
         "--model", metavar="KIND:FILE",

@@ -37,7 +37,7 @@ def add(command: argparse.ArgumentParser) -> None:
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours",
     )  # fmt: skip
     add_map(command, "--controller")
-    command.add_argument("--out", help="run folder; runs/<scenario>-<time> by default")
+    command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.add_argument("--no-figures", action="store_true", help="neither figures nor report")

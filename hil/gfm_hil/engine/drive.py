@@ -25,8 +25,8 @@ from gfm_hil.engine.loop_records import (
     make_loop,
 )
 from gfm_hil.engine.plant_ticks import plant_ticks
-from gfm_hil.engine.setup import Bench
-from gfm_hil.engine.timeline import Timeline
+from gfm_hil.engine.setup import Bench, follow_trips
+from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.engine.waiting import part_from
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
@@ -34,7 +34,7 @@ from gfm_hil.models import ModelError
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import PLANT_LEFT
 from gfm_hil.recording.parts import Part
-from gfm_plant import NO_FRESH_U, take_out
+from gfm_plant import NO_FRESH_U
 from gfm_plant.names import CONTROLLER_GONE, CONTROLLER_LEFT
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
@@ -116,7 +116,7 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
     ends = [_End("plant", share, t0_ns, flags) for share in shares]
     timelines = [share.timeline for share in shares]
     sides, first = tuple(end.side for end in ends), ends[0]
-    bench, alone = shares[0].bench, len(shares) == 1
+    bench = shares[0].bench
     ticks = bench.scenario.ticks
     for end in ends:
         end.keep_u(end.bench.u)
@@ -129,8 +129,9 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
         if why == Why.RESTORE:
             bench.restore_plant(tick)
             first.keep_u(bench.u)
-        if not alone:
-            take_out(bench.plant)
+        for started in follow_trips(bench.plant):
+            ends[started].keep_u(bench.plant.st["u"][started, 0, : len(bench.u)])
+        report_check(bench.plant, timelines, tick)
         for timeline in timelines:
             timeline.look(max(tick - 1, 0))
             if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.engine.loop_records import ControllerRecords, Why
-from gfm_hil.engine.setup import Bench
-from gfm_hil.engine.tick import answer, obey, sample, take
-from gfm_hil.engine.timeline import Timeline
+from gfm_hil.engine.setup import Bench, follow_trips
+from gfm_hil.engine.tick import answer, asks_to_start, obey, sample, take
+from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.recording.columns import (
     CONTROLLER_TIMES,
     PLANT_TIMES,
@@ -23,7 +23,8 @@ from gfm_hil.recording.columns import (
 )
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller
-from gfm_plant import PlantRecords, plant_is_delayed, plant_step, take_out
+from gfm_plant import PlantRecords, plant_is_delayed, plant_step
+from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
 
@@ -96,7 +97,8 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, go
             plant_step(plant)
         for i in range(len(ctl)):
             trips -= st[i].trip
-        if changed or trips != 0:
+            changed = asks_to_start(plant, i, ctl[i].state) or changed
+        if changed or trips != 0 or plant.now[0].check > WATCHING:
             return k + 1
     return stop
 
@@ -148,13 +150,15 @@ def run_inproc(
             bench.plant.records, controllers, plant_rows, controller_rows, k, stop, begin, goes_on
         )
         if not single:
-            take_out(bench.plant)
             for parts, rows in ((plant_parts, plant_rows), (controller_parts, controller_rows)):
                 for part, own in zip(parts, rows, strict=True):
                     part.signals[k:done] = own[: done - k]
         k = done
-        if int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
+        if bench.plant.net[0]["joins"]:
+            follow_trips(bench.plant)
+        elif int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
             bench.restore_plant(k)
+        report_check(bench.plant, timelines, k)
         for timeline in timelines:
             timeline.look(k - 1)
         if not go_on(k):

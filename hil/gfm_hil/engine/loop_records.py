@@ -46,7 +46,7 @@ loop_dtype = np.dtype(
         ("hold", "i8"),  # misses in a row that the plant allows
         ("extrapolate", "i8"),  # plant: misses in a row over which u continues its trend
         ("repeat", "i8"),  # lockstep: silence after which the plant sends y again, ns
-        ("repeats", "i8"),  # how often it did
+        ("repeats", "i8"),  # lockstep: how often the plant has sent y again
         ("unrested", "i8"),  # plant: ticks in a row without a sleep
         ("late", "i8"),  # misses in a row
         ("misses", "i8"),
@@ -56,10 +56,10 @@ loop_dtype = np.dtype(
         ("woken", "i8"),  # ``flags[WAKE]`` as last seen
         ("goes_on", "i8"),  # after a trip or in SAFE, instead of ending the run
         ("others", "i8"),  # plant: it has other converters, which go on if this controller is lost
-        ("came", "i8"),  # plant: what came of u[k]
+        ("came", "i8"),  # plant: whether u[k] came in time, late or not at all
         ("tripped", "i8"),  # plant: the converter's trip when y[k] was measured
-        ("unseen", "i8"),  # plant: a tick whose arrival of u the next reading of the clock gives
-        ("lost", "f8"),  # plant: 0, or for which trip its controller is not waited for any more
+        ("unseen", "i8"),  # plant: the tick whose u arrives at the next reading of the clock
+        ("lost", "f8"),  # plant: the trip after which it waits for the controller no more, or 0
         ("seen", "i8"),  # controller: the state with which it last returned
         ("u_last", "f8", (NU_INNER,)),  # the two newest u that came in time
         ("u_before", "f8", (NU_INNER,)),

@@ -19,7 +19,7 @@ from gfm_hil.engine.controller_ticks import receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, Why
 from gfm_hil.models import Model
 from gfm_runtime.compiled import compiled
-from gfm_runtime.controller import accept, bad_output, follow_plant
+from gfm_runtime.controller import accept, bad_output, follow_plant, measured
 from gfm_runtime.signals import NY
 from gfm_runtime.states import READY, RUNNING, SAFE
 
@@ -79,6 +79,10 @@ class SteppedModel:
             self._tick = int(records.loop["tick"][0])
             self._began = time.monotonic_ns()
             if took == RESTARTED:
+                if ctl["joins"][0]:
+                    ctl["joins"] = 0
+                    self._start[:] = 0.0
+                    measured(records.y, self._start)
                 self._model.start(self._start)
             if took != REFUSED:
                 self._model.tick(ctl["ref"][0], records.y, u)

@@ -11,7 +11,7 @@ several, a controller that leaves or falls silent trips its converter, and the o
 from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, Why
-from gfm_hil.engine.tick import obey, sample, take
+from gfm_hil.engine.tick import asks_to_start, obey, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
@@ -26,6 +26,7 @@ from gfm_plant import plant_is_delayed, plant_step
 from gfm_plant.names import CONTROLLER, GONE, LEFT
 from gfm_plant.names import SILENT as NOT_HEARD
 from gfm_plant.protection import trip
+from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import PLANT_TRIP, SAFE
 
@@ -85,6 +86,8 @@ def plant_ticks(sides, plant, last):
             plant_step(plant)
         for i in range(len(sides)):
             why = _judge(sides[i], plant, i, why)
+        if why == Why.GO_ON and plant.now[0].check > WATCHING:
+            why = Why.CHANGED
         if why != Why.GO_ON:
             break
         why = Why.DONE
@@ -277,6 +280,8 @@ def _judge(side, plant, i, why):
     elif r.goes_on and reader[0].e2e == INVALID:
         trip(plant, i, CONTROLLER, NOT_HEARD)
     if plant.st[i].trip != r.tripped:
+        return Why.CHANGED
+    if r.lost == 0 and asks_to_start(plant, i, reader[0].state):
         return Why.CHANGED
     if r.late * r.T >= r.patience:
         judge(reader, True, True)

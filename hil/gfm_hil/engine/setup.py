@@ -17,7 +17,8 @@ from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.retune import retuned
 from gfm_hil.scenario.events import Gains, LawChange, Reset
 from gfm_hil.scenario.model import Scenario, plant_of
-from gfm_plant import Network, NoEquilibrium
+from gfm_plant import Network, NoEquilibrium, start_again, take_out
+from gfm_plant.names import MAY_START
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import NY, NY_INNER, carried
@@ -66,6 +67,8 @@ class Bench:
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
 
+        That of a converter in a network will begin with the voltage and frequency that it measures.
+
         Raises:
             ValueError: it is not in SAFE.
         """
@@ -76,7 +79,22 @@ class Bench:
         c.ctl[:], c.laws[:], c.states[:], c.est[:] = self._controller
         c.asked, c.gains = self._asked, {}
         c.ctl["state"], c.ctl["changes"] = READY, changes
+        c.ctl["joins"] = self.plant.net["joins"]
         self.u[:] = self.start.commands[: len(self.u)]
+
+
+def follow_trips(plant: Network) -> list[int]:
+    """Do between two ticks what the trips of a network's converters ask for: the circuits without
+    one that has tripped, and the new start of each that was reset and may start.
+
+    Returns:
+        The indices of those that have started.
+    """
+    take_out(plant)
+    started = [int(k) for k in np.flatnonzero(plant.st["waits"] == MAY_START)]
+    for k in started:
+        start_again(plant, k)
+    return started
 
 
 def make_bench(scenario: Scenario) -> Bench:
@@ -109,7 +127,7 @@ def make_benches(scenario: Scenario) -> list[Bench]:
         if scenario.network is None:
             grid = scenario.plant.grid
             starts = [operating_point(plant.par, laws[0], refs[0], grid.omega_g, grid.V_g)]
-            machines = list[float]()
+            machines = list[tuple[float, float]]()
         else:
             starts, machines = operating_points(plant, laws, refs)
     except NoEquilibrium as problem:

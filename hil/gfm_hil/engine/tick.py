@@ -10,8 +10,8 @@ from __future__ import annotations
 from gfm_hil.engine.loop_records import Why
 from gfm_hil.recording.recorder import record_sample
 from gfm_plant import plant_command, plant_sample
-from gfm_plant.names import CONTROLLER, SAFE_STATE
-from gfm_plant.protection import trip
+from gfm_plant.names import CONTROLLER, MAY_START, SAFE_STATE
+from gfm_plant.protection import start_condition, trip
 from gfm_runtime.compiled import inlined
 from gfm_runtime.controller import control, follow_plant
 from gfm_runtime.states import READY, SAFE, STOPPED
@@ -53,9 +53,22 @@ def take(plant, i, u, tripped, state, fresh):
     """Hand u[k] to the D/A of converter i.
 
     Returns RESTORE, with u[k] not taken, if the plant was ``tripped`` and the controller is READY
-    for a new start in a ``fresh`` frame.
+    for a new start in a ``fresh`` frame. In a network the plant does not go back to its start; see
+    ``asks_to_start``.
     """
-    if tripped != 0 and state == READY and fresh:
+    if tripped != 0 and state == READY and fresh and plant.net[0].joins == 0:
         return Why.RESTORE
     plant_command(plant, i, u)
     return Why.GO_ON
+
+
+@inlined
+def asks_to_start(plant, i, state):
+    """Look, after the tick, whether converter i of a network, whose controller is in ``state``, is
+    to start again; returns whether Python has to act on what it waits for (``waits``)."""
+    s = plant.st[i]
+    if plant.net[0].joins == 0 or s.trip == 0 or state != READY:
+        return False
+    before = s.waits
+    s.waits = start_condition(plant, i)
+    return s.waits == MAY_START or s.waits != before

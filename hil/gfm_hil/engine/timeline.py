@@ -32,8 +32,8 @@ from gfm_hil.scenario.events import (
     nominal_hz,
 )
 from gfm_hil.scenario.profiles import Point, read_profile
-from gfm_plant import trip_reason
-from gfm_plant.names import CONTROLLER
+from gfm_plant import Checked, Network, finish_check, trip_reason, wait_reason
+from gfm_plant.names import CONTROLLER, NOT_ASKED
 from gfm_runtime.signals import carried
 from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 
@@ -100,6 +100,7 @@ class Timeline:
         self.put_off = False  # a write may take longer than a tick
         self.outcome: Outcome | None = None
         self._fault: tuple[Status, str] | None = None  # the run waits for its reset
+        self._waits = NOT_ASKED  # what a converter that was reset waited for
         self.stopped_by: dict[str, Any] | None = None  # the operator who stopped the run
 
     @property
@@ -192,6 +193,12 @@ class Timeline:
         elif found is None and self._fault is not None:
             self.write(tick, "recovered", role="+".join(self._roles))
         self._fault = found
+        waits = int(st["waits"][self._bench.place]) if "plant" in self._roles else NOT_ASKED
+        if waits != self._waits and (
+            why := wait_reason(self._bench.plant.records, self._bench.place)
+        ):
+            self.write(tick, "waits", reason=why)
+        self._waits = waits
 
     def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
         """The fault that keeps our side from running, if any; the cause before its consequences."""
@@ -202,6 +209,20 @@ class Timeline:
             heard = int(ctl["reason"][0]) == PLANT_TRIP
             return "tripped" if heard else "safe", safe_reason(ctl)
         return ("safe", trip_reason(self._bench.plant.records, self._bench.place)) if trip else None
+
+    def checked(self, found: Checked, tick: int) -> None:
+        """Log how a synchro-check has ended."""
+        kind = "breaker" if found.name else "grid-breaker"
+        name, f_b = found.name or "grid breaker", nominal_hz(self._bench.plant)
+        said = (
+            f"dV = {found.V:.4f} p.u., df = {found.omega * f_b:.4f} Hz, dphi = {found.degrees:.2f}"
+            " degrees"
+        )
+        if found.closed:
+            self.write(tick, kind, label=f"{name} on, synchronous", found=said)
+        else:
+            refused = f"the sides did not agree in time: {said}"
+            self.write(tick, kind, label=f"{name} stays off", refused=refused)
 
     def finish(self, tick: int) -> None:
         """The scenario is over: the run is complete unless it still waits for a reset."""
@@ -250,6 +271,14 @@ class Timeline:
         self.flush()
         self._log.close()
         self._room.unlink(missing_ok=True)
+
+
+def report_check(plant: Network, timelines: Sequence[Timeline], tick: int) -> None:
+    """Carry out what a synchro-check of the plant has found before a tick, and log it."""
+    found = finish_check(plant)
+    if found is not None:
+        for timeline in timelines:
+            timeline.checked(found, tick)
 
 
 class TimelineInMemory(Timeline):

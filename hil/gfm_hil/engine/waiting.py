@@ -18,13 +18,14 @@ from gfm_runtime.states import SAFE, STOPPED
 
 _SPIN_NS = 50_000  # longer would starve the threads that bring the answer
 
-_LAST_NS = 500_000_000
+_LAST_NS = 500_000_000  # how long to go on sending, or waiting for, last frames
 
 
 def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
     """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
 
-    It yields after every poll, because a pure spin would starve libzmq's own thread on two cores.
+    It yields after every poll, because a pure spin would starve libzmq's own thread on two cores,
+    and sleeps between two polls after 50 us.
     """
     spin_until = time.monotonic_ns() + _SPIN_NS
     while True:

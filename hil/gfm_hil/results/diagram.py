@@ -127,6 +127,9 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
         for name, load in network.loads.items():
             text = f"{name}\nP {load.P:g}, Q {load.Q:g} p.u."
             bars.setdefault(load.node, _Bar()).right.append(("load", text, load.closed))
+        for name, power in network.constant_power.items():
+            text = f"{name}\nconstant P {power.P:g}, Q {power.Q:g} p.u."
+            bars.setdefault(power.node, _Bar()).right.append(("load", text, power.closed))
         for name, machine in network.machines.items():
             text = f"{name}\nS {machine.S:g}, H {machine.H:g} s, X {machine.X:g}"
             bars.setdefault(machine.node, _Bar()).right.append(("machine", text, True))

@@ -117,9 +117,11 @@ class Gains(_Event):
 
 
 class Reset(_Event):
-    """Return from a trip or the safe state to the scenario's start, for runs that wait there."""
+    """Return from a trip or the safe state to the scenario's start, for runs that wait there. A
+    converter of a network starts again in the network as it is by then."""
 
     type: Literal["reset"] = Field(description="kind of event")
+    converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
         return "reset"
@@ -327,27 +329,72 @@ class FaultClear(_Event):
         return "fault cleared"
 
 
-class Breaker(_Event):
+class SynchroCheck(BaseModel):
+    """When a breaker may close: its two sides must agree for a time. The defaults are the limits of
+    IEEE Std 1547-2018, Table 5, for 1.5 to 10 MVA."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    V: float = Field(0.03, gt=0, le=1, description="largest difference of the voltages, p.u.")
+    f_hz: float = Field(0.1, gt=0, le=10, description="of the frequencies, Hz")
+    degrees: float = Field(10.0, gt=0, le=180, description="of the angles")
+    lasting_s: float = Field(
+        0.1, ge=0, le=3600, description="for how long all three must stay within, s"
+    )
+    within_s: float = Field(
+        60.0, gt=0, le=86400, description="after this time the breaker stays open, s"
+    )
+
+    @model_validator(mode="after")
+    def _has_the_time(self) -> SynchroCheck:
+        if self.within_s <= self.lasting_s:
+            raise ValueError(
+                f"within_s = {self.within_s:g}: must be more than lasting_s = {self.lasting_s:g}"
+            )
+        return self
+
+
+_CHECK: Any = Field(
+    None, description="closes once both sides agree, by a synchro-check; at once if none"
+)
+
+
+class _Switch(_Event):
+    """A breaker."""
+
+    closed: bool = Field(description="false opens it")
+    check: SynchroCheck | None = _CHECK
+
+    @model_validator(mode="after")
+    def _checks_what_closes(self) -> _Switch:
+        if self.check is not None and not self.closed:
+            raise ValueError("check: goes with closed = true")
+        return self
+
+    def _when(self) -> str:
+        return "" if self.check is None else " when synchronous"
+
+
+class Breaker(_Switch):
     """The grid breaker opens onto the local load, or closes again."""
 
     type: Literal["grid-breaker"] = Field(description="kind of event")
     closed: bool = Field(description="false opens it onto the local load")
 
     def label(self) -> str:
-        return "grid breaker " + ("closes" if self.closed else "opens")
+        return "grid breaker " + ("closes" if self.closed else "opens") + self._when()
 
 
-class LineBreaker(_Event):
+class LineBreaker(_Switch):
     """The breaker of a line or load of a network opens or closes."""
 
     type: Literal["breaker"] = Field(description="kind of event")
     name: str = Field(
         min_length=1, description="of the line or load, or of the converter whose line it is"
     )
-    closed: bool = Field(description="false opens it")
 
     def label(self) -> str:
-        return f"{self.name} " + ("on" if self.closed else "off")
+        return f"{self.name} " + ("on" if self.closed else "off") + self._when()
 
 
 Event = Annotated[
@@ -404,6 +451,10 @@ def apply_grid_event(event: Any, plant: Network) -> None:
             )
         case FaultClear():
             grid.clear_fault(plant)
+        case Breaker() | LineBreaker() if event.check is not None:
+            name, by = getattr(event, "name", ""), event.check
+            limits = by.V, by.f_hz / f_b, by.degrees, by.lasting_s, by.within_s
+            grid.check_synchronism(plant, name, *limits)
         case Breaker():
             grid.breaker(plant, event.closed)
         case LineBreaker():

@@ -39,11 +39,13 @@ from gfm_plant import (
     Network,
     NetworkParts,
     Plant,
+    finish_check,
     load_converter,
     make_network,
     make_plant,
 )
 from gfm_plant.records import SIZES
+from gfm_plant.synchro_check import AGREED
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
 from gfm_runtime.errors import meant, printable
 from gfm_runtime.inner_file import named_inner
@@ -209,7 +211,8 @@ class Scenario(_Model):
     after_trip: Literal["end", "wait"] = Field(
         "end",
         description="wait: a trip or a safe state does not end the run; the plant stays blocked "
-        "until an event, or an operator, resets both sides to the scenario's start",
+        "until an event, or an operator, resets both sides to the scenario's start; of a network "
+        "the converter that tripped waits for its reset",
     )
     prevent_idle: Literal["auto", "always", "never"] = Field(
         "auto",
@@ -412,8 +415,6 @@ class Scenario(_Model):
                     f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
                     f"{meant(asked, self.converters)}"
                 )
-        if self.network is not None and self.after_trip == "wait":
-            problems.append("after_trip = 'wait': a network has no reset yet; use 'end'")
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
         problems += self._wrong_links()
@@ -582,7 +583,8 @@ def check_scenario(
                 for stage in load_law(law, member.inner).laws:
                     _try_law(law, stage, scenario.T_s)
             except LawError as problem:
-                at = f"network.converters.{member.converter}.law: "
+                key = "inner" if _no_stage(member.inner) else "law"
+                at = f"network.converters.{member.converter}.{key}: "
                 wrong += [f"{where}: {at}{line}" for line in problem.lines]
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
@@ -598,6 +600,16 @@ def check_scenario(
     if wrong:
         raise UserError("\n".join(map(printable, wrong)))
     return scenario
+
+
+def _no_stage(name: str | None) -> bool:
+    """Whether there is no such inner stage."""
+    try:
+        if name is not None:
+            named_inner(name)
+    except LawError:
+        return True
+    return False
 
 
 def _try_law(name: str, stage: Law, T_s: float) -> None:
@@ -629,11 +641,16 @@ def plant_of(scenario: Scenario) -> Network:
 def _try_plant(scenario: Scenario) -> None:
     """Build the plant and try those of its events that not every plant can carry out."""
     converter = f"plant.converter = {scenario.plant.converter!r}"
-    if scenario.plant.converter.endswith(".toml"):
-        try:
-            read_toml(scenario.plant.converter)
-        except ValueError as problem:
-            raise UserError(f"{converter}: {problem}") from None
+    files = {converter: scenario.plant.converter}
+    for name in scenario.converters:
+        file = scenario.of(name).plant.converter
+        files[f"network.converters.{name}.plant.converter = {file!r}"] = file
+    for place, file in files.items():
+        if file.endswith(".toml"):
+            try:
+                read_toml(file)
+            except ValueError as problem:
+                raise UserError(f"{place}: {problem}") from None
     try:
         plant = plant_of(scenario)
     except ValidationError as problem:
@@ -649,5 +666,8 @@ def _try_plant(scenario: Scenario) -> None:
                     next(profile.points(scenario.T_s))[1].apply(plant)
                 else:
                     apply_grid_event(event, plant)
+                    if plant.wiring.check is not None:  # what it waits for is tried too
+                        plant.now["check"] = AGREED
+                        finish_check(plant)
             except (UserError, ValueError) as problem:
                 raise UserError(f"events.{k}: {problem}") from None

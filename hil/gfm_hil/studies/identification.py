@@ -457,9 +457,15 @@ def _plan(bands: Sequence[_Band], amplitude: float, settle_s: float, scenario: S
         if largest > _ROOM[name]:
             raise UserError(
                 f"amplitude = {amplitude:g}: would move {name} by {largest:.3g} p.u., allowed is "
-                f"{_ROOM[name]:g} p.u.: at most {amplitude * _ROOM[name] / largest:.2g}"
+                f"{_ROOM[name]:g} p.u.: at most {_below(amplitude * _ROOM[name] / largest):g}"
             )
     return plan
+
+
+def _below(value: float) -> float:
+    """The number of two digits that is not above ``value`` > 0."""
+    digit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.floor(value / digit) * digit
 
 
 def _sines(plan: _Plan, k: int, axis: str, scenario: Scenario) -> Vector:

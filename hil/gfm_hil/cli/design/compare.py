@@ -33,7 +33,7 @@ def add(kinds: Any) -> None:
     command.add_argument("--evaluations", type=int, default=EVALUATIONS, help="of each start")
     command.add_argument("--starts", type=int, help="of each law; more for more gains, if left")
     command.add_argument(
-        "--out", help="folder to write, or to go on with; runs/law-comparison-<time>"
+        "-o", "--out", help="folder to write, or to go on with; runs/law-comparison-<time>"
     )
     command.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     command.add_argument(

@@ -39,7 +39,7 @@ def add(kinds: Any) -> None:
     command.add_argument("--seed", type=int, default=0, help="of the search")
     command.add_argument("--rounds", type=int, default=6, help="how often corners may join")
     command.add_argument("--evaluations", type=int, default=2500, help="of each round")
-    command.add_argument("--out", required=True, help="write the law to this file")
+    command.add_argument("-o", "--out", required=True, help="write the law to this file")
     command.set_defaults(call=call)
 
 

@@ -51,7 +51,9 @@ def add(kinds: Any) -> None:
         if find is _step:
             command.add_argument("--of", default="P_ref", help="the input that steps")
             command.add_argument("--seconds", type=_seconds, default=1.0, help="how long, s")
-        command.add_argument("--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf")
+        command.add_argument(
+            "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
+        )
         command.add_argument("--json", action="store_true", help="as JSON")
         command.set_defaults(call=call, find=find, draw=draw)
 

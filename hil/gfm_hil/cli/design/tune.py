@@ -41,7 +41,7 @@ def add(kinds: Any) -> None:
     )
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
     command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
-    command.add_argument("--out", help="write the tuned law to this file")
+    command.add_argument("-o", "--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.set_defaults(call=call)
 

@@ -141,7 +141,8 @@ def _notes(job: Job, row: Row) -> list[str]:
         f"at {mode['frequency_hz']:.4g} Hz",
     ]
     if row["delay_us"] is not None:
-        lines.append(f"it stands {row['delay_us']:.0f} us from the sample of y to its action")
+        delay = f"{row['delay_us']:.0f} us"
+        lines.append(f"it is stable up to {delay} from the sample of y to its action")
     for key, name in (("L_g", "L_g"), ("R", "R_f and R_g")):
         if row[key]:
             low, high = (e["factor"] for e in row[key])

@@ -135,7 +135,7 @@ _WITH_GAMMA: dict[str, list[Column]] = {
         _LAW,
         ("σ [1/s]", lambda r: number(r["sigma"])),
         ("least damping ratio", _damping),
-        ("delay it stands [µs]", _delay),
+        ("stable up to a delay of [µs]", _delay),
         ("L_g", _factors("L_g")),
         ("R_f, R_g", _factors("R")),
     ],
