@@ -1,4 +1,15 @@
-from .model import Model, ModelError, open_model
+from .model import FORMS, PIL, Model, ModelError, open_model, precision
+from .pil import PilModel
 from .ports import PortMap, read_map
 
-__all__ = ["Model", "ModelError", "PortMap", "open_model", "read_map"]
+__all__ = [
+    "FORMS",
+    "PIL",
+    "Model",
+    "ModelError",
+    "PilModel",
+    "PortMap",
+    "open_model",
+    "precision",
+    "read_map",
+]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from gfm_hil.core.errors import UserError
 from gfm_hil.models.ports import PortMap
 
-KINDS = ("dll", "fmu")
+if TYPE_CHECKING:
+    from gfm_hil.models.pil import PilModel
+
+PIL = "pil:"
+FORMS = "dll:FILE, fmu:FILE or pil:TARGET"
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 
@@ -24,9 +28,11 @@ class Model(Protocol):
 
     Attributes:
         name: what the run calls it: 1 to 64 printable ASCII characters.
+        real: float64 or float32, for the laws that the controller's process has beside it.
     """
 
     name: str
+    real: str
 
     def start(self, u: NDArray[np.float64]) -> None:
         """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
@@ -48,11 +54,11 @@ class Model(Protocol):
         """End it, and remove what it left."""
 
 
-def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model:
-    """The model ``KIND:FILE``, for a run with sampling time T_s [s].
+def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model | PilModel:
+    """The model that ``text`` names, for a run with sampling time T_s [s].
 
     Args:
-        text: ``dll:FILE`` or ``fmu:FILE``.
+        text: ``dll:FILE``, ``fmu:FILE``, or ``pil:TARGET`` for the run's own laws.
         ports: which signal each of its ports is.
         T_s: sampling time of the run, s.
         inner: whether the run has an inner stage, so that y and u have its signals.
@@ -60,9 +66,15 @@ def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model:
     Raises:
         UserError: there is no such file, it is no such model, or its ports do not fit.
     """
-    kind, colon, file = text.partition(":")
-    if not colon or kind not in KINDS or not file:
-        raise UserError(f"controller {text!r}: must be dll:FILE or fmu:FILE")
+    kind, _, file = text.partition(":")
+    if kind not in ("dll", "fmu", "pil") or not file:
+        raise UserError(f"controller {text!r}: must be {FORMS}")
+    if kind == "pil":
+        from gfm_hil.models.pil import PilModel
+
+        if ports != PortMap():
+            raise UserError(f"controller {text}: has our signals, and takes no map")
+        return PilModel(file)
     path = Path(file).absolute()
     if not path.is_file():
         raise UserError(f"{file}: there is no such file")
@@ -73,6 +85,19 @@ def open_model(text: str, ports: PortMap, T_s: float, inner: bool) -> Model:
     from gfm_hil.models.fmu import FmuModel
 
     return FmuModel(path, ports, T_s, inner)
+
+
+def precision(text: str) -> str:
+    """The precision, float64 or float32, of the laws beside the model that ``text`` names.
+
+    Raises:
+        UserError: it is a target that is not there.
+    """
+    if not text.startswith(PIL):
+        return "float64"
+    from gfm_hil.models.pil import PilModel
+
+    return PilModel(text.removeprefix(PIL)).real
 
 
 def run_name(kind: str, model: str) -> str:
