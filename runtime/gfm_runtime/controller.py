@@ -205,6 +205,15 @@ def _join(law, state, c, inner):
         settle_inner(law, state, c.u, c.u[2], 0.0)
 
 
+@inlined
+def next_law(c, est, y):
+    """The law to which this tick changes, as requested or by the schedule; -1 if it stays."""
+    if c.stages > 0:
+        _schedule(c, est, y)
+    k, c.request = c.request, -1
+    return -1 if k == c.active else k
+
+
 @compiled
 def bad_output(ctl, channel):
     """SAFE, because output ``channel`` is not finite."""
@@ -228,18 +237,13 @@ def control(ctl, laws, states, est, y, u):
     if c.joins:
         c.joins = 0
         _join(laws[c.active], states[c.active], c, inner)
-    if c.stages > 0:
-        _schedule(c, est[0], c.y)
-    if c.request >= 0:
-        k, c.request = c.request, -1
-        if k != c.active:
-            c.bump = change_law(
-                laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u
-            )
-            if inner:
-                take_measurements(states[k], c.y)
-                settle_inner(laws[k], states[k], c.u, c.out[2], c.out[3])
-            c.active, c.changes = k, c.changes + 1
+    k = next_law(c, est[0], c.y)
+    if k >= 0:
+        c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u)
+        if inner:
+            take_measurements(states[k], c.y)
+            settle_inner(laws[k], states[k], c.u, c.out[2], c.out[3])
+        c.active, c.changes = k, c.changes + 1
     if inner:
         step_with_inner(laws[c.active], states[c.active], c)
         for i in (1, 0, 2, 3):

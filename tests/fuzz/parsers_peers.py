@@ -23,6 +23,7 @@ from gfm_hil.links.can.segments import LONGEST, SegmentSender
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import frame_dtype
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
+from gfm_hil.links.serial.framing import Unstuffer, stuffed
 from gfm_hil.scenario.model import check_scenario
 from gfm_runtime.signals import NU, NY
 
@@ -158,8 +159,32 @@ def _can_seeds() -> list[bytes]:
     return seeds
 
 
+@contextlib.contextmanager
+def _serial(place: Path) -> Iterator[Take]:
+    """Bytes of a line: no message is too long, and the next one arrives after any of them."""
+
+    def take(content: bytes) -> None:
+        into, found = Unstuffer(), []
+        for piece in (content[:7], content[7:], b"\0" + stuffed(b"next")):
+            into.feed(piece)
+            while (message := into.next()) is not None:
+                found.append(message)
+        assert found[-1] == b"next" and max(map(len, found)) <= LONGEST
+        assert len(found) + into.damaged <= content.count(b"\0") + 2
+
+    yield take
+
+
+def _serial_seeds() -> list[bytes]:
+    writer = FrameWriter("y")
+    frames = [stuffed(writer.pack(k, 2, 0, Y)) for k in range(3)]
+    greeting = b'GFMHIL {"kind": "hello", "role": "plant"}'
+    return [b"".join(frames), stuffed(greeting), stuffed(bytes(range(1, 256)) + bytes(249))]
+
+
 PEERS = (
     Parser("frames", _frames, lambda: blobs(_frame_seeds())),
     Parser("handshake", _handshake, _hellos),
     Parser("can", _can, lambda: blobs(_can_seeds(), changes=12)),
+    Parser("serial", _serial, lambda: blobs(_serial_seeds(), changes=12)),
 )

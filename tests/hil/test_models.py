@@ -275,8 +275,8 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        ("exe:x", "must be dll:FILE, fmu:FILE or c:FILE"),
-        ("dll:", "must be dll:FILE, fmu:FILE or c:FILE"),
+        ("exe:x", "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
+        ("dll:", "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
         ("dll:none.so", "none.so: there is no such file"),
         ("dll:{text}", "cannot be loaded"),
         ("fmu:{text}", "is no FMU that FMPy reads"),

@@ -206,6 +206,9 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         console.print(escape(f"round trip [µs]: {text}"), highlight=False)
+    if "instructions" in summary:
+        text = ", ".join(f"{k} {v}" for k, v in summary["instructions"].items())
+        console.print(f"instructions of a step: {text}", highlight=False)
     events = summary["events"]
     shown = events if len(events) <= 2 * _ENDS else [*events[:_ENDS], *events[-_ENDS:]]
     for table in fitting(console, shown, events_table):

@@ -25,7 +25,7 @@ from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
-from gfm_hil.models import Rig, open_model, read_map
+from gfm_hil.models import FORMS, Rig, open_model, read_map
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import Scenario
@@ -40,8 +40,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("-o", "--out", help="run folder; runs/<role>-<time> by default")
     command.add_argument("--quiet", action="store_true", help="say nothing but errors")
     command.add_argument(
-        "--model", metavar="KIND:FILE",
-        help="of the controller: dll:FILE, fmu:FILE or c:FILE, which gives u in place of the law",
+        "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u",
     )  # fmt: skip
     add_map(command, "--model")
     command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)

@@ -25,6 +25,7 @@ from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model
+from gfm_hil.models import PIL, precision
 from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
@@ -33,8 +34,9 @@ def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument(
-        "--controller", metavar="KIND:FILE",
-        help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours",
+        "--controller", metavar="KIND:NAME",
+        help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"
+        " or pil:TARGET, the law on a processor in QEMU, see gfmhil firmware check",
     )  # fmt: skip
     add_map(command, "--controller")
     command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")
@@ -60,6 +62,8 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
+    if options.controller is not None and options.controller.startswith(PIL) and not options.mode:
+        options.mode = "lockstep"  # QEMU keeps no time
     scenario = resolve(options, law=options.law, waveforms=options.waveforms)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
     if scenario.network is not None:
@@ -103,7 +107,7 @@ def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Noti
         return []
     if scenario.link.type == INPROC:
         raise UserError("--controller: is a process, and a run in process has none; choose --link")
-    compile_for_model(scenario, notice)
+    compile_for_model(scenario, notice, precision(options.controller))
     return model_command(options.controller, options.map)
 
 

@@ -136,24 +136,27 @@ def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
     return compile_sets(sets, notice), len(sets)
 
 
-def compile_for_model(scenario: Scenario, notice: Callable[[str], None]) -> None:
+def compile_for_model(
+    scenario: Scenario, notice: Callable[[str], None], real: str = "float64"
+) -> None:
     """Compile what a controller calls that steps a model in place of the law.
 
     Args:
         scenario, notice: as for ``compiled_bench``.
+        real: of the model's laws.
 
     Raises:
         UserError: as ``make_bench``.
     """
-    bench = make_bench(scenario)
-    bench.model = SteppedModel(_Nothing(), bench.u)
+    bench = make_bench(scenario, real)
+    bench.model = SteppedModel(_Nothing(), bench.controller, bench.u)
     compile_sets([_role("controller", [bench], " of a model")], notice)
 
 
 class _Nothing:
     """A model that is not there."""
 
-    name = "nothing"
+    name, real = "nothing", "float64"
 
     def start(self, u: NDArray[np.float64]) -> None:
         """Nothing."""

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.sd_notify import Watched, notify
-from gfm_hil.engine.setup import Bench, make_bench, make_benches
+from gfm_hil.engine.setup import Bench, gains_of, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
@@ -47,6 +48,9 @@ from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import carried
 
+if TYPE_CHECKING:
+    from gfm_hil.models import PilModel
+
 
 def run_role(
     role: Role,
@@ -54,7 +58,7 @@ def run_role(
     folder: Path,
     endpoints: Mapping[str, str] = MappingProxyType({}),
     notice: Callable[[str], None] = print,
-    model: Model | None = None,
+    model: Model | PilModel | None = None,
 ) -> Outcome:
     """Run one side of a scenario at its endpoints; record to ``folder``.
 
@@ -72,7 +76,8 @@ def run_role(
         UserError: an endpoint cannot be opened, or the scenario has no operating point.
     """
     with Interrupt() as interrupt, ExitStack() as stack:
-        benches = make_benches(scenario) if scenario.parts else [make_bench(scenario)]
+        real = "float64" if model is None else model.real
+        benches = make_benches(scenario) if scenario.parts else [make_bench(scenario, real)]
         sides = []
         if model is not None:
             benches[0].model = _stepped(model, benches[0])
@@ -89,17 +94,23 @@ def run_role(
         return _run(role, sides, notice, interrupt)
 
 
-def _stepped(model: Model, bench: Bench) -> SteppedModel:
+def _stepped(model: Model | PilModel, bench: Bench) -> SteppedModel:
     """A model ready for tick 0 at the operating point.
 
     Raises:
         UserError: it refuses, or the scenario has events that are about a law.
     """
-    for event in bench.scenario.events:
-        if isinstance(event, (LawChange, Gains)):
-            raise UserError(f"events, {event.label()}: {model.name} has a law of its own")
+    from gfm_hil.models import PilModel  # brings compilers in, which few runs need
+
+    scenario = bench.scenario
+    if not isinstance(model, PilModel):
+        for event in scenario.events:
+            if isinstance(event, (LawChange, Gains)):
+                raise UserError(f"events, {event.label()}: {model.name} has a law of its own")
+    elif scenario.mode == "realtime":
+        raise UserError(f"mode = 'realtime': {model.name} keeps no time; choose --mode lockstep")
     try:
-        return SteppedModel(model, bench.u)
+        return SteppedModel(model, bench.controller, bench.u, gains_of(scenario))
     except ModelError as problem:
         raise UserError(str(problem)) from None
 

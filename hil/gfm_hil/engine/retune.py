@@ -16,12 +16,11 @@ from gfm_runtime.kernel import pack_law
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
 Gains = tuple[tuple[str, float], ...]
+Retuned = tuple[DiscreteLaw, NDArray[Any]]
 
 
 @lru_cache(maxsize=64)
-def retuned(
-    name: str, gains: Gains, T_s: float, inner: str | None = None
-) -> tuple[DiscreteLaw, NDArray[Any]]:
+def retuned(name: str, gains: Gains, T_s: float, inner: str | None = None) -> Retuned:
     """A law with some gains changed, discretised, and packed for the kernel.
 
     A gain that the law file ties to a changed one follows it unless it is given too. The newest
@@ -50,8 +49,16 @@ def change_gains(controller: Controller, values: Mapping[str, float]) -> int:
     Raises:
         ValueError: as ``retuned``.
     """
+    return controller.retune(*ready_gains(controller, values), {**controller.gains, **values})
+
+
+def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
+    """What ``change_gains`` changes to.
+
+    Raises:
+        ValueError: as ``retuned``.
+    """
     gains = {**controller.gains, **values}
     name = controller.asked
     inner = controller.sets[name].inner
-    ready = retuned(name, tuple(sorted(gains.items())), controller.T_s, inner)
-    return controller.retune(*ready, gains)
+    return retuned(name, tuple(sorted(gains.items())), controller.T_s, inner)

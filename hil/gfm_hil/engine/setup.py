@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gfm_design.model.operating_point import OperatingPoint, operating_point, operating_points
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.model_ticks import SteppedModel
-from gfm_hil.engine.retune import retuned
+from gfm_hil.engine.retune import Retuned, retuned
 from gfm_hil.scenario.events import Gains, LawChange, Reset
 from gfm_hil.scenario.model import Scenario, plant_of
 from gfm_plant import Network, NoEquilibrium, start_again, take_out
@@ -97,8 +97,12 @@ def follow_trips(plant: Network) -> list[int]:
     return started
 
 
-def make_bench(scenario: Scenario) -> Bench:
+def make_bench(scenario: Scenario, real: str = "float64") -> Bench:
     """Build both sides of a scenario of one converter at its operating point.
+
+    Args:
+        scenario: checked.
+        real: float64 or float32, for the laws' arithmetic.
 
     Raises:
         UserError: the law has no steady state on this grid, or the scenario has a network.
@@ -107,20 +111,23 @@ def make_bench(scenario: Scenario) -> Bench:
         raise UserError(
             "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
         )
-    benches = make_benches(scenario)
+    benches = make_benches(scenario, real)
     return next(b for b in benches if b.scenario.converter == scenario.converter)
 
 
-def make_benches(scenario: Scenario) -> list[Bench]:
+def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     """Build both sides of a scenario at its operating point: a bench for each converter, with a
     controller of its own and one plant in common.
+
+    Args:
+        scenario, real: as for ``make_bench``.
 
     Raises:
         UserError: the laws have no steady state on this grid.
     """
     each = [scenario.of(name) for name in scenario.converters] or [scenario]
     plant = plant_of(scenario)
-    controllers = [_controller(one, plant) for one in each]
+    controllers = [_controller(one, plant, real) for one in each]
     laws = [controller.active_law for controller in controllers]
     refs = [np.asarray(one.references.vector()) for one in each]
     try:
@@ -148,12 +155,12 @@ def make_benches(scenario: Scenario) -> list[Bench]:
         told = start.commands[: len(carried("u", inner))].copy()
         bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told)
         bench.keep()
-        _ready_gains(one)
+        gains_of(one)
         benches.append(bench)
     return benches
 
 
-def _controller(scenario: Scenario, plant: Network) -> Controller:
+def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:
     # under the name that events use: the name inside a law file may differ
     sets = [replace(load_law(name, scenario.inner), name=name) for name in scenario.laws()]
     return Controller(
@@ -161,17 +168,18 @@ def _controller(scenario: Scenario, plant: Network) -> Controller:
         scenario.T_s,
         scenario.references.vector(),
         hold=scenario.late_policy.hold,
+        real=real,
         omega_b=plant.wiring.omega_b,
     )
 
 
-def _ready_gains(scenario: Scenario) -> None:
-    """Prepare every change of gains that the scenario names before it runs.
+def gains_of(scenario: Scenario) -> list[Retuned]:
+    """Every change of gains that the scenario names, prepared before it runs.
 
     Raises:
         UserError: a change that is not possible.
     """
-    name, gains = scenario.law, dict[str, float]()
+    found, name, gains = list[Retuned](), scenario.law, dict[str, float]()
     for event in scenario.sorted_events():
         if isinstance(event, LawChange):
             name, gains = event.law, {}
@@ -180,6 +188,9 @@ def _ready_gains(scenario: Scenario) -> None:
         elif isinstance(event, Gains):
             gains.update(event.values)
             try:
-                retuned(name, tuple(sorted(gains.items())), scenario.T_s, scenario.inner)
+                found.append(
+                    retuned(name, tuple(sorted(gains.items())), scenario.T_s, scenario.inner)
+                )
             except ValueError as problem:
                 raise UserError(f"events, {event.label()}: {problem}") from None
+    return found

@@ -17,7 +17,12 @@ from gfm_hil.links.base import Link, LinkKind
 
 GROUP = "gfmhil.links"
 
-_OURS = {"can": "gfm_hil.links.can", "shm": "gfm_hil.links.shm", "zmq": "gfm_hil.links.zeromq"}
+_OURS = {
+    "can": "gfm_hil.links.can",
+    "serial": "gfm_hil.links.serial",
+    "shm": "gfm_hil.links.shm",
+    "zmq": "gfm_hil.links.zeromq",
+}
 
 
 def link_names() -> list[str]:

@@ -1,7 +1,8 @@
-"""Models that are not ours as controllers: real-code DLLs of IEEE/CIGRE, and FMUs.
+"""What may stand in the controller's place: real-code DLLs of IEEE/CIGRE, FMUs, and our own laws on
+another processor.
 
-A model computes u from the references and measurements; a map names its ports where they are not
-called as our signals.
+A model that is not ours computes u from the references and measurements; a map names its ports
+where they are not called as our signals.
 """
 
 import lazy_loader

@@ -1,4 +1,17 @@
-from .model import Model, ModelError, Rig, model_file, open_model
+from .model import FORMS, PIL, Model, ModelError, Rig, model_file, open_model, precision
+from .pil import PilModel
 from .ports import PortMap, read_map
 
-__all__ = ["Model", "ModelError", "PortMap", "Rig", "model_file", "open_model", "read_map"]
+__all__ = [
+    "FORMS",
+    "PIL",
+    "Model",
+    "ModelError",
+    "PilModel",
+    "PortMap",
+    "Rig",
+    "model_file",
+    "open_model",
+    "precision",
+    "read_map",
+]

@@ -112,6 +112,8 @@ class DllModel:
         UserError: it cannot be loaded, has not the interface, or its ports do not fit.
     """
 
+    real = "float64"
+
     def __init__(self, path: Path, ports: PortMap, T_s: float, inner: bool) -> None:
         where = path.name
         try:

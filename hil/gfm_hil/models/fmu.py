@@ -29,6 +29,8 @@ class FmuModel:
         UserError: FMPy is missing, it cannot read the file, or the ports do not fit.
     """
 
+    real = "float64"
+
     def __init__(self, path: Path, ports: PortMap, T_s: float, inner: bool) -> None:
         need("fmpy", "FMPy", f"controller fmu:{path.name}", "fmu")
         import fmpy

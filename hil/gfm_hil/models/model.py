@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,13 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.models.ports import PortMap
 from gfm_plant import Bases
 
+if TYPE_CHECKING:
+    from gfm_hil.models.pil import PilModel
+
+PIL = "pil:"
 KINDS = ("dll", "fmu", "c")
-_FORMS = "dll:FILE, fmu:FILE or c:FILE"
+_FILES = "dll:FILE, fmu:FILE or c:FILE"
+FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 
@@ -44,9 +49,11 @@ class Model(Protocol):
 
     Attributes:
         name: what the run calls it: 1 to 64 printable ASCII characters.
+        real: float64 or float32, for the laws that the controller's process has beside it.
     """
 
     name: str
+    real: str
 
     def start(self, u: NDArray[np.float64]) -> None:
         """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
@@ -68,19 +75,25 @@ class Model(Protocol):
         """End it, and remove what it left."""
 
 
-def open_model(text: str, ports: PortMap, rig: Rig) -> Model:
-    """The model ``KIND:FILE``.
+def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
+    """The model that ``text`` names.
 
     Args:
-        text: ``dll:FILE``, ``fmu:FILE``, or ``c:FILE`` for a library that has the interface of
-            ``gfmhil_controller.h``.
+        text: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` for a library that has the interface of
+            ``gfmhil_controller.h``, or ``pil:TARGET`` for the run's own laws.
         ports: which signal each of its ports is.
         rig: what it is connected to.
 
     Raises:
         UserError: there is no such file, it is no such model, or its ports do not fit.
     """
-    kind, path = model_file(text)
+    if text.startswith(PIL):
+        from gfm_hil.models.pil import PilModel
+
+        if ports != PortMap():
+            raise UserError(f"controller {text}: has our signals, and takes no map")
+        return PilModel(text.removeprefix(PIL))
+    kind, path = model_file(text, FORMS)
     if kind == "dll":
         from gfm_hil.models.dll import DllModel
 
@@ -94,19 +107,32 @@ def open_model(text: str, ports: PortMap, rig: Rig) -> Model:
     return FmuModel(path, ports, rig.T_s, rig.inner)
 
 
-def model_file(text: str) -> tuple[str, Path]:
-    """The kind and the file of the model ``KIND:FILE``.
+def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
+    """The kind and the file of the model ``KIND:FILE``; ``forms`` is what the message allows.
 
     Raises:
         UserError: there is no such kind or file.
     """
     kind, colon, file = text.partition(":")
     if not colon or kind not in KINDS or not file:
-        raise UserError(f"controller {text!r}: must be {_FORMS}")
+        raise UserError(f"controller {text!r}: must be {forms}")
     path = Path(file).absolute()
     if not path.is_file():
         raise UserError(f"{file}: there is no such file")
     return kind, path
+
+
+def precision(text: str) -> str:
+    """The precision, float64 or float32, of the laws beside the model that ``text`` names.
+
+    Raises:
+        UserError: it is a target that is not there.
+    """
+    if not text.startswith(PIL):
+        return "float64"
+    from gfm_hil.models.pil import PilModel
+
+    return PilModel(text.removeprefix(PIL)).real
 
 
 def run_name(kind: str, model: str) -> str:

@@ -42,6 +42,9 @@ SIGNALS_OF: dict[Role, tuple[str, ...]] = {
     "controller": CONTROLLER_COLUMNS,
 }
 TIMES_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
+#: kept after the times: of a law that runs on a processor in the loop, -1: not counted
+COUNTS_OF: dict[Role, tuple[str, ...]] = {"plant": (), "controller": ("instructions",)}
+INSTRUCTIONS = "controller_instructions"
 _INNER_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_INNER, "controller": CONTROLLER_INNER}
 
 
@@ -57,10 +60,15 @@ def recorded_in(role: Role, width: int) -> tuple[str, ...]:
     )
 
 
+def kept_of(role: Role) -> tuple[str, ...]:
+    """The columns that a role keeps beside its signals, integers: times, and counts after them."""
+    return TIMES_OF[role] + COUNTS_OF[role]
+
+
 def bytes_per_tick(inner: bool = False) -> int:
     """What a tick takes in the parts of a run."""
     signals = [signals_of(role, inner) for role in SIGNALS_OF]
-    return 8 * sum(map(len, [*signals, *TIMES_OF.values()]))
+    return 8 * sum(map(len, [*signals, *map(kept_of, SIGNALS_OF)]))
 
 
 PIECE = 1 << 18  # ticks of a column that a reader holds in memory at a time
@@ -206,9 +214,10 @@ def _table() -> dict[str, Described]:
         Described("limited", "", "", "whether the inner stage limits the current", "",
                   ((0, "no"), (1, "yes"))),
         *(_time(role, name) for role, times in TIMES_OF.items() for name in times),
+        Described(INSTRUCTIONS, "", "", "instructions of a step on a processor in the loop"),
     ]  # fmt: skip
     found = {row.name: row for row in rows}
-    times = [f"{role}_{name}" for role, names in TIMES_OF.items() for name in names]
+    times = [f"{role}_{name}" for role in TIMES_OF for name in kept_of(role)]
     inner = (*PLANT_INNER, *CONTROLLER_INNER)
     return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *inner, *times)}
 

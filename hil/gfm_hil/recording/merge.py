@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import CONTROLLER_COLUMNS, TIMES_OF, recorded_in
+from gfm_hil.recording.columns import CONTROLLER_COLUMNS, COUNTS_OF, kept_of, recorded_in
 from gfm_hil.recording.npz import BLOCK, Table, write_npz
 from gfm_hil.recording.parts import Part
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.signals import NY
 
 
-def _rows(file: Path, first: int, last: int) -> NDArray[Any]:
+def _rows(file: Path, first: int, last: int, columns: int | None = None) -> NDArray[Any]:
     """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
-    return np.ascontiguousarray(np.load(file, mmap_mode="r")[first:last].T)
+    return np.ascontiguousarray(np.load(file, mmap_mode="r")[first:last, :columns].T)
 
 
 def _blocks(rows: int) -> Iterator[tuple[int, int]]:
@@ -90,12 +90,19 @@ def _signals(
 
 
 def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[Table]:
-    """The times of each side that recorded some."""
-    for role, names in TIMES_OF.items():
-        file = parts / f"{role}_times.npy"
-        if role in roles and any((_rows(file, a, b) >= 0).any() for a, b in _blocks(done)):
+    """The times of each side that recorded some, and what it counted."""
+    for role, counts in COUNTS_OF.items():
+        if role not in roles:
+            continue
+        file, names = parts / f"{role}_times.npy", kept_of(role)
+        known = np.zeros(len(names), bool)
+        for a, b in _blocks(done):
+            known |= (_rows(file, a, b) >= 0).any(axis=1)
+        if not known[len(names) - len(counts) :].any():
+            names = names[: len(names) - len(counts)]
+        if known.any():
             kinds = {f"{role}_{name}": np.dtype(np.int64) for name in names}
-            yield Table(kinds, done, partial(_rows, file))
+            yield Table(kinds, done, partial(_rows, file, columns=len(kinds)))
 
 
 def laws_used(indices: NDArray[Any]) -> int:

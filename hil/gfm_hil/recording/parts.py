@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import TIMES_OF, bytes_per_tick, recorded_in, signals_of
+from gfm_hil.recording.columns import bytes_per_tick, kept_of, recorded_in, signals_of
 
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
@@ -46,7 +46,7 @@ class Part:
 
         ``inner``: the run has an inner stage, and records its signals.
         """
-        columns, times = signals_of(role, inner), TIMES_OF[role]
+        columns, times = signals_of(role, inner), kept_of(role)
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
@@ -80,7 +80,7 @@ class Part:
         signals, times, progress = arrays
         kinds = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
         known = signals.ndim == 2 and recorded_in(role, signals.shape[1]) != ()
-        widths = known and times.shape[1:] == (len(TIMES_OF[role]),)
+        widths = known and times.shape[1:] == (len(kept_of(role)),)
         whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)
         return Part(*arrays) if whole and 0 <= progress[0] <= len(signals) else None
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines, need
-from gfm_hil.core.roles import OUR_CONTROLLER
+from gfm_hil.core.roles import OUR_CONTROLLER, target_of
 from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
 from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
@@ -216,8 +216,10 @@ def controlled_by(summary: Mapping[str, Any]) -> str:
     """The laws of a run, files without their folders, or what a controller that is not ours calls
     itself."""
     name = summary.get("controller", OUR_CONTROLLER)
-    if name == OUR_CONTROLLER:
-        return " → ".join(Path(law).name for law in summary["laws"])
+    target = target_of(name)
+    if target is not None:
+        laws = " → ".join(Path(law).name for law in summary["laws"])
+        return laws + (f" on {target}" if target else "")
     return name or "a controller that gave no name"
 
 

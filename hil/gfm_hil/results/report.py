@@ -144,6 +144,9 @@ def write_report(
     if summary["round_trip_us"]:
         times = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         facts.append(("round trip [µs]", times))
+    if "instructions" in summary:
+        counts = ", ".join(f"{k} {v}" for k, v in summary["instructions"].items())
+        facts.append(("instructions of a step", counts))
     facts.append(("date, version", f"{summary['date']}, gfmhil {summary['version']}"))
     for machine, found in summary["machines"].items():
         judged = f", doctor: {found['worst']} ({'; '.join(found['findings'])})" if found else ""

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.core.roles import OUR_CONTROLLER, Role
-from gfm_hil.recording.columns import Columns
+from gfm_hil.core.roles import OUR_CONTROLLER, Role, target_of
+from gfm_hil.recording.columns import INSTRUCTIONS, Columns, Rows, pieces
 from gfm_hil.recording.log import Outcome, cause
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.recording.timing import ROUND_TRIP, count_misses
+from gfm_hil.recording.timing import ROUND_TRIP, Spread, count_misses
 from gfm_hil.results.doctor import verdict
 from gfm_hil.results.metrics import event_metrics
 from gfm_hil.results.ripple import remaining_ripple
@@ -128,7 +128,7 @@ def summarise(
         "expected": scenario.expect,
         "unmet": unmet(scenario, outcome, log, done),
         "controller": controller,
-        "laws": laws if controller == OUR_CONTROLLER else [],
+        "laws": laws if target_of(controller) is not None else [],
         "link": scenario.link.type,
         "mode": scenario.mode,
         "T_s": scenario.T_s,
@@ -147,6 +147,8 @@ def summarise(
         "events": events,
         "run": met[0]["run"] if met else None,
     }
+    if INSTRUCTIONS in timing:
+        summary["instructions"] = _instructions(timing[INSTRUCTIONS])
     injected = {role: end["injected"] for role, end in links.items() if "injected" in end}
     if injected:
         summary["injected"] = injected
@@ -160,6 +162,14 @@ def _round_trip(timing: Columns, T_s: float) -> dict[str, float] | None:
     if not timing.keys() >= {*ROUND_TRIP.needs}:
         return None
     return ROUND_TRIP.spread(timing, T_s).percentiles_us() or None
+
+
+def _instructions(counted: Rows) -> dict[str, int]:
+    """The fewest, the median and the most of a tick, of the ticks in which they were counted."""
+    found = Spread.of(piece[piece >= 0] for piece in pieces(counted, 0, len(counted)))
+    return {
+        name: round(found.percentile(q)) for name, q in (("least", 0), ("p50", 50), ("most", 100))
+    }
 
 
 def _trips(

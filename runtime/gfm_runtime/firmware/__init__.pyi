@@ -1,30 +1,39 @@
-from .check import OPTIMISED, TARGETS, Checked, check
+from .check import OPTIMISED, TARGETS, Checked, check, need_tools
 from .dll import build_dll, dll_sources
 from .fmu import FMI, fmu
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
+from .loop import CHANGE, FROM, START, TICK, TO, LoopProgram, build_loop
 from .module import REALS, STYLES, Module, Style, make_modules, sources
 from .schedule import stage_names
 
 __all__ = [
+    "CHANGE",
     "CHECKED",
     "FMI",
+    "FROM",
     "OPTIMISED",
     "REALS",
     "SHIPPED",
+    "START",
     "STYLES",
     "TARGETS",
+    "TICK",
+    "TO",
     "Checked",
     "Golden",
+    "LoopProgram",
     "Module",
     "Style",
     "build_dll",
+    "build_loop",
     "check",
     "dll_sources",
     "export",
     "fmu",
     "golden",
     "make_modules",
+    "need_tools",
     "sources",
     "stage_names",
 ]

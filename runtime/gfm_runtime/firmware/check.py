@@ -20,7 +20,8 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.golden import CHECKED, golden
 from gfm_runtime.firmware.report import read_report
 
-_HARNESS = files("gfm_runtime.firmware").joinpath("harness")
+HARNESS = files("gfm_runtime.firmware").joinpath("harness")
+PROGRAM = "program.elf"
 #: also what CMakeLists.txt gives; sqrt is one instruction without errno
 FLAGS = ("-std=c99", "-ffp-contract=off", "-fno-math-errno")
 OPTIMISED = "-O2"
@@ -46,6 +47,7 @@ class Target:
         link: for the linker.
         machine: QEMU's command, or () for this machine.
         tick_ns: of the clock that counts instructions.
+        real: float32 if that is all that its floating-point unit has.
     """
 
     what: str
@@ -56,33 +58,44 @@ class Target:
     link: tuple[str, ...] = ()
     machine: tuple[str, ...] = ()
     tick_ns: int = 0
+    real: str = "float64"
+
+    @property
+    def run(self) -> list[str]:
+        """The command that runs ``PROGRAM``."""
+        return [*self.machine, *_QEMU, "-kernel", PROGRAM] if self.machine else [f"./{PROGRAM}"]
+
+    def instructions(self, ticks: int) -> int:
+        """How many instructions so many ticks of the clock are."""
+        return round(ticks * self.tick_ns / 2**_SHIFT)
 
 
-def _cortex(cpu: str, fpu: str, machine: str, what: str) -> Target:
+def _cortex(cpu: str, fpu: str, machine: str, what: str, real: str) -> Target:
     return Target(
         what,
         "arm-none-eabi-",
         "gcc",
         "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm",
         (f"-mcpu={cpu}", "-mthumb", f"-mfpu={fpu}", "-mfloat-abi=hard"),
-        ("-nostartfiles", "-T", str(_HARNESS.joinpath("arm.ld")), "-lm"),
+        ("-nostartfiles", "-T", str(HARNESS.joinpath("arm.ld")), "-lm"),
         ("qemu-system-arm", "-machine", machine),
         40,
+        real,
     )
 
 
 TARGETS = {
     "host": Target("this machine, gcc", "", "gcc", "gcc libc6-dev", link=("-lm",)),
     "clang": Target("this machine, clang", "", "clang", "clang libc6-dev", link=("-lm",)),
-    "m4f": _cortex("cortex-m4", "fpv4-sp-d16", "mps2-an386", "Cortex-M4F in QEMU"),
-    "m7": _cortex("cortex-m7", "fpv5-d16", "mps2-an500", "Cortex-M7 in QEMU"),
+    "m4f": _cortex("cortex-m4", "fpv4-sp-d16", "mps2-an386", "Cortex-M4F in QEMU", "float32"),
+    "m7": _cortex("cortex-m7", "fpv5-d16", "mps2-an500", "Cortex-M7 in QEMU", "float64"),
     "rv64": Target(
         "RISC-V rv64gc in QEMU",
         "riscv64-unknown-elf-",
         "gcc",
         "gcc-riscv64-unknown-elf picolibc-riscv64-unknown-elf qemu-system-misc",
         ("-march=rv64gc", "-mabi=lp64d", "-mcmodel=medany", "--specs=picolibc.specs"),
-        ("-nostartfiles", "-T", str(_HARNESS.joinpath("riscv.ld")), "-lm"),
+        ("-nostartfiles", "-T", str(HARNESS.joinpath("riscv.ld")), "-lm"),
         ("qemu-system-riscv64", "-machine", "virt", "-bios", "none"),
         1,
     ),
@@ -126,12 +139,7 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
         LawError: no such folder, a missing tool (the apt package is named), a build that fails, or
             a program that does not end as it should.
     """
-    found, where = read_report(folder), TARGETS[target]
-    for tool in (where.prefix + where.compiler, where.prefix + "size", *where.machine[:1]):
-        if shutil.which(tool) is None:
-            raise LawError(
-                f"target {target}", f"{tool} is not there; apt-get install {where.packages}"
-            )
+    found, where = read_report(folder), need_tools(target)
     rows = golden(found.modules, ticks)
     with tempfile.TemporaryDirectory(prefix="gfmhil-firmware-") as work:
         at = Path(work)
@@ -140,8 +148,10 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
         )
         names = [m.prefix for m in found.modules]
         names += ["gfm"] * (found.style == "records")
-        _build(folder.resolve(), at, where, names, flags)
-        said = _run([*where.machine, *(_QEMU if where.machine else ())], at, bool(where.machine))
+        rest = [folder.resolve() / "selftest.c", Path(str(HARNESS.joinpath("harness.c")))]
+        hooks = ["-DGOLDEN_NO_MAIN", "-DGOLDEN_CLOCK=clock_now"]
+        build(folder.resolve(), at, where, names, [*hooks, *map(str, rest)], flags)
+        said = called(where.run, at)
         out = []
         for k, m in enumerate(found.modules):
             line = re.search(rf"^law {k} (\d+) (\d+) (\d+) (\d+) (\d+)$", said, re.MULTILINE)
@@ -150,8 +160,7 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
             counted, differ, least, most, state = map(int, line.groups())
             instructions = None
             if where.tick_ns:
-                least, most = (round(t * where.tick_ns / 2**_SHIFT) for t in (least, most))
-                instructions = least, most
+                instructions = where.instructions(least), where.instructions(most)
             step = "gfm" if found.style == "records" else m.prefix
             code, constants = _sections(at, where, {step, m.prefix})
             out.append(
@@ -169,20 +178,48 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
         return out
 
 
-def _build(folder: Path, at: Path, where: Target, names: Sequence[str], flags: str) -> None:
+def need_tools(target: str) -> Target:
+    """A target of ``TARGETS`` whose compiler and machine are there.
+
+    Raises:
+        LawError: they are not (the apt packages are named).
+    """
+    where = TARGETS[target]
+    for tool in (where.prefix + where.compiler, where.prefix + "size", *where.machine[:1]):
+        if shutil.which(tool) is None:
+            raise LawError(
+                f"target {target}", f"{tool} is not there; apt-get install {where.packages}"
+            )
+    return where
+
+
+def build(
+    folder: Path,
+    at: Path,
+    where: Target,
+    names: Sequence[str],
+    rest: Sequence[str],
+    flags: str = OPTIMISED,
+) -> None:
+    """Compile the modules ``names`` of a folder, and a program around them, to ``PROGRAM``.
+
+    Args:
+        folder: has the modules' sources.
+        at: where the objects and the program go.
+        where: the target.
+        names: of the modules, without an end.
+        rest: the program's sources, and more for their compiler.
+        flags: more for the compiler.
+
+    Raises:
+        LawError: it does not compile.
+    """
     compiler = [where.prefix + where.compiler, *FLAGS, *where.flags, *shlex.split(flags)]
     own = [str(folder / f"{name}.c") for name in names]
     called([*compiler, "-fstack-usage", f"-I{folder}", "-c", *own], at)
-    rest = [str(folder / "selftest.c"), str(_HARNESS.joinpath("harness.c"))]
-    hooks = ["-DGOLDEN_NO_MAIN", "-DGOLDEN_CLOCK=clock_now"]
-    called([*compiler, "-std=gnu99", *hooks, f"-I{folder}", "-c", *rest], at)
-    objects = [f"{name}.o" for name in (*names, "selftest", "harness")]
-    called([*compiler, *objects, "-o", "check.elf", *where.link], at)
-
-
-def _run(machine: Sequence[str], at: Path, bare: bool) -> str:
-    command = [*machine, "-kernel", "check.elf"] if bare else ["./check.elf"]
-    return called(command, at)
+    called([*compiler, "-std=gnu99", f"-I{folder}", "-c", *rest], at)
+    sources = [*names, *(Path(text).stem for text in rest if text.endswith(".c"))]
+    called([*compiler, *(f"{name}.o" for name in sources), "-o", PROGRAM, *where.link], at)
 
 
 def called(command: Sequence[str], at: Path) -> str:

@@ -1,0 +1,80 @@
+/* The program of a processor in the loop: waits for a request in the file `to`, and answers in the file
+ * `from`. A request is what a tick does first, the number of a law, whether its stage limits, the
+ * references and the measurements; at a start the law's whole state follows. The first answer says
+ * that the program runs; its count is what reading the clock takes. */
+#define GOLDEN_NO_MAIN
+#define GOLDEN_CLOCK clock_now
+#include "selftest.c"
+
+#include "board.h"
+#include "states.h"
+
+enum { TICK, START, CHANGE };
+
+static struct {
+    golden_word what, law, limited;
+    golden_real ref[5], y[GOLDEN_NY];
+} request;
+
+static struct {
+    golden_word result, channel, limited, count;
+    golden_real u[GOLDEN_NU], own[3], bump, i_ref[2];
+} answer;
+
+static golden_real state[STATE_REALS];
+
+/* What the host records of a law after a tick. */
+static void look_at(int law, int k)
+{
+    const view_t now = laws[law].view(k);
+    memcpy(answer.own, now.u, sizeof answer.own);
+#if STAGES
+    memcpy(answer.i_ref, now.stage, sizeof answer.i_ref);
+    answer.limited = (golden_word)now.limited;
+#endif
+    answer.channel = (golden_word)states[law].channel(k);
+}
+
+static int whole(long file, void *at, unsigned long size)
+{
+    unsigned long got = 0, more;
+    while (got < size && (more = board_read(file, (char *)at + got, size - got)) != 0)
+        got += more;
+    return got == size;
+}
+
+int main(void)
+{
+    const long to = board_open("to", 2, BOARD_READ), from = board_open("from", 4, BOARD_WRITE);
+    const unsigned long before = clock_now();
+    int law = 0, k = 0;
+    view_t now;
+    answer.count = (golden_word)ELAPSED(clock_now() - before);
+    board_write(from, &answer, sizeof answer);
+    while (whole(to, &request, sizeof request)) {
+        if (request.what == START) {
+            if (!whole(to, state, sizeof state))
+                break;
+            law = (int)request.law;
+            k = 0;
+            laws[law].init(k);
+            states[law].load(k, state, (int)request.limited);
+            continue;
+        }
+        answer.bump = 0;
+        if (request.what == CHANGE) {
+            now = laws[law].view(k);
+            laws[law].look(k, request.ref, request.y, answer.own);
+            law = (int)request.law;
+            k = 1 - k;
+            laws[law].init(k);
+            laws[law].change(k, request.ref, request.y, answer.own, now.trend NOW_E, &answer.bump);
+        }
+        answer.result = (golden_word)laws[law].step(k, request.ref, request.y, answer.u);
+        answer.count = (golden_word)ELAPSED(golden_elapsed);
+        look_at(law, k);
+        board_write(from, &answer, sizeof answer);
+    }
+    board_end();
+    return 0;
+}

@@ -1,0 +1,128 @@
+"""The program of a processor in the loop: the laws of a run as one program for a target.
+
+It waits for a tick's references and measurements in a pipe, steps the law, and answers in another
+pipe what the law gives and what a run records of it. All words have the size of the law's numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_runtime.firmware.check import HARNESS, Target, build, need_tools
+from gfm_runtime.firmware.folder import selftest
+from gfm_runtime.firmware.module import Module, check_modules, sources
+from gfm_runtime.firmware.stage import SIZE, VARIABLES
+from gfm_runtime.kernel import N_MAX
+from gfm_runtime.signals import NU, NY, carried
+
+#: what a request asks for before its tick: nothing, a change to its law; or to start at a state
+TICK, START, CHANGE = range(3)
+#: the pipes in the program's folder, by which it gets requests and gives answers
+TO, FROM = "to", "from"
+
+
+@dataclass(frozen=True)
+class LoopProgram:
+    """A program, built.
+
+    Attributes:
+        target: where it runs.
+        folder: where it lies, and in which its pipes have to be.
+        request, state, answer: of what goes over the pipes; a state follows each START.
+    """
+
+    target: Target
+    folder: Path
+    request: np.dtype[Any]
+    state: np.dtype[Any]
+    answer: np.dtype[Any]
+
+
+def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path) -> LoopProgram:
+    """Build the program of a target for a run's laws; law k of a request is ``modules[k]``.
+
+    Args:
+        modules: all with y and u of the same signals, in one precision.
+        T_s: sampling time, s.
+        target: one of ``gfm_runtime.firmware.TARGETS``.
+        folder: empty.
+
+    Raises:
+        LawError: a law that C cannot hold, a missing tool (the apt packages are named), or a
+            build that fails.
+    """
+    where = need_tools(target)
+    check_modules(modules)
+    real, stages = modules[0].real, modules[0].stages
+    texts = {**sources(modules, T_s, "unrolled"), **selftest(modules, "unrolled")}
+    for name, text in (texts | {"states.h": _states(modules)}).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    program = str(HARNESS.joinpath("loop.c"))
+    build(folder, folder, where, [m.prefix for m in modules], [program])
+    word = np.dtype(f"i{real.itemsize}")
+    y, u = len(carried("y", stages)), len(carried("u", stages))
+    request = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
+    answer = [("result", word), ("channel", word), ("limited", word), ("count", word)]
+    state = [("x", real, (N_MAX,)), *((name, real, (NU,)) for name in ("offset", "u", "trend"))]
+    return LoopProgram(
+        where,
+        folder,
+        np.dtype([*request, ("y", real, (y,))]),
+        np.dtype([*state, *((name, real, (size,)) for name, size, _ in VARIABLES if stages)]),
+        np.dtype(
+            [
+                *answer,
+                ("u", real, (u,)),
+                ("own", real, (NU,)),
+                ("bump", real),
+                ("i_ref", real, (2,)),
+            ]
+        ),
+    )
+
+
+def _states(modules: Sequence[Module]) -> str:
+    """states.h: what loads a whole state into an instance of a law, and its channel."""
+    stages = modules[0].stages
+    parts = {"x": 0, "offset": N_MAX, "u": N_MAX + NU, "trend": N_MAX + 2 * NU}
+    end = N_MAX + 3 * NU
+    if stages:
+        parts, end = parts | {"stage": end}, end + SIZE
+    lines = [
+        f"enum {{ STATE_REALS = {end} }};",
+        f"#define STAGES {int(stages)}",
+        f"#define NOW_E {', now.e' * stages}",
+    ]
+    for m in modules:
+        lines += [
+            f"static void {m.prefix}_load(int k, const golden_real *from, int limited)",
+            "{",
+            f"    {m.prefix}_t *s = &{m.prefix}_of[k];",
+            *(
+                f"    memcpy(&s->{part}, from + {at}, sizeof s->{part});"
+                for part, at in parts.items()
+            ),
+            "    s->limited = limited;" if stages else "    (void)limited;",
+            "}",
+            f"static int {m.prefix}_channel(int k)",
+            "{",
+            f"    return {m.prefix}_of[k].channel;",
+            "}",
+        ]
+    return "\n".join(
+        [
+            *lines,
+            "static const struct {",
+            "    void (*load)(int k, const golden_real *from, int limited);",
+            "    int (*channel)(int k);",
+            "} states[] = {",
+            *(f"    {{{m.prefix}_load, {m.prefix}_channel}}," for m in modules),
+            "};",
+            "",
+        ]
+    )
