@@ -456,6 +456,8 @@ class _Judge:
         found = self._expected(unit, after, P_0)
         if found is None:
             return self._cannot("its time is not that of an event with an envelope")
+        if not np.isfinite([found.lower, found.upper]).all():
+            return self._cannot(f"its envelope has no finite limits at H = {unit.H:.2g} s")
         # As DyCoV measures: the mean of the last cycle, and the limits are late by a cycle. In the
         # first one the mean is of before and after, and is not judged.
         cycle = whole_ticks(self.width)
