@@ -62,7 +62,7 @@ class Controller:
         real: DTypeLike = np.float64,
         omega_b: float = 100 * math.pi,
     ) -> None:
-        self.T_s, self._omega_b = T_s, omega_b
+        self.T_s, self.omega_b = T_s, omega_b
         self.sets = {s.name: s for s in sets}
         self.asked, self.gains = "", dict[str, float]()
         self.discrete: list[DiscreteLaw] = []
@@ -117,7 +117,7 @@ class Controller:
             self.ctl["stage_X"][0, :n] = [*X[:-1], X_MAX]
             self.ctl["hysteresis"], self.ctl["since"] = schedule.hysteresis, 0
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
-            self.est[:] = make_impedance(self.T_s, schedule.X_0, self._omega_b, schedule.X_f)
+            self.est[:] = make_impedance(self.T_s, schedule.X_0, self.omega_b, schedule.X_f)
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
 
     def retune(self, discrete: DiscreteLaw, packed: NDArray[Any], gains: dict[str, float]) -> int:

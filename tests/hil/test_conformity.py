@@ -679,6 +679,21 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
     assert other.verdict == CANNOT and "not that of an event" in other.text
 
 
+def test_an_envelope_without_finite_limits_is_no_verdict() -> None:
+    """Of a unit almost without inertia: limits that are no numbers let any p pass."""
+    scenario = Scenario.model_validate(
+        {
+            "title": "ramp", "duration": 4.0, "link": {"type": "inproc"},
+            "plant": {"grid": {"scr": 3.0, "x_over_r": 6.0}},
+            "events": [{"t": 1.0, "type": "grid-frequency", "f_hz": 49.0, "rate": 1.0}],
+        }
+    )  # fmt: skip
+    unit = Declared(D=100.0, H=1e-9, X_eff=0.27)
+    under = UNDER.model_copy(update={"unit": unit})
+    (found,) = judge(run_of(scenario, p=np.full(40_000, 0.5)), [one("in_envelope")], under)
+    assert found.verdict == CANNOT and "no finite limits at H = 1e-09 s" in found.text
+
+
 def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
     lab: Path,
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -10,10 +11,15 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.inproc import run_inproc
+from gfm_hil.engine.retune import ready_gains
+from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
 from gfm_hil.results.runner import run_scenario
+from gfm_hil.scenario.model import check_scenario
+from gfm_runtime import load_law
+from gfm_runtime.inner import INNER_CONSTANTS
 
 from ..support.laws import every_law, home_plant
 
@@ -189,6 +195,24 @@ def test_a_law_file_may_bear_any_name(run, tmp_path):
     )  # fmt: skip
     assert done.summary["laws"] == ["vsg-2", str(path), "vsg-2"]
     assert max(done.summary["bump_pu"]) <= 1e-6
+
+
+def test_gains_change_at_the_converters_own_frequency(tmp_path):
+    """The constants of an inner stage depend on omega_b, which other gains do not change."""
+    paper = resources.files("gfm_plant") / "converters" / "paper.toml"
+    text = paper.read_text("utf-8").replace("314.1592653589793", "376.99111843077515")
+    (tmp_path / "sixty.toml").write_text(text)
+    content = {"title": "60 Hz", "duration": 0.1, "law": "vsg-2", "inner": "virtual-stator"}
+    content |= {"plant": {"converter": str(tmp_path / "sixty.toml")}, "link": {"type": "inproc"}}
+    scenario = check_scenario(content, "")
+    controller = make_bench(scenario).controller
+    assert controller.omega_b == pytest.approx(120 * math.pi)
+    same = load_law("vsg-2").laws[0].parameters["D_p"].value
+    (packed,) = ready_gains(controller, {"D_p": same})[1]
+    own = controller.laws[0]
+    assert {name: packed[name] for name in INNER_CONSTANTS} == {
+        name: own[name] for name in INNER_CONSTANTS
+    }
 
 
 def test_changing_to_the_law_in_force_changes_nothing(run):

@@ -27,7 +27,7 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.rate import Rate
 from gfm_hil.core.roles import Role
 from gfm_hil.engine.announcement import LARGEST, SCHEME, announcement
-from gfm_hil.engine.retune import retuned
+from gfm_hil.engine.retune import ready_gains
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.scenario.events import (
@@ -165,8 +165,7 @@ class CommandServer:
             raise ValueError(f"law = {event.law!r}: not made ready for this run; {known}")
         c = self._bench.controller
         if isinstance(event, Gains):
-            gains = {**c.gains, **event.values}
-            retuned(c.asked, tuple(sorted(gains.items())), c.T_s, c.sets[c.asked].inner)
+            ready_gains(c, event.values)
         if isinstance(event, Reset) and self._bench.scenario.after_trip == "end":
             raise ValueError("reset: this run ends at a trip; after_trip = 'wait' in its scenario")
         if ours == "plant":

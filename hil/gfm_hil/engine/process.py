@@ -110,7 +110,9 @@ def _stepped(model: Model | PilModel, bench: Bench) -> SteppedModel:
     elif scenario.mode == "realtime":
         raise UserError(f"mode = 'realtime': {model.name} keeps no time; choose --mode lockstep")
     try:
-        return SteppedModel(model, bench.controller, bench.u, gains_of(scenario))
+        return SteppedModel(
+            model, bench.controller, bench.u, gains_of(scenario, bench.controller.omega_b)
+        )
     except ModelError as problem:
         raise UserError(str(problem)) from None
 

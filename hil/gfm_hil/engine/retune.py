@@ -20,11 +20,12 @@ Retuned = tuple[DiscreteLaw, NDArray[Any]]
 
 
 @lru_cache(maxsize=64)
-def retuned(name: str, gains: Gains, T_s: float, inner: str | None = None) -> Retuned:
+def retuned(name: str, gains: Gains, T_s: float, omega_b: float, inner: str | None) -> Retuned:
     """A law with some gains changed, discretised, and packed for the kernel.
 
     A gain that the law file ties to a changed one follows it unless it is given too. The newest
-    results are cached: the command server's check prepares what the loop then uses.
+    results are cached: the command server's check prepares what the loop then uses. ``omega_b`` is
+    that of the converter, rad/s, for an inner stage.
 
     Raises:
         ValueError: a scheduled law, a name that its file does not have, or no such law.
@@ -35,7 +36,7 @@ def retuned(name: str, gains: Gains, T_s: float, inner: str | None = None) -> Re
             raise LawError(f"law {name}", "is scheduled: its gains change by themselves")
         (law,) = load_law(name, inner, **tied(file, dict(gains))).laws
         discrete = discretise(law, T_s)
-        return discrete, pack_law(discrete)
+        return discrete, pack_law(discrete, omega_b=omega_b)
     except LawError as problem:
         raise ValueError(str(problem)) from None
 
@@ -61,4 +62,4 @@ def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
     gains = {**controller.gains, **values}
     name = controller.asked
     inner = controller.sets[name].inner
-    return retuned(name, tuple(sorted(gains.items())), controller.T_s, inner)
+    return retuned(name, tuple(sorted(gains.items())), controller.T_s, controller.omega_b, inner)

@@ -155,7 +155,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         told = start.commands[: len(carried("u", inner))].copy()
         bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told)
         bench.keep()
-        gains_of(one)
+        gains_of(one, controller.omega_b)
         benches.append(bench)
     return benches
 
@@ -173,8 +173,9 @@ def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:
     )
 
 
-def gains_of(scenario: Scenario) -> list[Retuned]:
-    """Every change of gains that the scenario names, prepared before it runs.
+def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
+    """Every change of gains that the scenario names, prepared before it runs; ``omega_b`` as for
+    ``retuned``.
 
     Raises:
         UserError: a change that is not possible.
@@ -188,9 +189,8 @@ def gains_of(scenario: Scenario) -> list[Retuned]:
         elif isinstance(event, Gains):
             gains.update(event.values)
             try:
-                found.append(
-                    retuned(name, tuple(sorted(gains.items())), scenario.T_s, scenario.inner)
-                )
+                given = tuple(sorted(gains.items()))
+                found.append(retuned(name, given, scenario.T_s, omega_b, scenario.inner))
             except ValueError as problem:
                 raise UserError(f"events, {event.label()}: {problem}") from None
     return found
