@@ -17,7 +17,7 @@ from scipy.io import loadmat
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER, TABLE, describe
+from gfm_hil.recording.columns import CONTROLLER_INNER, INSTRUCTIONS, PLANT_INNER, TABLE, describe
 from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.export import FORMATS, export_run
 from gfm_hil.results.runner import run_scenario
@@ -52,8 +52,8 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def test_the_table_has_every_column_of_the_recording(table):
-    inner = {*PLANT_INNER, *CONTROLLER_INNER}
-    assert list(table.recorded) == [name for name in TABLE if name not in inner]
+    absent = {*PLANT_INNER, *CONTROLLER_INNER, INSTRUCTIONS}  # of a stage, and of a processor
+    assert list(table.recorded) == [name for name in TABLE if name not in absent]
     assert len({len(x) for x in table.recorded.values()}) == 1
     assert table.recorded["plant_received"].min() > 0
 
@@ -62,7 +62,7 @@ def test_every_column_is_described():
     for name in [*TABLE]:
         column = describe(name, ["a", "b"])
         assert column.comment
-        assert bool(column.unit) != (bool(column.words) or name == "tick")
+        assert bool(column.unit) != (bool(column.words) or name in ("tick", INSTRUCTIONS))
     assert describe("y_p", []).unit == "p.u. (S_n)"
     assert describe("law", ["a", "b"]).words == ((0, "a"), (1, "b"))
 

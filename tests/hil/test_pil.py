@@ -18,7 +18,7 @@ import pytest
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.models import PortMap, open_model
+from gfm_hil.models import PortMap, Rig, open_model
 from gfm_hil.results import runner
 from gfm_hil.results.run import Run
 from gfm_hil.scenario.model import find_scenario, load_scenario
@@ -229,11 +229,11 @@ def test_a_missing_tool_and_a_wrong_target_are_named(
     with pytest.raises(
         UserError, match=r"pil:m3: must be pil: and one of host, clang, m4f, m7, rv"
     ):
-        open_model("pil:m3", PortMap(), 1e-4, False)
+        open_model("pil:m3", PortMap(), Rig())
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(
         UserError, match=r"m4f: arm-none-eabi-gcc is not there; apt-get install gcc"
     ):
-        open_model("pil:m4f", PortMap(), 1e-4, False)
+        open_model("pil:m4f", PortMap(), Rig())
     with pytest.raises(UserError, match=r"pil:m4f: has our signals, and takes no map"):
-        open_model("pil:m4f", PortMap(fixed={"i_u": 0.5}), 1e-4, False)
+        open_model("pil:m4f", PortMap(fixed={"i_u": 0.5}), Rig())
