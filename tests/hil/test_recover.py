@@ -306,10 +306,10 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
 
 
 def test_a_role_whose_log_cannot_be_written_ends_both(small_disk, start, tmp_path):
-    events = [{"type": "reference", "tick": 100 * k, "P_ref": 0.5} for k in range(1, 120)]
+    events = [{"type": "reference", "tick": 100 * k, "P_ref": 0.5} for k in range(1, 110)]
     scenario = write(
         tmp_path,
-        duration=1.2,
+        duration=1.1,
         events=events,
         mode="realtime",
         late_policy={"hold": 10**6},
