@@ -837,3 +837,10 @@ def test_a_report_as_the_command_writes_it_is_read_again(
     error = capsys.readouterr().err
     assert "old/results.json: is no results.json" in error and error.count("\n") == 1
     assert main(["conform", "diff", str(lab), str(lab.parent / "new"), "--share", "2"]) == 2
+
+
+def test_the_list_is_also_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conform", "--against", "miso", "--list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [row["test"] for row in listed] == [case.id for case in load_cases(["miso"])]
+    assert all(row["runs"] > 0 and row["title"] and row["source"] for row in listed)

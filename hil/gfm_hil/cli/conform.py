@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
@@ -96,7 +97,10 @@ def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
     cases = load_cases(options.against or [ALL])
     if options.list:
-        terminal().print(_list(cases))
+        if options.json:
+            print(json.dumps([_plain(case) for case in cases], indent=2))
+        else:
+            terminal().print(_list(cases))
         return 0
     if not options.law and options.controller is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
@@ -176,6 +180,11 @@ def _diff(options: argparse.Namespace) -> int:
 
 def _names(law: str) -> Sequence[str]:
     return law_names() if law == ALL else [law]
+
+
+def _plain(case: Case) -> dict[str, Any]:
+    runs, source = len(case.test.runs()), case.test.source.words()
+    return {"test": case.id, "runs": runs, "title": case.test.title, "source": source}
 
 
 def _list(cases: Sequence[Case]) -> Table:
