@@ -84,11 +84,8 @@ def event_metrics(
     beyond = slow_high - final if step > 0 else final - slow_low
     nadir, top, slope = _frequency(f, start, stop, max(1, round(ROCOF_WINDOW / T_s)))
     # a controller of phase voltages commands a frame of constant speed, which is no frequency
-    tells = (
-        nadir != top or not np.isnan(signals["law"][start : start + 1][0])
-        if "law" in signals
-        else True
-    )
+    has_law = "law" not in signals or not np.isnan(signals["law"][start : start + 1][0])
+    tells = has_law or nadir != top
     v_low, v_high = _extremes(pieces(V, start, stop))
     free = start + lasts if stop - start - lasts >= _FEW else start
     first = p[free : min(stop, free + round(LONGEST / T_s))]

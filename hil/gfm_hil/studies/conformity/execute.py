@@ -158,9 +158,13 @@ def make_jobs(
     figures: bool,
     foreign: Foreign | None = None,
 ) -> list[Job]:
-    """A job for each part of each test under each law, and then under the model; ``laws`` are files
-    by name, of which the first one, or else that of a scenario without a law, also says where the
-    model begins. The rest is as for ``Job``."""
+    """A job for each part of each test under each law, and then under the model.
+
+    Args:
+        laws: files by name. The model begins at the operating point of the first one, or, without
+            laws, of the law that a scenario has by default.
+        cases, inner, under, converters, folder, figures, foreign: as for ``Job``.
+    """
     each: list[tuple[str, str, Foreign | None]] = [(*law, None) for law in laws.items()]
     if foreign is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
