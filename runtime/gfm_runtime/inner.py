@@ -5,7 +5,8 @@ produces E_u itself, as in the paper. With one, the measured currents and voltag
 (i, v, i_o in the converter's dq frame) and E = E_u + j 0 give the bridge's voltage e = e_d + j e_q:
 
 * ``virtual-stator``: a reference current behind a virtual impedance,
-  (X_v/omega_b) di*/dt = E - v - (R_v + j omega X_v) i*, which the limit cuts, then a current loop;
+  (X_v/omega_b) di/dt = E - v - (R_v + j omega X_v) i, which the limit cuts to i*, then a current
+  loop;
 * ``cascaded``: a PI voltage loop around v* = E - (R_v + j omega X_v) i_o gives i*, which the limit
   cuts, then the current loop;
 * ``threshold-impedance``: as ``cascaded``, and beyond the threshold v* falls by
@@ -14,7 +15,11 @@ produces E_u itself, as in the paper. With one, the measured currents and voltag
 The current loop is e = v_f + (k_c + k_ci/s) (i* - i) + j omega L_f i with the low-pass filtered
 voltage v_f, and |e| <= m v_dc. Around them: a power limiter that lowers (raises) omega_u while p is
 above P_max (below P_min), a frequency measurement (PLL) that replaces the reference omega_g of
-column 3, and the freeze of the E_u row's states while the current is limited.
+column 3, and the freeze of the E_u row's states where they would lead further into the limit.
+
+The stator's own current is not cut. If it were, the cut would act like a resistance in series with
+the virtual impedance: the limited current would come in phase with E - v, and after a large jump of
+the grid's angle carry no power that could bring the angle back.
 
 Sources: the structures are those of Paquette and Divan (IEEE Trans. Ind. Appl. 51(2), 2015:
 virtual impedance current limiting), Qoria et al. (IEEE Open Access J. Power Energy 7, 2020:
@@ -69,7 +74,8 @@ class Inner:
             (threshold-impedance).
         f_i: bandwidth of the low-pass on i, Hz (threshold-impedance).
         m: limit of |e| over v_dc, p.u.; infinite for none.
-        freeze: hold the states of the E_u row while the current is limited.
+        freeze: while the current is limited, hold the states of the E_u row if they would move E_u
+            further away from v_d.
         P_max, P_min: where the power limiter begins, p.u.; infinite for none.
         k_P, k_Pi: the power limiter, p.u. of omega_u per p.u. of power, and 1/s.
         f_pll: bandwidth of the PLL that measures omega_g for column 3, Hz; 0 for none.
@@ -97,7 +103,7 @@ class Inner:
     freeze: bool = True
     P_max: float = math.inf
     P_min: float = -math.inf
-    k_P: float = 0.2
+    k_P: float = 0.1
     k_Pi: float = 5.0
     f_pll: float = 0.0
 
@@ -208,8 +214,8 @@ def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
         ("i_ref", f, (2,)),
         ("v_f", f, (2,)),
         ("i_f", f, (2,)),
-        ("x_c", f, (2,)),  # integrals of the current and of the voltage loop
-        ("x_v", f, (2,)),
+        ("x_c", f, (2,)),  # integral of the current loop
+        ("x_v", f, (2,)),  # that of the voltage loop, or the virtual stator's current
         ("away", f, (2,)),  # voltage left by a bumpless change, decays
         ("e", f, (2,)),
         ("omega", f),  # omega_u after the power limiter
@@ -294,11 +300,12 @@ def _stator(law, state, E_d, E_q):
     m = state.m
     b = state.omega * law.half_turn
     keep, lose = law.one - law.stator_a, law.one + law.stator_a
-    d, q = state.i_ref[0], state.i_ref[1]
+    d, q = state.x_v[0], state.x_v[1]
     r_d = keep * d + b * q + law.stator_b * (E_d - m[V_D])
     r_q = keep * q - b * d + law.stator_b * (E_q - m[V_Q])
     size = lose * lose + b * b
-    state.i_ref[0], state.i_ref[1] = (r_d * lose + r_q * b) / size, (r_q * lose - r_d * b) / size
+    state.x_v[0], state.x_v[1] = (r_d * lose + r_q * b) / size, (r_q * lose - r_d * b) / size
+    state.i_ref[0], state.i_ref[1] = state.x_v[0], state.x_v[1]
     _limit_current(law, state)
 
 
@@ -428,6 +435,7 @@ def settle_inner(law, state, u, e_d, e_q):
             state.i_ref[0] += lack_d / law.k_c
             state.i_ref[1] += lack_q / law.k_c
         through_d, through_q = state.i_ref[0], state.i_ref[1]
+        state.x_v[0], state.x_v[1] = through_d, through_q
         drop_d, drop_q = law.one - law.one, law.one - law.one
         if law.inner != STATOR:
             drop_d, drop_q = _drop(law, state)

@@ -28,14 +28,16 @@ class PowerLimiter(Table):
 
     P_max: Number = Field(description="p.u.")
     P_min: Number = Field(description="p.u.")
-    k_p: Number = Field(0.2, description="p.u. of omega_u per p.u. of power")
+    k_p: Number = Field(0.1, description="p.u. of omega_u per p.u. of power")
     k_i: Number = Field(5.0, description="1/s")
 
 
 class _Stage(Table):
     m: Number = Field(SPACE_VECTOR, description="limit of abs(e) over v_dc, p.u.")
     freeze: bool = Field(
-        True, description="hold the states of the law's E_u row while the current is limited"
+        True,
+        description="while the current is limited, hold the states of the law's E_u row if they "
+        "would move E_u further away from v_d",
     )
     power: PowerLimiter | None = Field(None, description="power limiter; none if not given")
     f_pll: Number = Field(

@@ -188,6 +188,12 @@ def advance(law, state):
             a += law.A[i, j] * state.x[j]
         state.x_next[i] = a
     frozen = law.freeze != 0 and state.limited != 0
+    if frozen:  # a move of E_u towards v lets the current leave its limit
+        move = law.one - law.one
+        for i in range(n):
+            if law.row[i] == 2:
+                move += law.C[2, i] * (state.x_next[i] - state.x[i])
+        frozen = move * (state.u[2] - state.v_f[0]) > 0
     for i in range(n):
         if not (frozen and law.row[i] == 2):
             state.x[i] = _faded(state.x_next[i])

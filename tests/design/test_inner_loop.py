@@ -64,7 +64,7 @@ class Kernel:
 
     def places(self) -> list[tuple[str, int]]:
         """Where the states of ``LinearStage.states`` are kept; an angle has no place of its own."""
-        short = {"v_f": "v_f", "i*": "i_ref", "x_v": "x_v", "x_c": "x_c"}
+        short = {"v_f": "v_f", "i*": "x_v", "x_v": "x_v", "x_c": "x_c"}
         assert self.loop.stage is not None
         names = [name.split()[0] for name in self.loop.stage.states]
         both = [name for name in names if name in short]

@@ -170,8 +170,15 @@ class Unrolled:
             [i for i in range(n) if law["row"][i] == 2] if self._inner and law["freeze"] else []
         )
         lines += [f"s->x[{i}] = faded(x{i});" for i in range(n) if i not in frozen]
-        if frozen:
-            lines += ["if (!s->limited) {", *(f"    s->x[{i}] = faded(x{i});" for i in frozen), "}"]
+        if frozen:  # a move of E_u towards v lets the current leave its limit
+            moves = [
+                self._product(law["C"][2, i], f"(x{i} - s->x[{i}])")
+                for i in frozen
+                if law["C"][2, i] != 0
+            ]
+            away = f"({_sum(moves) or self._zero}) * (t->u[2] - s->stage.v_f[0]) > {self._zero}"
+            lines += [f"if (!(s->limited && {away})) {{"]
+            lines += [*(f"    s->x[{i}] = faded(x{i});" for i in frozen), "}"]
         return lines
 
     def _set_states(self) -> list[str]:

@@ -58,6 +58,10 @@ static void advance(const gfm_law_t *law, gfm_t *s, const tick_t *t)
 {
     real next[GFM_NX];
     int i, j;
+/* @if stages@ */
+    real move = @0@;
+    int frozen;
+/* @end@ */
     for (i = 0; i < @N_ROWS@; i++) {
         real excess = t->u[i] - t->raw[i];
 /* @if stages@ */
@@ -87,9 +91,18 @@ static void advance(const gfm_law_t *law, gfm_t *s, const tick_t *t)
         }
         next[i] = a;
     }
+/* @if stages@ */
+    for (i = 0; i < law->n; i++) {
+        if (law->row[i] == 2) {
+            move += law->C[2][i] * (next[i] - s->x[i]);
+        }
+    }
+    /* a move of E_u towards v lets the current leave its limit */
+    frozen = (law->freeze && s->limited && move * (s->u[2] - s->stage.v_f[0]) > @0@) ? 1 : 0;
+/* @end@ */
     for (i = 0; i < law->n; i++) {
 /* @if stages@ */
-        if (!(law->freeze && s->limited && law->row[i] == 2)) {
+        if (!(frozen && law->row[i] == 2)) {
             s->x[i] = faded(next[i]);
         }
 /* @else@ */

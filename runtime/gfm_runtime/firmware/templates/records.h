@@ -18,7 +18,7 @@ typedef struct {
     gfm_real E_r[GFM_NX][GFM_NREF], E_y[GFM_NX][@N_COLUMNS@], F[GFM_NX][@N_ROWS@], G[GFM_NX][@N_ROWS@];
 /* @if stages@ */
     int inner, priority; /* @KINDS@ */
-    int freeze;          /* whether the states of E_u keep their values while the current is limited */
+    int freeze;          /* whether the states of E_u may not lead further into the limit of the current */
     int row[GFM_NX]; /* of u that each state belongs to */
     gfm_real @CONSTANTS@;
 /* @end@ */

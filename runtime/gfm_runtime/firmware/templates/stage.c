@@ -86,12 +86,14 @@ static void stator(@LAW@@P@_t *s, const tick_t *t, const real y[], real E_d, rea
 {
     const real *v = &y[@GUARD@_Y_V_D];
     real b = t->omega * @half_turn@, keep = @1@ - @stator_a@, lose = @1@ + @stator_a@;
-    real d = s->stage.i_ref[0], q = s->stage.i_ref[1];
+    real d = s->stage.x_v[0], q = s->stage.x_v[1];
     real r_d = keep * d + b * q + @stator_b@ * (E_d - v[0]);
     real r_q = keep * q - b * d + @stator_b@ * (E_q - v[1]);
     real size = lose * lose + b * b;
-    s->stage.i_ref[0] = (r_d * lose + r_q * b) / size;
-    s->stage.i_ref[1] = (r_q * lose - r_d * b) / size;
+    s->stage.x_v[0] = (r_d * lose + r_q * b) / size;
+    s->stage.x_v[1] = (r_q * lose - r_d * b) / size;
+    s->stage.i_ref[0] = s->stage.x_v[0];
+    s->stage.i_ref[1] = s->stage.x_v[1];
     limit_current(@law@s);
 }
 

@@ -35,6 +35,8 @@ static void settle_stage(@LAW@@P@_t *s, const real u[], const real y[], const re
         /* @end@ */
         through_d = s->stage.i_ref[0];
         through_q = s->stage.i_ref[1];
+        s->stage.x_v[0] = through_d;
+        s->stage.x_v[1] = through_q;
         /* @if voltage@ */
             const real *i_o = &y[@GUARD@_Y_I_OD];
             real B = u[1] * @C_f@;
