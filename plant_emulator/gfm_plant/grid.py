@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from gfm_plant.circuit import GROUND
 from gfm_plant.emulator import reconnect, synchronise
 from gfm_plant.model import DELTA
+from gfm_plant.names import FAULTED_PHASES
 from gfm_plant.network import Network
 from gfm_plant.synchro_check import NONE, TIME_OVER, WATCHING
 from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, Wiring
@@ -85,23 +86,48 @@ def fault(
     duration: float | None = None,
     line: str | None = None,
     node: str | None = None,
+    kind: str = "3ph",
+    phases: str | None = None,
+    Z_0: complex | None = None,
 ) -> None:
-    """Short the three phases to ground through `R`.
+    """Short phases through `R`: all three or one (LG) or two (LLG) of them to ground, or two (LL).
+
+    An unbalanced fault couples positive and negative sequence. The plant solves it exactly too, see
+    `gfm_plant.circuit`.
 
     Args:
         plant: The plant.
         position: Place on the line: 0 at its start, the filter capacitor, 1 at its end; None: at a
             node.
-        R: Resistance of the fault, p.u. of the first converter; > 0 at a capacitor.
+        R: Resistance from each phase to ground, or between the two phases of an LL fault, p.u. of
+            the first converter; > 0 at a capacitor.
         duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
         line: Name of the line, or of the converter whose line it is; None: the first converter.
         node: The node.
+        kind: "3ph", "LG", "LL" or "LLG".
+        phases: The phases that an unbalanced fault connects; None: a, of two phases b and c.
+        Z_0: Impedance R + jX, X at nominal frequency, between the place and ground for the zero
+            sequence of LG and LLG, p.u. of the first converter; None: that of the closed lines
+            between the place and the grid, with their own L and R.
 
     Raises:
-        ValueError: If there is no such place, or a value is out of range. The plant is then
+        ValueError: If there is no such place or kind, or a value is out of range. The plant is then
             unchanged.
     """
     wiring = plant.wiring
+    if kind not in FAULTED_PHASES:
+        raise ValueError(f"kind = {kind!r}: must be one of {list(FAULTED_PHASES)}")
+    phases = FAULTED_PHASES[kind][0] if phases is None else phases
+    if phases not in FAULTED_PHASES[kind]:
+        allowed = list(FAULTED_PHASES[kind])
+        raise ValueError(f"phases = {phases!r}: must be one of {allowed} for kind {kind!r}")
+    if Z_0 is not None:
+        if kind not in ("LG", "LLG"):
+            raise ValueError(
+                f"X_0, R_0: no current of kind {kind!r} goes to ground; leave them out"
+            )
+        _require("X_0", Z_0.imag, Z_0.imag >= 0, ">= 0 p.u.")
+        _require("R_0", Z_0.real, Z_0.real >= 0, ">= 0 p.u.")
     if position is not None:
         _require("position", position, 0 <= position < 1, "in [0, 1)")
         lines = wiring.named_lines()
@@ -122,7 +148,13 @@ def fault(
     _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    plant.rewire(replace(wiring, fault=FaultPlace(node, inside, position, R)))
+    changed = replace(wiring, fault=FaultPlace(node, inside, position, R, kind, phases, Z_0))
+    if kind in ("LG", "LLG") and changed.zero_sequence() is None:
+        raise ValueError(
+            f"X_0: not set, and no closed line leads from {where} to the grid, whose star point is"
+            f" earthed; an {kind} fault needs a path to ground"
+        )
+    plant.rewire(changed)
     plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
     reconnect(plant.records)
 

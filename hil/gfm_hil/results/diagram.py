@@ -277,4 +277,4 @@ def _fault(
     _wire(axes, *((x + a, y + b) for a, b in flash), colour=_RED)
     axes.plot([x], [y], "v", ms=5, color=_RED, zorder=4)
     t = event.at(scenario.T_s) * scenario.T_s
-    axes.text(x + 0.26, y + 0.5, f"fault, {t:g} s", fontsize=7.5, color=_RED)
+    axes.text(x + 0.26, y + 0.5, f"{event.what}, {t:g} s", fontsize=7.5, color=_RED)
