@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from gfm_plant import clear_fault, fault, grid_impedance, phase_jump
+from gfm_plant import clear_fault, fault, grid_impedance, grid_unbalance, phase_jump
 from gfm_plant.grid import breaker
 from gfm_plant.solution import I_F, I_O, V
 
@@ -230,7 +230,9 @@ def test_two_phases_to_an_ideal_ground_are_all_three(rest: Callable[..., Any]) -
         plant = rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF)
         plant.advance(13)
         fault(plant.plant, 0.4, 0.0, duration=0.015, **more)
-        plant.advance(100)
+        plant.advance(50)
+        grid_unbalance(plant.plant, (1.0, 0.6, 0.8j), duration=0.008)
+        plant.advance(50)
         phase_jump(plant.plant, 15.0)
         plant.advance(200)
         found.append(plant.st["x"][0].copy())
