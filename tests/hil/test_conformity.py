@@ -23,6 +23,7 @@ from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
+from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, judge_nfp, worst
 from gfm_hil.studies.conformity.model import Criterion, Declared, Nfp, Part
@@ -34,8 +35,10 @@ from gfm_hil.studies.conformity.sets import (
     scenario_of,
     shipped_sets,
 )
+from gfm_hil.studies.envelopes import measure_unit
 from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
+from gfm_plant.options import Grid
 
 from ..support.firmware import cc
 
@@ -260,36 +263,51 @@ def test_a_window_that_cannot_be_judged_says_why(ramp: Scenario) -> None:
         assert found.verdict == CANNOT and why in found.text
 
 
-@pytest.mark.parametrize("scr", [3.0, 10.0])
-def test_the_peak_after_a_jump_is_that_of_the_closed_form(scr: float, tmp_path: Path) -> None:
-    """dP = V^2 sin(theta) / (X_p + 1/SCR), with X_p of the filter inductor alone.
-
-    The law turns its voltage back meanwhile: by 1 % droop behind its low-pass of 0.167 s, less
-    than 3 % in the cycle of the mean. The filter capacitor and what is left of the resistances
-    account for the rest of the tolerance.
-    """
-    content = f"""
-title = "closed form"
-f_n = 50.0
-source = {{ document = "here", clause = "closed form", revision = "1", known = "own" }}
-[scenario]
-duration = 1.0
-references = {{ P_ref = 0.0 }}
-plant = {{ factors = {{ R_f = 0.0 }}, grid = {{ scr = {scr}, x_over_r = 1000.0 }} }}
-events = [{{ t = 0.5, type = "grid-phase-jump", degrees = -10.0 }}]
-[[criteria]]
-kind = "peak_delta_p"
-clause = "closed form"
-least = 0.1
-direction = "up"
+SWING = """
+name = "swing"
+title = "A swing equation at a constant voltage"
+source = "2 H dw/dt = P_ref - p - D (w - 1)"
+phi.22 = {{ type = "IF", k = "1 / D", T = "2 * H / D" }}
+parameters.D = {{ value = {D}, unit = "p.u.", source = "here" }}
+parameters.H = {{ value = {H}, unit = "s", source = "here" }}
 """
-    (tmp_path / "jump.toml").write_text(content)
-    (case,) = load_cases([str(tmp_path)])
-    scenario = scenario_of(case, case.test.runs()[0], UNDER, "droop-3", None, tmp_path)
+
+
+@pytest.mark.parametrize(("D", "H", "scr"), [(50.0, 4.0, 3.0), (20.0, 5.0, 3.0), (100.0, 8.0, 5.0)])
+def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_come_back(
+    D: float, H: float, scr: float, tmp_path: Path
+) -> None:
+    """dP = V^2 sin(theta) / (X_p + 1/SCR), with X_p of the filter inductor alone. The circuit has
+    next to no capacitor, and the resistance that lets the line's own mode decay.
+    """
+    swing = tmp_path / "swing.toml"
+    swing.write_text(SWING.format(D=D, H=H))
+    plant = {
+        "factors": {"R_f": 0.0, "C_f": 0.01},
+        "grid": {"scr": scr, "x_over_r": 100.0},
+        "dc_source": {"mode": "regulated"},
+    }
+    content = {
+        "title": "closed form", "f_n": 50.0,
+        "source": {"document": "here", "clause": "closed form", "revision": "1", "known": "own"},
+        "scenario": {
+            "duration": 1.0, "references": {"P_ref": 0.0}, "plant": plant,
+            "events": [{"t": 0.5, "type": "grid-phase-jump", "degrees": -10.0}],
+        },
+        "criteria": [
+            {"kind": "peak_delta_p", "clause": "closed form", "least": 0.1, "direction": "up"}
+        ],
+    }  # fmt: skip
+    (tmp_path / "jump").mkdir()
+    (tmp_path / "jump" / "jump.toml").write_text(toml_text(content))
+    (case,) = load_cases([str(tmp_path / "jump")])
+    scenario = scenario_of(case, case.test.runs()[0], UNDER, str(swing), None, tmp_path)
     (found,) = judge(run_in_memory(scenario), case.test.criteria, UNDER)
     X_p = load_converter("paper").pu()["L_f"]
-    expected = math.sin(math.radians(10)) / (X_p + 1 / scr)
-    assert found.value == pytest.approx(expected, rel=0.05)
+    assert found.value == pytest.approx(math.sin(math.radians(10)) / (X_p + 1 / scr), rel=5e-3)
+
+    unit = measure_unit(swing, references__P_ref=0.0, plant=plant)
+    assert pytest.approx([D, H], rel=0.01) == [unit.D, unit.H]
 
 
 def test_another_frequency_and_rating_keep_the_elements_per_unit() -> None:
@@ -659,6 +677,7 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
 ) -> None:
     """On p as it is; the mean over a cycle moves it by less than the envelope is wide."""
     unit = Declared(D=150.0, H=5.0, X_eff=0.6 - 1 / 3)
+    under = UNDER.model_copy(update={"unit": unit, "droop": math.inf})
     scenario = Scenario.model_validate(
         {
             "title": "event", "duration": 4.0, "link": {"type": "inproc"},
@@ -669,14 +688,28 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
     change = answer(envelopes.Unit(unit.D, unit.H, unit.X_eff), np.maximum(t, 0.0))
     run = run_of(scenario, p=0.5 + factor * np.where(t >= 0, change, 0.0))
     asked = one("in_envelope")
-    (found,) = judge(run, [asked], UNDER.model_copy(update={"unit": unit}))
+    (found,) = judge(run, [asked], under)
     assert found.verdict == verdict
     assert (found.value == 0.0) is (verdict == PASS)
     assert found.curve is not None and "curve" not in found.plain()
     (unknown,) = judge(run, [asked], UNDER)
     assert unknown.verdict == CANNOT and "are not declared" in unknown.text
-    (other,) = judge(run, [one("in_envelope", at=[2.5])], UNDER.model_copy(update={"unit": unit}))
+    (other,) = judge(run, [one("in_envelope", at=[2.5])], under)
     assert other.verdict == CANNOT and "not that of an event" in other.text
+
+
+def test_the_envelope_of_a_ramp_is_not_for_a_converter_with_droop(ramp: Scenario) -> None:
+    under = UNDER.model_copy(update={"unit": Declared(D=150.0, H=5.0, X_eff=0.3)})
+    t = np.arange(ramp.ticks) * ramp.T_s
+    omega_g = 1.0 - 0.01 * np.clip((t - 2.0) / 0.5, 0.0, 1.0)
+    grid = ramp.plant.model_copy(update={"grid": Grid(scr=3.0, x_over_r=6.0)})
+    run = run_of(
+        ramp.model_copy(update={"plant": grid}), p=np.full(ramp.ticks, 0.5), omega_g=omega_g
+    )
+    (found,) = judge(run, [one("in_envelope")], under)
+    assert found.verdict == CANNOT and "1 % alone moves p by 0.5 p.u." in found.text
+    (other,) = judge(run, [one("in_envelope")], under.model_copy(update={"droop": math.inf}))
+    assert other.verdict in (PASS, FAIL)
 
 
 def test_an_envelope_without_finite_limits_is_no_verdict() -> None:

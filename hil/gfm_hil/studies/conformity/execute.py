@@ -92,6 +92,9 @@ class Job:
         return "/".join(x for x in (self.case.id, self.part.name) if x)
 
 
+_CAUSES = {"no_trip": 0, "stays_in_step": 1}  # kinds of criteria
+
+
 @dataclass(frozen=True)
 class Found:
     """What became of a part of a test under a law.
@@ -120,11 +123,15 @@ class Found:
 
     @property
     def words(self) -> str:
-        """What is wrong first, in one sentence; empty if all passes."""
-        told = [v for v in self.verdicts if v.verdict == self.verdict]
-        if self.verdict == PASS:
-            return ""
-        return told[0].text if told else self.reason
+        """What is wrong, in one sentence; empty if all passes."""
+        return self.cause.text if self.cause else "" if self.verdict == PASS else self.reason
+
+    @property
+    def cause(self) -> Verdict | None:
+        """The clause that says most about why it does not pass: a trip, or a loss of step, explains
+        whatever comes after it; None if all pass or it did not run."""
+        told = [v for v in self.verdicts if v.verdict == self.verdict != PASS]
+        return min(told, key=lambda v: _CAUSES.get(v.kind, len(_CAUSES)), default=None)
 
 
 def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign | None:

@@ -458,6 +458,11 @@ class _Judge:
             return self._cannot("its time is not that of an event with an envelope")
         if not np.isfinite([found.lower, found.upper]).all():
             return self._cannot(f"its envelope has no finite limits at H = {unit.H:.2g} s")
+        if (droops := self._by_droop(P_0)) > 0.5 * float(np.min(found.upper - found.lower)):
+            return self._cannot(
+                "the envelope of a ramp knows no droop, and the declared one of "
+                f"{100 * self.under.droop:g} % alone moves p by {droops:.3g} p.u."
+            )
         # As DyCoV measures: the mean of the last cycle, and the limits are late by a cycle. In the
         # first one the mean is of before and after, and is not judged.
         cycle = whole_ticks(self.width)
@@ -479,6 +484,16 @@ class _Judge:
         curve = t[::every], low[::every], high[::every]
         made = self._made(wrong is None, beyond, "p.u.", "beyond the envelope: 0 p.u.", text, "p")
         return replace(made, curve=curve)
+
+    def _by_droop(self, P_0: float) -> float:
+        """How far the declared droop moves p within the declared power, p.u.; 0 if the event at
+        ``at`` is no ramp of the frequency."""
+        ramps = [e for e in self.run.scenario.events if isinstance(e, GridFrequency) and e.rate]
+        if not any(e.at(self.T_s) == self.tick for e in ramps):
+            return 0.0
+        omega_g = self._raw("omega_g")
+        moved = (omega_g[self.tick - 1] - omega_g[self.last - 1]) / self.under.droop
+        return float(abs(np.clip(P_0 + moved, self.under.P_min, self.under.P_max) - P_0))
 
     def _expected(self, unit: Unit, t: Vector, P_0: float) -> Envelope | None:
         """The envelope of the event at ``at``, or None if there is none; t: s after it."""

@@ -293,7 +293,9 @@ class UnderTest(_Model):
 
     plant: Plant = Field(description="converter and instruments, without a grid")
     droop: float = Field(
-        gt=0, le=1, description="declared: frequency over power in the steady state, p.u./p.u."
+        gt=0,
+        allow_inf_nan=True,
+        description="declared: frequency over power in the steady state, p.u./p.u.; inf: none",
     )
     P_max: float = Field(description="declared: most power in the steady state, p.u.")
     P_min: float = Field(description="declared: least power in the steady state, p.u.")

@@ -104,6 +104,7 @@ class Conformity:
                             "verdict": f.verdict,
                             "status": f.status,
                             "reason": f.reason,
+                            "cause": f.cause and {"clause": f.cause.clause, "text": f.cause.text},
                             "clauses": [v.plain() for v in f.verdicts],
                         }
                         for f in self.of(law, case.id)
