@@ -10,7 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gfm_plant.circuit import GROUND
+from gfm_plant.build import CONNECTION, FAR, LINE
+from gfm_plant.circuit import GROUND, Branch
 from gfm_plant.emulator import reconnect, synchronise
 from gfm_plant.model import DELTA
 from gfm_plant.names import FAULTED_PHASES
@@ -97,18 +98,18 @@ def fault(
 
     Args:
         plant: The plant.
-        position: Place on the line: 0 at its start, the filter capacitor, 1 at its end; None: at a
-            node.
+        position: Place on the line: 0 at its start, the filter capacitor, or with a second inductor
+            the point of connection; 1 at its end; None: at a node.
         R: Resistance from each phase to ground, or between the two phases of an LL fault, p.u. of
             the first converter; > 0 at a capacitor.
         duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
-        line: Name of the line, or of the converter whose line it is; None: the first converter.
+        line: Name of the line, or of the converter whose line it is; None: that of the only one.
         node: The node.
         kind: "3ph", "LG", "LL" or "LLG".
         phases: The phases that an unbalanced fault connects; None: a, of two phases b and c.
         Z_0: Impedance R + jX, X at nominal frequency, between the place and ground for the zero
             sequence of LG and LLG, p.u. of the first converter; None: that of the closed lines
-            between the place and the grid, with their own L and R.
+            between the place and earthed star points, with their own L and R.
 
     Raises:
         ValueError: If there is no such place or kind, or a value is out of range. The plant is then
@@ -131,7 +132,10 @@ def fault(
     if position is not None:
         _require("position", position, 0 <= position < 1, "in [0, 1)")
         lines = wiring.named_lines()
-        line = wiring.units[0].name if line is None else line
+        for name, _ in wiring.transformers:
+            del lines[name]
+        if line is None:
+            line = LINE if wiring.units[0].node == CONNECTION else wiring.units[0].name
         if line not in lines:
             raise ValueError(f"line = {line!r}: must be one of {sorted(lines)}")
         node = lines[line].start
@@ -151,8 +155,8 @@ def fault(
     changed = replace(wiring, fault=FaultPlace(node, inside, position, R, kind, phases, Z_0))
     if kind in ("LG", "LLG") and changed.zero_sequence() is None:
         raise ValueError(
-            f"X_0: not set, and no closed line leads from {where} to the grid, whose star point is"
-            f" earthed; an {kind} fault needs a path to ground"
+            f"X_0: not set, and no closed line leads from {where} to the earthed star point of the"
+            f" grid or of a transformer; an {kind} fault needs a path to ground"
         )
     plant.rewire(changed)
     plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
@@ -229,11 +233,16 @@ def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     """
     _require("L_g", L_g, L_g > 0, "a factor > 0")
     _require("R_g", R_g, R_g >= 0, "a factor >= 0")
-    r, unit = plant.par[0], plant.wiring.units[0]
-    ratio = float(r["current"])
+    r, wiring = plant.par[0], plant.wiring
+    unit, ratio = wiring.units[0], float(r["current"])
     new_L, new_R = float(L_g * r["L_line_n"]), float(R_g * r["R_line_n"])
-    changed = replace(unit, L_g=new_L * ratio, R_g=new_R * ratio)
-    plant.rewire(replace(plant.wiring, units=(changed, *plant.wiring.units[1:])))
+    if unit.node == CONNECTION:
+        branches = (Branch(LINE, CONNECTION, FAR, new_L, new_R), *wiring.branches[1:])
+        plant.rewire(replace(wiring, branches=branches))
+        new_L, new_R = unit.L_g + new_L, unit.R_g + new_R
+    else:
+        changed = replace(unit, L_g=new_L * ratio, R_g=new_R * ratio)
+        plant.rewire(replace(wiring, units=(changed, *wiring.units[1:])))
     plant.par["L_g"][0], plant.par["R_g"][0] = new_L, new_R
 
 

@@ -24,7 +24,7 @@ N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_RE
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
 N_RING = 256  # places of a ring that holds one cycle
 
-SIZES = {1: 6, 2: 17, 4: 33, 12: 97}
+SIZES = {1: 7, 2: 17, 4: 33, 12: 97}
 """Records come in sizes, because each is compiled once a computer: converters, and states of the
 circuit, that fit in."""
 N_SINKS = 4  # loads of constant power that fit; into the records of one converter, one

@@ -27,6 +27,8 @@ from gfm_plant.circuit import (
 from gfm_plant.names import FAULTED_PHASES
 
 GRID_SOURCE = "grid"
+MAGNETISING = ".m"
+"""Behind the name of a transformer: its magnetising inductance, a branch to ground."""
 ALPHA, BETA = 0, 1
 """The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
 
@@ -176,6 +178,8 @@ class Wiring:
         fault: where one is, or may be again, or None.
         blocked: indices of converters whose bridges are out of every circuit.
         check: the synchro-check that waits to close a breaker, or None.
+        transformers: names of the branches that are one, and where it is earthed: as
+            `options.Transformer`.
     """
 
     omega_b: float
@@ -191,6 +195,7 @@ class Wiring:
     fault: FaultPlace | None = None
     blocked: frozenset[int] = frozenset()
     check: Check | None = None
+    transformers: tuple[tuple[str, str], ...] = ()
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -231,7 +236,8 @@ class Wiring:
         return tuple(Branch(m.name, m.emf, m.node, m.X, m.R) for m in self.machines)
 
     def named_lines(self) -> dict[str, Branch]:
-        """Lines by the name that people use: a converter's line has that of the converter."""
+        """Lines and transformers by the name that people use: a converter's line has that of the
+        converter."""
         own = {unit.name: line for unit, line in zip(self.units, self.units_lines, strict=True)}
         return own | {b.name: b for b in self.branches if b.end != GROUND}
 
@@ -239,7 +245,8 @@ class Wiring:
     def has_load(self) -> bool:
         """Whether anything is left to feed without the grid."""
         return bool(self.shunts or self.sinks) or any(
-            branch.end == GROUND for branch in self.branches
+            branch.end == GROUND and not branch.name.endswith(MAGNETISING)
+            for branch in self.branches
         )
 
     def to_grid(self) -> dict[str, float]:
@@ -267,7 +274,9 @@ class Wiring:
         its two ends."""
         found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
         lines = (*self.branches, *self.machine_branches)
-        found |= {b.name: (b.name, b.start, b.end) for b in lines}
+        found |= {
+            b.name: (b.name, b.start, b.end) for b in lines if not b.name.endswith(MAGNETISING)
+        }
         to_ground: tuple[Shunt | Sink, ...] = (*self.shunts, *self.sinks)
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
@@ -299,30 +308,35 @@ class Wiring:
         """The impedance between the place of the fault and ground for a zero sequence at nominal
         frequency, p.u.; None: there is no path.
 
-        It is the fault's own ``Z_0``, or that of the closed lines between the fault and the grid,
-        whose star point is earthed and whose lines have the same impedance for all sequences.
-        Converters, machines and loads have three wires: behind the delta winding of a transformer
-        a zero sequence finds no path.
+        It is the fault's own ``Z_0``, or that of the closed lines between the fault and the earthed
+        star points of the grid and of transformers; lines have the same impedance for all
+        sequences. Converters, machines and loads have three wires: behind the delta winding of a
+        transformer a zero sequence finds no path.
         """
-        if self.fault is None or self.fault.Z_0 is not None or self.grid is None or not self.closed:
+        if self.fault is None or self.fault.Z_0 is not None:
             return None if self.fault is None else self.fault.Z_0
-        lines = [b for b in self._whole((*self.units_lines, *self.branches)) if b.end != GROUND]
-        reached = {self.grid}
-        while (
-            more := {end for b in lines if {b.start, b.end} & reached for end in (b.start, b.end)}
-            - reached
-        ):
+        earthed, found = dict(self.transformers), []
+        for branch in self._whole((*self.units_lines, *self.branches)):
+            if branch.end == GROUND or earthed.get(branch.name) == "none":
+                continue
+            ends = {"end": {branch.start}, "start": {branch.end}}.get(
+                earthed.get(branch.name, ""), {self.grid} if self.closed else set()
+            )  # which of its ends are at ground
+            one, other = (GROUND if end in ends else end for end in (branch.start, branch.end))
+            found.append((one, other, 1 / complex(branch.R, branch.L)))
+        reached = {GROUND}
+        while more := {end for a, b, _ in found if {a, b} & reached for end in (a, b)} - reached:
             reached |= more
         place = "beyond" if self.split else self.fault.node
         if place not in reached:
             return None
-        nodes = sorted(reached - {self.grid})
+        nodes = sorted(reached - {GROUND})
         Y = np.zeros((len(nodes), len(nodes)), complex)
-        for line in lines:
-            if line.start in reached:
-                at = [nodes.index(end) for end in (line.start, line.end) if end != self.grid]
+        for a, b, y in found:
+            if a in reached:
+                at = [nodes.index(end) for end in (a, b) if end != GROUND]
                 sign = np.array([1.0, -1.0][: len(at)])
-                Y[np.ix_(at, at)] += np.outer(sign, sign) / complex(line.R, line.L)
+                Y[np.ix_(at, at)] += np.outer(sign, sign) * y
         return complex(np.linalg.inv(Y)[nodes.index(place), nodes.index(place)])
 
     def voltage(

@@ -224,7 +224,7 @@ def test_a_run_on_disk_is_that_in_memory(
          r"events.0: node = 'bsu': must be one of \['bus'\]"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1}]}, "position = None, node = None"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bus", "kind": "LG"}]},
-         "events.0: X_0: not set, and no closed line leads from node bus to the grid"),
+         "events.0: X_0: not set, and no closed line leads from node bus to the earthed star"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bus", "kind": "GL"}]},
          "events.0.kind: must be '3ph', 'LG', 'LL' or 'LLG'"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bus", "kind": "LL",
@@ -236,6 +236,14 @@ def test_a_run_on_disk_is_that_in_memory(
         ({"network": {"converters": {"A": {"node": "x"}}, "grid": "y"}}, "the grid is at node 'y'"),
         ({"network": {"converters": {"A": {"node": "x"}}, "lines": {"l": {**LINE, "L": 0.0}}}},
          "network.lines.l.L: must be greater than 0"),
+        ({"network": {"converters": {"A": {"node": "x"}}, "transformers":
+          {"t": {"start": "x", "end": "y", "S": 1.0, "X": -0.1}}}},
+         "network.transformers.t.X: must be greater than 0"),
+        ({"network": {"converters": {"A": {"node": "x"}}, "transformers":
+          {"t": {"start": "x", "end": "y", "S": 1.0, "X": 0.1, "earthed": "delta"}}}},
+         "network.transformers.t.earthed: must be 'end', 'start', 'both' or 'none'"),
+        ({"network": {"converters": {"A": {"node": "x", "plant": {"lcl": {"L": 0.0}}}}}},
+         "network.converters.A.plant.lcl.L: must be greater than 0"),
         ({"network": {"converters": {"A": {"node": "x", "plant": {"grid": {"V_g": 0.9}}}}}},
          "plant.grid: is the scenario's own"),
     ],

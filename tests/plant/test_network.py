@@ -312,6 +312,69 @@ def test_a_fault_in_two_axes_is_one_in_three_phases() -> None:
         assert one == pytest.approx(other, abs=1e-9)
 
 
+def test_a_transformer_is_its_leakage_and_its_magnetising_inductance() -> None:
+    """In p.u. of its own rating: as a line and a load of reactive power alone."""
+    converters = {"a": ({}, "m"), "b": ({"lcl": {"L": 0.1, "R": 0.02}}, "m")}
+    transformer = {"start": "m", "end": "far", "S": 2.0, "X": 0.2, "R": 0.02, "X_m": 10.0}
+    paper = Plant().real_factors()
+    assert not paper
+    nominal = load_converter("paper").pu()
+    longer = {"factors": {"L_g": 0.1 / nominal["L_g"], "R_g": 0.02 / nominal["R_g"]}}
+    one = make(converters, grid="far", transformers={"t": transformer})
+    other = make(
+        {"a": ({}, "m"), "b": (longer, "m")}, grid="far",
+        lines={"t": {"start": "m", "end": "far", "L": 0.1, "R": 0.01}},
+        loads={"z": {"node": "m", "P": 0.0, "Q": 0.2}},
+    )  # fmt: skip
+    assert one.wiring.order[-2:] == ("t", "t.m")
+    assert set(one.wiring.breakers()) == {"a", "b", "t"} and not one.wiring.has_load
+    for plant in (one, other):
+        u = start(plant, 1.0, [0.1, 0.15])
+        phase_jump(plant, 10.0)
+        go(plant, u, 300)
+    assert one.st["x"] == pytest.approx(other.st["x"], abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("earthed", "node", "Z_0"),
+    [
+        ("end", "n", 1 / (1 / (0.005 + 0.05j) + 1 / (0.02 + 0.2j))),
+        ("end", "m", None),
+        ("start", "m", 0.005 + 0.05j),
+        ("start", "n", 0.02 + 0.2j),
+        ("both", "m", 0.005 + 0.05j + 0.02 + 0.2j),
+        ("none", "n", 0.02 + 0.2j),
+        ("none", "m", None),
+    ],
+)
+def test_the_path_of_a_zero_sequence(earthed: str, node: str, Z_0: complex | None) -> None:
+    """Leakage and line, in series or in parallel, by hand."""
+    plant = make(
+        {"a": ({}, "m")}, grid="far",
+        transformers={
+            "t": {"start": "m", "end": "n", "S": 4.0, "X": 0.2, "R": 0.02, "earthed": earthed}
+        },
+        lines={"l": {"start": "n", "end": "far", "L": 0.2, "R": 0.02}},
+    )  # fmt: skip
+    u = start(plant, 1.0, 0.1)
+    if Z_0 is None:
+        with pytest.raises(ValueError, match=f"X_0: not set, and no closed line.*node {node}"):
+            fault(plant, None, 0.1, node=node, kind="LG")
+        return
+    fault(plant, None, 0.1, node=node, kind="LG")
+    assert plant.wiring.zero_sequence() == pytest.approx(Z_0, abs=1e-15)
+    go(plant, u, 100)
+    told = make(
+        {"a": ({}, "m")}, grid="far",
+        lines={"t": {"start": "m", "end": "n", "L": 0.05, "R": 0.005},
+               "l": {"start": "n", "end": "far", "L": 0.2, "R": 0.02}},
+    )  # fmt: skip
+    start(told, 1.0, 0.1)
+    fault(told, None, 0.1, node=node, kind="LG", Z_0=Z_0)
+    go(told, u, 100)
+    assert plant.st["x"] == pytest.approx(told.st["x"], abs=1e-11)
+
+
 BUS = {"a": ({}, "bus")}
 
 
@@ -325,6 +388,12 @@ BUS = {"a": ({}, "bus")}
         ({"loads": {"y": {"node": "bus", "P": 0.1}, "z": {"node": "bus", "P": 0.1}}},
          "y and z: two resistors at node bus"),
         ({}, "node bus: only a.i_o ends there"),
+        ({"transformers": {"t": {"start": "bus", "end": "x", "S": 1.0, "X": 0.1}}},
+         "node x: only t ends there"),
+        ({"transformers": {"a": {"start": "bus", "end": "x", "S": 1.0, "X": 0.1}}},
+         "a is the name of two parts"),
+        ({"transformers": {"t": {"start": "y", "end": "x", "S": 1.0, "X": 0.1}}},
+         "t is at node 'y', which has no path"),
     ],
 )  # fmt: skip
 def test_impossible_networks(parts: dict[str, Any], message: str) -> None:

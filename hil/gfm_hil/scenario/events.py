@@ -293,7 +293,7 @@ class Fault(_Event):
         ge=0,
         lt=1,
         description="place on the line: 0 at its start, which for a converter's line is the filter "
-        "capacitor, 1 at its end",
+        "capacitor, with plant.lcl the point of connection; 1 at its end",
     )
     line: str | None = Field(
         None, description="in a network: name of the line, or of the converter whose line it is"
@@ -314,7 +314,7 @@ class Fault(_Event):
         ge=0,
         le=1e6,
         description="of LG and LLG: reactance to ground for the zero sequence, p.u.; that of the "
-        "lines from there to the grid if neither X_0 nor R_0 is given",
+        "lines to earthed star points if neither X_0 nor R_0 is given",
     )
     R_0: float | None = Field(
         None, ge=0, le=1e6, description="of LG and LLG: resistance for the zero sequence, p.u."
@@ -333,7 +333,7 @@ class Fault(_Event):
 
     @property
     def Z_0(self) -> complex | None:
-        """Impedance for the zero sequence, p.u.; None: that of the lines to the grid."""
+        """Impedance for the zero sequence, p.u.; None: that of the lines to star points."""
         if self.X_0 is None and self.R_0 is None:
             return None
         return complex(self.R_0 or 0.0, self.X_0 or 0.0)
@@ -347,9 +347,7 @@ class Fault(_Event):
 
     def label(self) -> str:
         line = "the line" if self.line is None else f"line {self.line}"
-        where = f"{self.position:g} of {line}" if self.position else "the filter"
-        if self.position == 0 and self.line is not None:
-            where = f"the start of {line}"
+        where = f"{self.position:g} of {line}" if self.position else f"the start of {line}"
         if self.node is not None:
             where = f"node {self.node}"
         return f"{self.what} at {where}" + (f" for {self.duration:g} s" if self.duration else "")
