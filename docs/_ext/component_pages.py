@@ -16,6 +16,7 @@ from gfm_plant import Network, NetworkParts, Plant, make_network, options
 from gfm_plant.circuit import GROUND
 from gfm_plant.parameters import ConverterParameters
 from gfm_plant.records import N_MACHINES, N_SINKS, SIZES
+from gfm_plant.wiring import MAGNETISING
 
 _NAME = "x"
 
@@ -59,6 +60,10 @@ COMPONENTS = (
         most=f"1 to {max(SIZES)}",
     ),
     _Component(
+        "Second inductor of the filter", options.SecondInductor, "`[plant.lcl]`",
+        most="one a converter; its current is that of the converter's line",
+    ),
+    _Component(
         "DC source", options.DcSource, "`[plant.dc_source]`",
         more=(
             ("integral of the regulator", "p.u.", "of a `regulated` source"),
@@ -81,6 +86,11 @@ COMPONENTS = (
     _Component(
         "Line", options.Line, "`[network.lines.NAME]`",
         {"lines": {_NAME: {"start": "bus", "end": "n", "L": 0.1}},
+         "loads": {"r": {"node": "n", "P": 0.1}}}, most=_CIRCUIT,
+    ),
+    _Component(
+        "Transformer", options.Transformer, "`[network.transformers.NAME]`",
+        {"transformers": {_NAME: {"start": "bus", "end": "n", "S": 1.0, "X": 0.1, "X_m": 50.0}},
          "loads": {"r": {"node": "n", "P": 0.1}}}, most=_CIRCUIT,
     ),
     _Component(
@@ -127,7 +137,8 @@ def _states(one: _Component) -> list[str]:
     if one.model is ConverterParameters:
         names = {f"`{name}`": name for name in plant.wiring.units[0].states}
     else:
-        names = {f"`{_NAME}`": name for name in plant.wiring.order if name == _NAME}
+        own = (_NAME, _NAME + MAGNETISING)
+        names = {f"`{name}`": name for name in plant.wiring.order if name in own}
     banks = {bank.name for bank in plant.wiring.capacitors}
     banks |= {unit.states[1] for unit in plant.wiring.units}
     lines = []
@@ -143,6 +154,8 @@ def _breaker(one: _Component) -> str:
         return (
             "`breaker` with the name of the converter opens its line; a synchro-check may close it."
         )
+    if one.model is options.SecondInductor:
+        return "`breaker` with the name of the converter, in a network."
     if one.model in (options.Grid, options.FiniteGrid):
         return "`grid-breaker`; a synchro-check may close it."
     breakers = _built(one.example).wiring.breakers()

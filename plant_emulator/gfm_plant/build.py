@@ -37,11 +37,13 @@ from gfm_plant.records import (
     network_dtypes,
     size_for,
 )
+from gfm_plant.wiring import MAGNETISING, Unit, Wiring
 from gfm_plant.wiring import Machine as MachineParts
-from gfm_plant.wiring import Unit, Wiring
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
+CONNECTION, LINE = "connection", "line"
+"""With a second inductor: the point of connection behind it, and the line from there."""
 
 _LAG = 5.0  # shortest lag of a load of constant power, in sampling periods
 _SWING_STEP = 0.1  # largest rate of a finite grid times T_s
@@ -60,12 +62,19 @@ def make_plant(options: Plant, T_s: float) -> Network:
     Raises:
         ValueError: If the converter is unknown, or the DC source's control is too fast for T_s.
     """
-    load: tuple[Branch, ...] = ()
+    converter, parts, node = load_converter(options.converter), [], FAR
+    if options.lcl is not None:
+        line, node = converter.pu(options.real_factors()), CONNECTION
+        parts.append(Branch(LINE, CONNECTION, FAR, line["L_g"], line["R_g"]))
     if options.grid.load_R is not None and options.grid.load_L is not None:
-        bases = load_converter(options.converter).bases
+        bases = converter.bases
         L, R = bases.to_pu(options.grid.load_L, "L"), bases.to_pu(options.grid.load_R, "R")
-        load = (Branch(LOAD, FAR, GROUND, L, R),)
-    return _make({CONVERTER: (options, FAR)}, T_s, options.grid, FAR, load)
+        parts.append(Branch(LOAD, FAR, GROUND, L, R))
+    plant = _make({CONVERTER: (options, node)}, T_s, options.grid, FAR, parts)
+    if options.lcl is not None:  # all that lies between capacitor and grid
+        plant.par["L_g"] += line["L_g"]
+        plant.par["R_g"] += line["R_g"]
+    return plant
 
 
 def make_network(
@@ -84,10 +93,16 @@ def make_network(
             or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
     names = [*converters, *parts.lines, *parts.loads, *parts.capacitors, *parts.machines]
-    names += parts.constant_power
+    names += [*parts.constant_power, *parts.transformers]
+    names += [f"{name}{MAGNETISING}" for name, x in parts.transformers.items() if x.X_m]
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise ValueError(f"network: {twice[0]} is the name of two parts")
     branches = [Branch(name, x.start, x.end, x.L, x.R) for name, x in parts.lines.items()]
+    for name, one in parts.transformers.items():
+        branches.append(Branch(name, one.start, one.end, one.X / one.S, one.R / one.S))
+        if one.X_m is not None:
+            inductor = Branch(f"{name}{MAGNETISING}", one.start, GROUND, one.X_m / one.S, 0.0)
+            branches.append(inductor)
     shunts: dict[str, Shunt] = {}
     for name, load in parts.loads.items():
         size = load.P**2 + load.Q**2
@@ -102,11 +117,13 @@ def make_network(
             shunts[load.node] = Shunt(name, load.node, 1 / load.P)
     banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
     opened = {name for name, line in parts.lines.items() if not line.closed}
+    opened |= {name for name, one in parts.transformers.items() if not one.closed}
     opened |= {name for name, load in parts.loads.items() if not load.closed}
     opened |= {name for name, load in parts.constant_power.items() if not load.closed}
     network = _make(
         converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks,
         frozenset(opened), parts.machines, parts.constant_power,
+        tuple((name, one.earthed) for name, one in parts.transformers.items()),
     )  # fmt: skip
     network.net["joins"] = 1
     return network
@@ -123,13 +140,14 @@ def _make(
     opened: frozenset[str] = frozenset(),
     machines: Mapping[str, Machine] = MappingProxyType({}),
     constant_power: Mapping[str, ConstantPowerLoad] = MappingProxyType({}),
+    transformers: tuple[tuple[str, str], ...] = (),
 ) -> Network:
     """Return a plant; elements in p.u. of the first converter."""
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
     N = len(converters)
-    # one more for a fault within a branch
-    states = N_OWN * N + len(branches) + len(capacitors) + len(machines) + 1
+    # two more for a fault within a branch
+    states = N_OWN * N + len(branches) + len(capacitors) + len(machines) + 2
     net_dtype, now_dtype = network_dtypes(size_for(N, states, len(machines), len(constant_power)))
     records = PlantRecords(
         np.zeros(N, converter_par_dtype),
@@ -181,6 +199,7 @@ def _make(
         tuple(MachineParts(name, m.node, m.X / m.S, m.R / m.S) for name, m in machines.items()),
         grid_node,
         opened=opened,
+        transformers=transformers,
     )
     _check_paths(wiring)
     network = Network(records, wiring)
@@ -230,6 +249,8 @@ def _pack_converter_circuit(
     bases = converter.bases
     par["omega_b"] = bases.omega_b
     elements = converter.pu(options.real_factors())
+    if options.lcl is not None:
+        elements["L_g"], elements["R_g"] = options.lcl.L, options.lcl.R
     for element, value in elements.items():
         par[element] = value
     nominal = converter.pu()

@@ -9,6 +9,11 @@ orthogonal even where eigenvalues repeat, as those of identical converters in pa
 A node that has neither a capacitor nor a source forces the sum of its branch currents to zero. The
 circuit then lives in the subspace in which these sums vanish, and the projection onto it by
 stored energy is what a switching does physically: it keeps the flux of every loop.
+
+An unbalanced fault connects each space vector with its conjugate. With the real axis on the phase
+that differs from the two others, the real and the imaginary parts of all space vectors in the
+frame that stands still belong to two real circuits, which have nothing to do with each other.
+``join_axes`` makes one set of modes of both.
 """
 
 from __future__ import annotations
@@ -81,12 +86,16 @@ class Modes:
         states: w of the modes, (n_w, n); a state that the circuit does not have is zero.
         modes: the modes of w, (n, n_w); it projects by stored energy.
         drive: rate of the modes per source voltage, and per current of the sinks, (n, n_s), 1/s.
+        mirror: factor, (n,), on ``modes`` and ``drive`` for the mirror images of w and of the
+            sources, conj(x) e^(-2 j omega_b t); zero in a balanced circuit, which has no use for
+            them.
     """
 
     rates: NDArray[np.complex128]
     states: NDArray[np.complex128]
     modes: NDArray[np.complex128]
     drive: NDArray[np.complex128]
+    mirror: NDArray[np.complex128]
 
 
 def find_modes(
@@ -184,9 +193,36 @@ def _find_modes(
     modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
     drive = np.zeros((len(rates), n_s), complex)
     drive[:] = omega_b * np.linalg.solve(X, K.T @ (B / root[:, None]))
-    for array in (rates, states, modes, drive):
+    mirror = np.zeros(len(rates), complex)
+    for array in (rates, states, modes, drive, mirror):
         array.flags.writeable = False
-    return Modes(rates, states, modes, drive)
+    return Modes(rates, states, modes, drive, mirror)
+
+
+def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:
+    """Return the modes of a circuit that is not the same in all directions.
+
+    In the frame that stands still a space vector is W = w e^(j omega_b t), and the parts of
+    W e^(-j angle) = W_alpha + j W_beta obey one circuit each. Their modes are real-linear in W, and
+    so linear in w and its mirror image together: W_alpha = (W' + conj W') / 2 and
+    W_beta = (W' - conj W') / 2j with W' = W e^(-j angle).
+
+    Args:
+        alpha, beta: the modes of the two circuits, with the same states and sources.
+        angle: of the axis of alpha, rad.
+    """
+    turn = np.exp(1j * angle)
+    half, mirrored = (0.5 / turn, -0.5j / turn), (turn**2, -(turn**2))
+    both = alpha, beta
+    return Modes(
+        np.concatenate([one.rates for one in both]),
+        np.hstack([alpha.states * turn, beta.states * 1j * turn]),
+        np.vstack([one.modes * part for one, part in zip(both, half, strict=True)]),
+        np.vstack([one.drive * part for one, part in zip(both, half, strict=True)]),
+        np.concatenate(
+            [np.full(len(m.rates), part) for m, part in zip(both, mirrored, strict=True)]
+        ),
+    )
 
 
 def find_voltage(

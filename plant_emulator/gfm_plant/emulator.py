@@ -30,6 +30,7 @@ from gfm_plant.solution import (
     grid_source,
     half_step,
     machine_source,
+    mirror_sources,
     own,
     read_states,
     state,
@@ -48,7 +49,7 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
     Delay lines, sensor filters and DC sources are filled as if they had been there forever.
     """
     n, now = plant.net[0], plant.now[0]
-    enter(n, now, circuit(n, now))
+    enter(n, now, plant.st[0].tick, circuit(n, now))
     for k in range(n.n_converters):
         r, s = plant.par[k], plant.st[k]
         s.x[DELTA], s.x[V_DC] = x0[k, DELTA], x0[k, V_DC]
@@ -124,6 +125,8 @@ def plant_step(plant: PlantRecords) -> None:
         now.w_before[i, 0], now.w_before[i, 1] = now.w[i, 0], now.w[i, 1]
     for j in range(n.n_sinks):
         now.v_sink_before[j, 0], now.v_sink_before[j, 1] = now.v_sink[j, 0], now.v_sink[j, 1]
+    if n.unbalanced[circuit(n, now)]:
+        mirror_sources(n, now, plant.st[0].tick)
     for part in range(n.n_parts):
         if n.stretch[part] > 0.0:
             _stretch(plant, part)
@@ -144,7 +147,7 @@ def plant_step(plant: PlantRecords) -> None:
     else:
         _go_back(plant)
         trip(plant, worst, DIVERGED, largest)
-        enter(n, now, circuit(n, now))
+        enter(n, now, plant.st[0].tick, circuit(n, now))
     advance_grid(n, now)
     if now.unbalance_left > 0.0:
         now.unbalance_left -= n.T_s
@@ -445,7 +448,7 @@ def synchronise(plant: PlantRecords, k: int) -> None:
     for j in range(len(s.crossed)):
         s.crossed[j] = 0
     s.trip, s.trip_tick, s.trip_value, s.waits = 0, 0, 0.0, NOT_ASKED
-    enter(plant.net[0], now, circuit(plant.net[0], now))
+    enter(plant.net[0], now, plant.st[0].tick, circuit(plant.net[0], now))
     _write_x(plant, k)
 
 
@@ -458,7 +461,7 @@ def reconnect(plant: PlantRecords) -> None:
 @compiled
 def _reconnect(plant: PlantRecords) -> None:
     n, now = plant.net[0], plant.now[0]
-    enter(n, now, circuit(n, now))
+    enter(n, now, plant.st[0].tick, circuit(n, now))
     for k in range(n.n_converters):
         _write_x(plant, k)
 

@@ -10,9 +10,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gfm_plant.circuit import GROUND
+from gfm_plant.build import CONNECTION, FAR, LINE
+from gfm_plant.circuit import GROUND, Branch
 from gfm_plant.emulator import reconnect, synchronise
 from gfm_plant.model import DELTA
+from gfm_plant.names import FAULTED_PHASES
 from gfm_plant.network import Network
 from gfm_plant.synchro_check import NONE, TIME_OVER, WATCHING
 from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, Wiring
@@ -85,27 +87,55 @@ def fault(
     duration: float | None = None,
     line: str | None = None,
     node: str | None = None,
+    kind: str = "3ph",
+    phases: str | None = None,
+    Z_0: complex | None = None,
 ) -> None:
-    """Short the three phases to ground through `R`.
+    """Short phases through `R`: all three or one (LG) or two (LLG) of them to ground, or two (LL).
+
+    An unbalanced fault couples positive and negative sequence. The plant solves it exactly too, see
+    `gfm_plant.circuit`.
 
     Args:
         plant: The plant.
-        position: Place on the line: 0 at its start, the filter capacitor, 1 at its end; None: at a
-            node.
-        R: Resistance of the fault, p.u. of the first converter; > 0 at a capacitor.
+        position: Place on the line: 0 at its start, the filter capacitor, or with a second inductor
+            the point of connection; 1 at its end; None: at a node.
+        R: Resistance from each phase to ground, or between the two phases of an LL fault, p.u. of
+            the first converter; > 0 at a capacitor.
         duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
-        line: Name of the line, or of the converter whose line it is; None: the first converter.
+        line: Name of the line, or of the converter whose line it is; None: that of the only one.
         node: The node.
+        kind: "3ph", "LG", "LL" or "LLG".
+        phases: The phases that an unbalanced fault connects; None: a, of two phases b and c.
+        Z_0: Impedance R + jX, X at nominal frequency, between the place and ground for the zero
+            sequence of LG and LLG, p.u. of the first converter; None: that of the closed lines
+            between the place and earthed star points, with their own L and R.
 
     Raises:
-        ValueError: If there is no such place, or a value is out of range. The plant is then
+        ValueError: If there is no such place or kind, or a value is out of range. The plant is then
             unchanged.
     """
     wiring = plant.wiring
+    if kind not in FAULTED_PHASES:
+        raise ValueError(f"kind = {kind!r}: must be one of {list(FAULTED_PHASES)}")
+    phases = FAULTED_PHASES[kind][0] if phases is None else phases
+    if phases not in FAULTED_PHASES[kind]:
+        allowed = list(FAULTED_PHASES[kind])
+        raise ValueError(f"phases = {phases!r}: must be one of {allowed} for kind {kind!r}")
+    if Z_0 is not None:
+        if kind not in ("LG", "LLG"):
+            raise ValueError(
+                f"X_0, R_0: no current of kind {kind!r} goes to ground; leave them out"
+            )
+        _require("X_0", Z_0.imag, Z_0.imag >= 0, ">= 0 p.u.")
+        _require("R_0", Z_0.real, Z_0.real >= 0, ">= 0 p.u.")
     if position is not None:
         _require("position", position, 0 <= position < 1, "in [0, 1)")
         lines = wiring.named_lines()
-        line = wiring.units[0].name if line is None else line
+        for name, _ in wiring.transformers:
+            del lines[name]
+        if line is None:
+            line = LINE if wiring.units[0].node == CONNECTION else wiring.units[0].name
         if line not in lines:
             raise ValueError(f"line = {line!r}: must be one of {sorted(lines)}")
         node = lines[line].start
@@ -122,7 +152,13 @@ def fault(
     _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    plant.rewire(replace(wiring, fault=FaultPlace(node, inside, position, R)))
+    changed = replace(wiring, fault=FaultPlace(node, inside, position, R, kind, phases, Z_0))
+    if kind in ("LG", "LLG") and changed.zero_sequence() is None:
+        raise ValueError(
+            f"X_0: not set, and no closed line leads from {where} to the earthed star point of the"
+            f" grid or of a transformer; an {kind} fault needs a path to ground"
+        )
+    plant.rewire(changed)
     plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
     reconnect(plant.records)
 
@@ -197,11 +233,16 @@ def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     """
     _require("L_g", L_g, L_g > 0, "a factor > 0")
     _require("R_g", R_g, R_g >= 0, "a factor >= 0")
-    r, unit = plant.par[0], plant.wiring.units[0]
-    ratio = float(r["current"])
+    r, wiring = plant.par[0], plant.wiring
+    unit, ratio = wiring.units[0], float(r["current"])
     new_L, new_R = float(L_g * r["L_line_n"]), float(R_g * r["R_line_n"])
-    changed = replace(unit, L_g=new_L * ratio, R_g=new_R * ratio)
-    plant.rewire(replace(plant.wiring, units=(changed, *plant.wiring.units[1:])))
+    if unit.node == CONNECTION:
+        branches = (Branch(LINE, CONNECTION, FAR, new_L, new_R), *wiring.branches[1:])
+        plant.rewire(replace(wiring, branches=branches))
+        new_L, new_R = unit.L_g + new_L, unit.R_g + new_R
+    else:
+        changed = replace(unit, L_g=new_L * ratio, R_g=new_R * ratio)
+        plant.rewire(replace(wiring, units=(changed, *wiring.units[1:])))
     plant.par["L_g"][0], plant.par["R_g"][0] = new_L, new_R
 
 

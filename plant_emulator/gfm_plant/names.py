@@ -42,6 +42,15 @@ CONTROLLER_LEFT = "the controller was stopped"
 #: here on the protection (its place in TRIPS) that would trip it again
 NOT_ASKED, MAY_START, WOULD_TRIP = 0, 1, 2
 
+FAULTED_PHASES: dict[str, tuple[str, ...]] = {
+    "3ph": ("abc",),
+    "LG": ("a", "b", "c"),
+    "LL": ("bc", "ca", "ab"),
+    "LLG": ("bc", "ca", "ab"),
+}
+"""The phases that each kind of fault may connect, the usual ones first. Of an unbalanced kind they
+stand in the order of the phase that differs from the two others: a, b, c."""
+
 SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
 """Indices of the y that pass the sensors; omega_u is a command and known exactly."""
 

@@ -156,6 +156,8 @@ class Network:
         if wiring.split is not None and wiring.split != before.split:
             there = wiring.order.index(wiring.split)
             self.now["w"][0, wiring.order.index("beyond")] = w[there]
+        if "fault" in wiring.order and wiring.fault != before.fault:
+            self.now["w"][0, wiring.order.index("fault")] = 0.0
         if before.grid is None and self.net[0]["reference"] == 0:  # the last machine is gone
             self.now["omega_g_slope"] = 0.0
         reconnect(self.records)
@@ -207,6 +209,8 @@ def _connect(records: PlantRecords, wiring: Wiring) -> None:
             _set(net["decay"][0, circuit, part, :n], np.exp(modes.rates * half))
         _set(net["states"][0, circuit, : len(order), :n], modes.states)
         _set(net["modes"][0, circuit, :n, : len(order)], modes.modes)
+        _set(net["mirror"][0, circuit, :n], modes.mirror)
+        net["unbalanced"][0, circuit] = modes.mirror.any()
         net["drive"][0, circuit] = 0.0
         for j, source in enumerate(sources):
             for place in places[source]:

@@ -197,6 +197,14 @@ def _part_is_enough(schema: dict[str, Any]) -> None:
     schema.pop("required")  # ``Protection`` completes it
 
 
+class SecondInductor(Options):
+    """The second inductor of an LCL filter, or the leakage of the converter's own transformer,
+    between filter capacitor and point of connection."""
+
+    L: Positive = Field(description="p.u. of the converter")
+    R: NonNegative = Field(0.0, description="p.u. of the converter")
+
+
 class Trip(Options):
     """One protection: trips when its threshold stays crossed for a time."""
 
@@ -277,6 +285,11 @@ class Plant(Options):
         description="peak-current limit of the bridge, p.u.: its hardware blocks pulses so that "
         "the current of L_f stays within; none if not given",
     )
+    lcl: SecondInductor | None = Field(
+        None,
+        description="second inductor of the filter; the line, and grid.scr, then begin behind it, "
+        "at the point of connection, which in a network is the node; none: an LC filter",
+    )
     grid: Grid = Field(Grid(), description="grid simulator at the start")
     sensors: Sensors = Field(
         Sensors(), description="what stands between the true quantities and the A/D"
@@ -330,6 +343,29 @@ class Line(Options):
     end: str = Field(min_length=1, description="node at its end")
     L: Positive = Field(description="p.u. of the first converter")
     R: NonNegative = Field(0.0, description="p.u. of the first converter")
+    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
+
+
+class Transformer(Options):
+    """A transformer between two nodes: its leakage in series, and its magnetising inductance from
+    the start to ground. It has the ratio of the nominal voltages, so that in p.u. it has none; the
+    angle by which a delta winding turns all voltages is left out, and it does not saturate. For a
+    zero sequence the earthed star point of one side, with a delta on the other, is a path to ground
+    through the leakage."""
+
+    start: str = Field(min_length=1, description="node at its start, such as the converter's side")
+    end: str = Field(min_length=1, description="node at its end")
+    S: Positive = Field(description="rating over that of the first converter")
+    X: Positive = Field(description="leakage reactance, p.u. of its rating")
+    R: NonNegative = Field(0.0, description="resistance, p.u. of its rating")
+    X_m: Positive | None = Field(
+        None, description="magnetising reactance, p.u. of its rating; none: no magnetising current"
+    )
+    earthed: Literal["end", "start", "both", "none"] = Field(
+        "end",
+        description="where its star points are earthed; the other winding is a delta, and with "
+        "both a zero sequence passes through",
+    )
     closed: bool = Field(True, description="whether its breaker is closed when the run begins")
 
 
@@ -399,6 +435,7 @@ class NetworkParts(Options):
         None, min_length=1, description="node of the grid of plant.grid; an island if none"
     )
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
+    transformers: dict[str, Transformer] = Field({}, description="between nodes, by name")
     loads: dict[str, Load] = Field({}, description="by name")
     constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")

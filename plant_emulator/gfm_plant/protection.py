@@ -62,7 +62,7 @@ def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
         i = own(k) + I_F
         s.x[0] = s.x[1] = now.w[i, 0] = now.w[i, 1] = s.i_source = s.E[0] = s.E[1] = 0.0
         now.row = 1 + k
-        enter(n, now, circuit(n, now))
+        enter(n, now, plant.st[0].tick, circuit(n, now))
         s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, now.omega_g, 0.0, 0.0
 
 

@@ -24,7 +24,7 @@ N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_RE
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
 N_RING = 256  # places of a ring that holds one cycle
 
-SIZES = {1: 5, 2: 16, 4: 32, 12: 96}
+SIZES = {1: 7, 2: 17, 4: 33, 12: 97}
 """Records come in sizes, because each is compiled once a computer: converters, and states of the
 circuit, that fit in."""
 N_SINKS = 4  # loads of constant power that fit; into the records of one converter, one
@@ -178,12 +178,14 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
     Circuits come in pairs of one row each without and with the fault: row 0 as the converters are,
     and row 1 + k with the bridge of converter k blocked besides. Sources are the bridges, then the
     positive and the negative sequence of the grid, then the machines, then the currents of the
-    loads of constant power. What swings is the grid, if
-    it is finite, in place 0, and the machines.
+    loads of constant power; in an unbalanced circuit their mirror images follow in the same
+    order. Such a circuit has up to two modes a state. What swings is the grid, if it is finite, in
+    place 0, and the machines.
     """
     n_m = N_MACHINES * (converters > 1)
     n_l = N_SINKS if converters > 1 else 1
     n_w, n_s, n_parts = SIZES[converters], converters + 2 + n_m + n_l, converters + 1
+    n_z = 2 * n_w
     n_c, n_swing = 2 * (converters + 1), 1 + n_m
     par = np.dtype(
         [
@@ -225,11 +227,13 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             # the modes of each circuit
             ("n_states", "i8"),  # of w, without those at its end that the plant does not have
             ("n_modes", "i8", (n_c,)),
-            ("rate", "f8", (n_c, n_w, 2)),  # real and imaginary part, also below; 1/s
-            ("decay", "f8", (n_c, 2 * n_parts, n_w, 2)),  # in half a piece of each cut
-            ("drive", "f8", (n_c, n_w, n_s, 2)),
-            ("states", "f8", (n_c, n_w, n_w, 2)),
-            ("modes", "f8", (n_c, n_w, n_w, 2)),
+            ("rate", "f8", (n_c, n_z, 2)),  # real and imaginary part, also below; 1/s
+            ("decay", "f8", (n_c, 2 * n_parts, n_z, 2)),  # in half a piece of each cut
+            ("drive", "f8", (n_c, n_z, n_s, 2)),
+            ("states", "f8", (n_c, n_w, n_z, 2)),
+            ("modes", "f8", (n_c, n_z, n_w, 2)),
+            ("unbalanced", "i8", (n_c,)),
+            ("mirror", "f8", (n_c, n_z, 2)),  # see `circuit.Modes`
             # of a synchro-check: the voltages of its two sides by w and by the sources; the largest
             # difference of voltage, p.u., speed, rad/s, and angle, rad; how long, and until when, s
             ("check_w", "f8", (n_c, 2, n_w)),
@@ -243,16 +247,16 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
         [
             # in the common frame, real and imaginary parts: modes, what drives them in the present
             # stretch (in its first and its second half), states, and the sources' unit phasors
-            ("z", "f8", (n_w, 2)),
-            ("forced", "f8", (n_w, 4)),
+            ("z", "f8", (n_z, 2)),
+            ("forced", "f8", (n_z, 4)),
             # each source's gain on the modes, for which speed and stretch, and turn in half a piece
-            ("gain", "f8", (n_s, n_w, 2)),
-            ("gain_omega", "f8", (n_s,)),
-            ("gain_part", "i8", (n_s,)),
-            ("turn", "f8", (n_s, 2)),
+            ("gain", "f8", (2 * n_s, n_z, 2)),
+            ("gain_omega", "f8", (2 * n_s,)),
+            ("gain_part", "i8", (2 * n_s,)),
+            ("turn", "f8", (2 * n_s, 2)),
             ("w", "f8", (n_w, 2)),
-            ("unit", "f8", (n_s, 2)),
-            ("halfway", "f8", (n_s, 2)),  # the unit phasors in the middle of a piece
+            ("unit", "f8", (2 * n_s, 2)),
+            ("halfway", "f8", (2 * n_s, 2)),  # the unit phasors in the middle of a piece
             ("w_before", "f8", (n_w, 2)),  # w at the last tick
             ("unit_before", "f8", (n_s, 2)),
             # the voltage that a load of constant power has measured, now, at the last tick, and

@@ -9,6 +9,10 @@ which is exact to rounding, however fast the mode is. The DC links and the senso
 through the quantities at the beginning, the middle and the end of a piece of time: Simpson's
 rule, whose error falls with the fourth power of the length. Complex numbers are pairs of reals:
 the compiled code is quicker that way.
+
+The modes of an unbalanced circuit are driven by the sources and by their mirror images
+conj(s) e^(-2 j omega_b t), which are phasors too: they turn at -omega where a source turns at
+omega. See `circuit.join_axes`.
 """
 
 from __future__ import annotations
@@ -61,10 +65,29 @@ def turned(x: float) -> tuple[float, float]:
 
 
 @compiled
+def mirror_at(n: Any, tick: int) -> tuple[float, float]:
+    """Return e^(-2 j omega_b t) at a tick: the mirror image of x is conj(x) times that."""
+    angle = -2.0 * n.omega_b * n.T_s * tick
+    return math.cos(angle), math.sin(angle)
+
+
+@compiled
+def mirror_sources(n: Any, now: Any, tick: int) -> None:
+    """Set the unit phasors of the sources' mirror images."""
+    m_r, m_i = mirror_at(n, tick)
+    images = len(now.unit) // 2
+    for k in range(images):
+        u_r, u_i = now.unit[k, 0], now.unit[k, 1]
+        now.unit[images + k, 0] = u_r * m_r + u_i * m_i
+        now.unit[images + k, 1] = u_r * m_i - u_i * m_r
+
+
+@compiled
 def drive(
     n: Any, now: Any, c: int, part: int, k: int, E_r: float, E_i: float, omega: float
 ) -> None:
-    """Add to the forcing of every mode what source k does to it, and turn its phasor.
+    """Add to the forcing of every mode what source k does to it, in an unbalanced circuit with its
+    mirror image, and turn their phasors.
 
     Args:
         n, now: elements of ``net`` and ``now``, also below.
@@ -73,8 +96,18 @@ def drive(
         E_r, E_i: the source's voltage over its unit phasor, p.u.
         omega: its speed, p.u.; negative for a negative sequence.
     """
+    _drive(n, now, c, part, k, k, E_r, E_i, omega)
+    if n.unbalanced[c]:
+        _drive(n, now, c, part, len(now.unit) // 2 + k, k, E_r, -E_i, -omega)
+
+
+@compiled
+def _drive(
+    n: Any, now: Any, c: int, part: int, k: int, source: int, E_r: float, E_i: float, omega: float
+) -> None:
+    """Drive by the phasor at place k: that of a source, or its mirror image."""
     if now.gain_omega[k] != omega or now.gain_part[k] != part:
-        _find_gains(n, now, c, part, k, omega)
+        _find_gains(n, now, c, part, k, source, omega)
     cos, sin = now.turn[k, 0], now.turn[k, 1]
     s_r = E_r * now.unit[k, 0] - E_i * now.unit[k, 1]
     s_i = E_r * now.unit[k, 1] + E_i * now.unit[k, 0]
@@ -85,6 +118,13 @@ def drive(
         now.forced[m, 1] += f_i
         now.forced[m, 2] += f_r * cos - f_i * sin
         now.forced[m, 3] += f_r * sin + f_i * cos
+    _turn_on(now, k)
+
+
+@compiled
+def _turn_on(now: Any, k: int) -> None:
+    """Take the phasor at place k on by a piece."""
+    cos, sin = now.turn[k, 0], now.turn[k, 1]
     u_r, u_i = now.unit[k, 0], now.unit[k, 1]
     h_r, h_i = u_r * cos - u_i * sin, u_r * sin + u_i * cos
     now.halfway[k, 0], now.halfway[k, 1] = h_r, h_i
@@ -101,7 +141,27 @@ def draw(
     """Add to the forcing of every mode what source k does to it, which is held at one value in the
     first half of a piece and at another in the second, in the common frame."""
     if now.gain_omega[k] != 1.0 or now.gain_part[k] != part:
-        _find_gains(n, now, c, part, k, 1.0)
+        _find_gains(n, now, c, part, k, k, 1.0)
+    _draw(n, now, c, k, first_r, first_i, second_r, second_i)
+    if n.unbalanced[c]:
+        j = len(now.unit) // 2 + k
+        if now.gain_omega[j] != -1.0 or now.gain_part[j] != part:
+            _find_gains(n, now, c, part, j, k, -1.0)
+        u_r, u_i = now.unit[j, 0], now.unit[j, 1]
+        _turn_on(now, j)
+        h_r, h_i = now.halfway[j, 0], now.halfway[j, 1]
+        _draw(
+            n, now, c, j, first_r * u_r + first_i * u_i, first_r * u_i - first_i * u_r,
+            second_r * h_r + second_i * h_i, second_r * h_i - second_i * h_r,
+        )  # fmt: skip
+
+
+@compiled
+def _draw(
+    n: Any, now: Any, c: int, k: int,
+    first_r: float, first_i: float, second_r: float, second_i: float,
+) -> None:  # fmt: skip
+    """Drive by two values of the source, or the mirror image, at place k."""
     for m in range(n.n_modes[c]):
         g_r, g_i = now.gain[k, m, 0], now.gain[k, m, 1]
         now.forced[m, 0] += g_r * first_r - g_i * first_i
@@ -111,9 +171,10 @@ def draw(
 
 
 @compiled
-def _find_gains(n: Any, now: Any, c: int, part: int, k: int, omega: float) -> None:
-    """Find what source k does to each mode in half a piece, per unit of its voltage; this stays
-    the same while its speed does, as that of an ideal grid."""
+def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega: float) -> None:
+    """Find what the phasor at place k, that of a source or its mirror image, does to each mode in
+    half a piece, per unit of its voltage; this stays the same while its speed does, as that of an
+    ideal grid."""
     speed = n.omega_b * (omega - 1.0)
     cos, sin = turned(speed * n.half_h[part])
     for m in range(n.n_modes[c]):
@@ -129,7 +190,10 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, omega: float) -> No
             f_i = z_i / 2.0 + z_r * z_i / 3.0
             a_r, a_i = h * n.decay[c, part, m, 0], h * n.decay[c, part, m, 1]
             g_r, g_i = a_r * f_r - a_i * f_i, a_r * f_i + a_i * f_r
-        b_r, b_i = n.drive[c, m, k, 0], n.drive[c, m, k, 1]
+        b_r, b_i = n.drive[c, m, source, 0], n.drive[c, m, source, 1]
+        if k != source:
+            x_r, x_i = n.mirror[c, m, 0], n.mirror[c, m, 1]
+            b_r, b_i = b_r * x_r - b_i * x_i, b_r * x_i + b_i * x_r
         now.gain[k, m, 0], now.gain[k, m, 1] = g_r * b_r - g_i * b_i, g_r * b_i + g_i * b_r
     now.turn[k, 0], now.turn[k, 1] = cos, sin
     now.gain_omega[k], now.gain_part[k] = omega, part
@@ -169,8 +233,9 @@ def circuit(n: Any, now: Any) -> int:
 
 
 @compiled
-def enter(n: Any, now: Any, c: int) -> None:
-    """Start the modes of circuit c from w, which is projected onto what that circuit can hold."""
+def enter(n: Any, now: Any, tick: int, c: int) -> None:
+    """Start the modes of circuit c at a tick from w, which is projected onto what that circuit can
+    hold."""
     for k in range(len(now.gain_part)):
         now.gain_part[k] = -1
     for m in range(n.n_modes[c]):
@@ -179,4 +244,15 @@ def enter(n: Any, now: Any, c: int) -> None:
             z_r += n.modes[c, m, i, 0] * now.w[i, 0] - n.modes[c, m, i, 1] * now.w[i, 1]
             z_i += n.modes[c, m, i, 0] * now.w[i, 1] + n.modes[c, m, i, 1] * now.w[i, 0]
         now.z[m, 0], now.z[m, 1] = z_r, z_i
+    if n.unbalanced[c]:
+        m_r, m_i = mirror_at(n, tick)
+        for m in range(n.n_modes[c]):
+            z_r = z_i = 0.0
+            for i in range(n.n_states):
+                z_r += n.modes[c, m, i, 0] * now.w[i, 0] + n.modes[c, m, i, 1] * now.w[i, 1]
+                z_i += n.modes[c, m, i, 1] * now.w[i, 0] - n.modes[c, m, i, 0] * now.w[i, 1]
+            f_r = n.mirror[c, m, 0] * m_r - n.mirror[c, m, 1] * m_i
+            f_i = n.mirror[c, m, 0] * m_i + n.mirror[c, m, 1] * m_r
+            now.z[m, 0] += z_r * f_r - z_i * f_i
+            now.z[m, 1] += z_r * f_i + z_i * f_r
     read_states(n, now, c)

@@ -2,7 +2,8 @@
 
 The difference of their voltages, speeds and angles must stay within its limits. The speed is that
 of the angle between them over a tick, through a low-pass of 20 ms as in a relay, which looks at
-whole cycles. A side below 0.2 p.u. is dead: it has no angle, and the check does not close onto it.
+whole cycles. A side below 0.2 p.u. is dead: it has no angle, and the check does not close onto it;
+nor does it close while an unbalanced fault is there.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def watch(plant: PlantRecords) -> None:
     b_r, b_i = _voltage(n, now, 1)
     a, b = math.sqrt(a_r * a_r + a_i * a_i), math.sqrt(b_r * b_r + b_i * b_i)
     angle = math.atan2(a_i * b_r - a_r * b_i, a_r * b_r + a_i * b_i)
-    agree = min(a, b) > _LEAST_V
+    agree = min(a, b) > _LEAST_V and not n.unbalanced[circuit(n, now)]
     if agree and now.check_looks > 0:
         turned = angle - now.check_seen[2]
         turned -= 2.0 * math.pi * math.floor(turned / (2.0 * math.pi) + 0.5)

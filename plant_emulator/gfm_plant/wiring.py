@@ -5,6 +5,7 @@ A wiring never changes: an event makes another one. Elements are in p.u. of the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -21,9 +22,15 @@ from gfm_plant.circuit import (
     Source,
     find_modes,
     find_voltage,
+    join_axes,
 )
+from gfm_plant.names import FAULTED_PHASES
 
 GRID_SOURCE = "grid"
+MAGNETISING = ".m"
+"""Behind the name of a transformer: its magnetising inductance, a branch to ground."""
+ALPHA, BETA = 0, 1
+"""The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
 
 
 @dataclass(frozen=True)
@@ -86,19 +93,58 @@ class Machine:
 
 @dataclass(frozen=True)
 class FaultPlace:
-    """Where the three phases are shorted to ground, and through what.
+    """Where phases are shorted, which, and through what.
 
     Attributes:
         node: the node, or the one at which the faulted branch starts.
         branch: name of the branch with the fault inside, or None: at the node itself.
         position: on that branch, in (0, 1).
-        R: p.u. of the network.
+        R: from each phase to ground, of kind LL from one phase to the other; p.u. of the network.
+        kind: a key of `FAULTED_PHASES`.
+        phases: one of that kind.
+        Z_0: R + jX of the zero sequence's path, p.u. of the network; None: that of the lines to the
+            grid, see `Wiring.zero_sequence`.
     """
 
     node: str
     branch: str | None
     position: float
     R: float
+    kind: str = "3ph"
+    phases: str = "abc"
+    Z_0: complex | None = None
+
+    @property
+    def balanced(self) -> bool:
+        """Whether it is the same in all three phases."""
+        return self.kind == "3ph"
+
+    @property
+    def angle(self) -> float:
+        """The axis of the phase that differs, rad."""
+        return 2 * math.pi / 3 * FAULTED_PHASES[self.kind].index(self.phases)
+
+    def seen(self, axis: int, Z_0: complex | None) -> complex | None:
+        """The impedance that the fault puts between the circuit of an axis and ground, p.u.; None:
+        it puts none there.
+
+        It follows from Clarke's transform of the currents and voltages at the fault, with v_0 =
+        -Z_0 i_0. LG, phase a: v_alpha + v_0 = R i_a, i_b = i_c = 0. LL, b to c: i_a = 0,
+        i_b = -i_c, v_b - v_c = R i_b. LLG, b and c: i_a = 0, v_b = R i_b, v_c = R i_c.
+
+        Args:
+            Z_0: impedance of the zero sequence's path; None: it has none, and no current.
+        """
+        match self.kind, axis:
+            case "LG", 0:
+                return None if Z_0 is None else 1.5 * self.R + 0.5 * Z_0
+            case "LLG", 0:
+                return None if Z_0 is None else 3 * self.R + 2 * Z_0
+            case "LL", 1:
+                return complex(self.R / 2)
+            case ("3ph", _) | ("LLG", 1):
+                return complex(self.R)
+        return None
 
 
 @dataclass(frozen=True)
@@ -132,6 +178,8 @@ class Wiring:
         fault: where one is, or may be again, or None.
         blocked: indices of converters whose bridges are out of every circuit.
         check: the synchro-check that waits to close a breaker, or None.
+        transformers: names of the branches that are one, and where it is earthed: as
+            `options.Transformer`.
     """
 
     omega_b: float
@@ -147,13 +195,17 @@ class Wiring:
     fault: FaultPlace | None = None
     blocked: frozenset[int] = frozenset()
     check: Check | None = None
+    transformers: tuple[tuple[str, str], ...] = ()
 
     @property
     def order(self) -> tuple[str, ...]:
         """Names of the states as w has them: three a converter, the branches, the banks' voltages,
-        and what a fault within a branch adds: the current beyond it."""
+        and what a fault adds: the current beyond it within a branch, and its own through the
+        inductance of the zero sequence's path."""
         own = tuple(name for unit in self.units for name in unit.states)
-        beyond = () if self.split is None else ("beyond",)
+        beyond: tuple[str, ...] = () if self.split is None else ("beyond",)
+        if self.fault is not None and self.fault.kind in ("LG", "LLG"):
+            beyond += ("fault",)
         others = [part.name for part in (*self.branches, *self.machine_branches)]
         others += [bank.name for bank in self.capacitors]
         return (*own, *others, *beyond)
@@ -184,7 +236,8 @@ class Wiring:
         return tuple(Branch(m.name, m.emf, m.node, m.X, m.R) for m in self.machines)
 
     def named_lines(self) -> dict[str, Branch]:
-        """Lines by the name that people use: a converter's line has that of the converter."""
+        """Lines and transformers by the name that people use: a converter's line has that of the
+        converter."""
         own = {unit.name: line for unit, line in zip(self.units, self.units_lines, strict=True)}
         return own | {b.name: b for b in self.branches if b.end != GROUND}
 
@@ -192,7 +245,8 @@ class Wiring:
     def has_load(self) -> bool:
         """Whether anything is left to feed without the grid."""
         return bool(self.shunts or self.sinks) or any(
-            branch.end == GROUND for branch in self.branches
+            branch.end == GROUND and not branch.name.endswith(MAGNETISING)
+            for branch in self.branches
         )
 
     def to_grid(self) -> dict[str, float]:
@@ -220,7 +274,9 @@ class Wiring:
         its two ends."""
         found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
         lines = (*self.branches, *self.machine_branches)
-        found |= {b.name: (b.name, b.start, b.end) for b in lines}
+        found |= {
+            b.name: (b.name, b.start, b.end) for b in lines if not b.name.endswith(MAGNETISING)
+        }
         to_ground: tuple[Shunt | Sink, ...] = (*self.shunts, *self.sinks)
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
@@ -234,22 +290,66 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
-        branches, capacitors, sources, shunts, _ = self._circuit(blocked, faulted)
         sinks = [sink for sink in self.sinks if sink.name not in self.opened]
-        parts = branches, capacitors, sources
-        modes = find_modes(*parts, self.omega_b, self.order, shunts, sinks)
-        return modes, [part.name for part in sources] + [part.name for part in sinks]
+        unbalanced = faulted and self.fault is not None and not self.fault.balanced
+        found = []
+        for axis in (ALPHA, BETA) if unbalanced else (ALPHA,):
+            branches, capacitors, sources, shunts, _ = self._circuit(blocked, faulted, axis)
+            parts = branches, capacitors, sources
+            found.append(find_modes(*parts, self.omega_b, self.order, shunts, sinks))
+        names = [part.name for part in sources] + [part.name for part in sinks]
+        if not unbalanced:
+            return found[0], names
+        assert self.fault is not None
+        alpha, beta = found
+        return join_axes(alpha, beta, self.fault.angle), names
+
+    def zero_sequence(self) -> complex | None:
+        """The impedance between the place of the fault and ground for a zero sequence at nominal
+        frequency, p.u.; None: there is no path.
+
+        It is the fault's own ``Z_0``, or that of the closed lines between the fault and the earthed
+        star points of the grid and of transformers; lines have the same impedance for all
+        sequences. Converters, machines and loads have three wires: behind the delta winding of a
+        transformer a zero sequence finds no path.
+        """
+        if self.fault is None or self.fault.Z_0 is not None:
+            return None if self.fault is None else self.fault.Z_0
+        earthed, found = dict(self.transformers), []
+        for branch in self._whole((*self.units_lines, *self.branches)):
+            if branch.end == GROUND or earthed.get(branch.name) == "none":
+                continue
+            ends = {"end": {branch.start}, "start": {branch.end}}.get(
+                earthed.get(branch.name, ""), {self.grid} if self.closed else set()
+            )  # which of its ends are at ground
+            one, other = (GROUND if end in ends else end for end in (branch.start, branch.end))
+            found.append((one, other, 1 / complex(branch.R, branch.L)))
+        reached = {GROUND}
+        while more := {end for a, b, _ in found if {a, b} & reached for end in (a, b)} - reached:
+            reached |= more
+        place = "beyond" if self.split else self.fault.node
+        if place not in reached:
+            return None
+        nodes = sorted(reached - {GROUND})
+        Y = np.zeros((len(nodes), len(nodes)), complex)
+        for a, b, y in found:
+            if a in reached:
+                at = [nodes.index(end) for end in (a, b) if end != GROUND]
+                sign = np.array([1.0, -1.0][: len(at)])
+                Y[np.ix_(at, at)] += np.outer(sign, sign) * y
+        return complex(np.linalg.inv(Y)[nodes.index(place), nodes.index(place)])
 
     def voltage(
         self, node: str, blocked: frozenset[int], faulted: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The voltage of a node in a circuit as factors of w and of the sources, see
+        """The voltage of a node in a balanced circuit as factors of w and of the sources, see
         ``find_voltage``; of a node where no current can flow, that of what it hangs on.
 
         Args:
             blocked, faulted: as for ``modes``.
         """
-        branches, capacitors, sources, shunts, hanging = self._circuit(blocked, faulted)
+        parts = self._circuit(blocked, faulted, ALPHA)
+        branches, capacitors, sources, shunts, hanging = parts
         there = {end for branch in branches for end in (branch.start, branch.end)}
         there |= {part.node for part in capacitors} | {part.node for part in sources}
         seen, reached = {node}, [node]
@@ -265,14 +365,20 @@ class Wiring:
         return np.zeros(len(self.order)), np.zeros(len(sources))
 
     def _circuit(
-        self, blocked: frozenset[int], faulted: bool
+        self, blocked: frozenset[int], faulted: bool, axis: int
     ) -> tuple[list[Branch], list[Capacitor], list[Source], list[Shunt], list[Branch]]:
-        """The parts of a circuit, and the branches that an open breaker has left hanging."""
+        """The parts of a circuit, and the branches that an open breaker has left hanging; of an
+        unbalanced one those of an axis."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
+        through_fault = []
         if faulted and self.fault is not None:
             node = "beyond" if self.split else self.fault.node
-            shunts = _with_shunt(shunts, Shunt("fault", node, self.fault.R))
+            seen = self.fault.seen(axis, self.zero_sequence())
+            if seen is not None and seen.imag > 0:
+                through_fault.append(Branch("fault", node, GROUND, seen.imag, seen.real))
+            elif seen is not None:
+                shunts = _with_shunt(shunts, Shunt("fault", node, seen.real))
         for k, unit in enumerate(self.units):
             if k not in blocked:
                 i_f = unit.states[0]
@@ -282,6 +388,7 @@ class Wiring:
             *self._whole(self.units_lines),
             *filters,
             *self._whole((*self.branches, *self.machine_branches)),
+            *through_fault,
         ]
         sources += [Source(machine.emf, machine.emf) for machine in self.machines]
         capacitors = [Capacitor(unit.states[1], unit.terminal, unit.C_f) for unit in self.units]

@@ -50,6 +50,22 @@ def test_a_fault_is_marked_at_its_place(make: Make) -> None:
     assert places[2] - places[0] == pytest.approx(2 * (places[1] - places[0]))
 
 
+def test_a_transformer_and_a_second_inductor_are_drawn(make: Make) -> None:
+    unit = {"node": "low", "plant": {"lcl": {"L": 0.08, "R": 0.01}}}
+    step_up = {"start": "low", "end": "high", "S": 2.0, "X": 0.12, "X_m": 100.0, "closed": False}
+    network = {"grid": "high", "converters": {"A": unit}, "transformers": {"T": step_up}}
+    scenario = make(network=network)
+    shown = texts(scenario)
+    assert "T\nS 2, X 0.12, R 0, $X_m$ 100" in shown and "$L_2$ 0.08\n$R_2$ 0.01" in shown
+    assert breakers(scenario) == [True, False]
+    outlines = [p for p in fill_diagram(Figure(), scenario).patches if isinstance(p, Circle)]
+    assert sum(p.get_radius() == 0.24 and not p.fill for p in outlines) == 2
+    alone = make(plant={"lcl": {"L": 0.08}, "grid": {"scr": 4.0, "x_over_r": 3.0}}, events=[FAULT])
+    assert "$L_2$ 0.08\n$R_2$ 0\n$L_g$ 0.237\n$R_g$ 0.079\nSCR 4" in texts(alone)
+    lg = {**FAULT, "kind": "LG", "phases": "c"}
+    assert "LG fault of c, 0.02 s" in texts(make(events=[lg]))
+
+
 def test_a_network_has_all_its_parts() -> None:
     scenario = load_scenario("three_share_a_load")
     shown = texts(scenario)

@@ -86,12 +86,15 @@ def test_every_event_and_changes_of_law(link, make, run, place):
             {"tick": 200, "type": "grid-voltage", "V_g": 0.98, "duration": 0.005},
             {"tick": 300, "type": "grid-phase-jump", "degrees": 0.5},
             {"tick": 400, "type": "grid-impedance", "L_g": 9.0, "R_g": 9.0},
+            {"tick": 420, "type": "fault", "kind": "LG", "phases": "b", "position": 0.4, "R": 1.0,
+             "duration": 0.005},
+            {"tick": 440, "type": "grid-unbalance", "retained": [1.0, 0.9, 1.0], "duration": 0.004},
             {"tick": 500, "type": "grid-breaker", "closed": False},
             {"tick": 600, "type": "grid-breaker", "closed": True},
             {"tick": 700, "type": "law", "law": "droop-1"},
             {"tick": 799, "type": "reference", "Q_ref": 0.01},
         ],
-    }
+    }  # fmt: skip
     ported, _ = three_ways(content, link, make, run, place)
     assert [e["law"] for e in ported.log if e["event"] == "law-active"] == ["vsg-2", "droop-1"]
 

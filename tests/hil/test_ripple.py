@@ -72,6 +72,16 @@ def test_an_unbalance_explains_even_multiples_while_it_lasts():
     assert ripple(wave, events=[SAG, over]).oscillates == "p"
 
 
+def test_an_unbalanced_fault_explains_even_multiples_until_it_is_cleared():
+    wave = 0.1 * np.sin(2 * np.pi * 100 * t)
+    fault = {"t": 1.0, "type": "fault", "position": 0.5, "R": 0.1}
+    clear = {"t": 1.5, "type": "fault-clear"}
+    assert not ripple(wave, events=[{**fault, "kind": "LL"}]).oscillates
+    assert ripple(wave, events=[fault]).oscillates == "p"
+    assert ripple(wave, events=[{**fault, "kind": "LG", "duration": 0.5}]).oscillates == "p"
+    assert ripple(wave, events=[{**fault, "kind": "LG"}, clear]).oscillates == "p"
+
+
 def test_a_run_is_judged_over_what_follows_its_last_event():
     wave = 0.1 * np.sin(2 * np.pi * 50 * t)
     assert ripple(wave, ticks=12_200).span_s == pytest.approx(0.11)

@@ -259,6 +259,12 @@ events = st.one_of(
     kind("grid-phase-jump", degrees=st.floats(-180, 180)),
     kind("grid-impedance", L_g=st.floats(0.5, 100), R_g=st.floats(0, 100)),
     kind("grid-breaker", closed=st.booleans()),
+    kind(
+        "fault",
+        position=st.floats(0, 0.9),
+        R=st.floats(0.1, 1),
+        kind=st.sampled_from(["3ph", "LL"]),
+    ),
 )
 contents = st.fixed_dictionaries(
     {"title": text, "description": text, "duration": st.floats(0.91, 100)},

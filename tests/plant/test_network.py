@@ -70,9 +70,12 @@ def go(plant: Network, u: np.ndarray, ticks: int) -> None:
         plant_step(plant.records)
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.3])
-def test_against_an_adaptive_integrator(factor: float) -> None:
-    """Two converters, the second with other elements, at two nodes with a capacitor bank each."""
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(1.0, "none"), (1.3, "none"), (1.3, "LL"), (1.0, "LG")]
+)
+def test_against_an_adaptive_integrator(factor: float, kind: str) -> None:
+    """Two converters, the second with other elements, at two nodes with a capacitor bank each; a
+    fault connects phases c and a at the second node, or phase b and ground."""
     plant = make(
         {"a": ({}, "m"), "b": ({"factors": {"L_f": factor, "C_f": 1 / factor, "C_dc": 0.8}}, "n")},
         lines={"l": {"start": "m", "end": "n", "L": 0.2, "R": 0.03}},
@@ -87,6 +90,21 @@ def test_against_an_adaptive_integrator(factor: float) -> None:
     u[1] += [-0.02, -1e-3, -0.02, 0.0]
     w_b, par = plant.wiring.omega_b, plant.par
     z = 0.8**2 + 0.3**2
+    axes = np.exp(2j * np.pi / 3 * np.array([0, 1, -1]))
+    R, Z_0 = 4.0, 0.1 + 0.5j
+    if kind != "none":
+        more = {"kind": "LL", "phases": "ca"} if kind == "LL" else {"phases": "b", "Z_0": Z_0}
+        fault(plant, None, R, node="n", **{"kind": "LG", **more})
+
+    def leak(t: float, v: complex, i_0: float) -> tuple[complex, float]:
+        """The fault's current, without zero sequence, and the d/dt of its zero sequence."""
+        turn = np.exp(1j * w_b * t)
+        v_a, v_b, v_c = (v * turn * axes.conj()).real
+        if kind == "LG":  # the current of b returns through Z_0: v_b + v_0 = 3 R i_0
+            i_abc, di_0 = [0.0, 3 * i_0, 0.0], (v_b - (3 * R + Z_0.real) * i_0) / Z_0.imag
+        else:
+            i_abc, di_0 = [(v_a - v_c) / R, 0.0, (v_c - v_a) / R], 0.0
+        return 2 / 3 * np.dot(i_abc, axes) / turn * (kind != "none"), w_b * di_0
 
     def slope(t: float, s: np.ndarray) -> np.ndarray:
         i_f, v, i_o = s[0:6:3], s[1:6:3], s[2:6:3]
@@ -100,13 +118,14 @@ def test_against_an_adaptive_integrator(factor: float) -> None:
         out[6] = w_b / 0.2 * (v_m - v_n - 0.03 * i_l)
         out[7] = w_b / (0.3 / z) * (v_n - 0.8 / z * i_z)
         out[8] = w_b / 0.05 * (i_o[0] - i_l - 0.4 * v_m)
-        out[9] = w_b / 0.08 * (i_o[1] + i_l - i_z)
+        away, out[12] = leak(t, v_n, s[12].real)
+        out[9] = w_b / 0.08 * (i_o[1] + i_l - i_z - away)
         out[:10] -= 1j * w_b * s[:10]
         drawn = (e * i_f.conj()).real
         out[10:12] = w_b / par["C_dc"] * (u[:, 0] - drawn / v_dc)
         return out
 
-    s0 = np.concatenate([w0[:10], [1.0, 1.0]])
+    s0 = np.concatenate([w0[:10], [1.0, 1.0, 0.0]])
     exact = solve_ivp(slope, (0, 0.05), s0, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     go(plant, u, 500)
     w = plant.now["w"][0] @ [1, 1j]
@@ -263,6 +282,99 @@ def test_a_fault_at_a_node_is_that_at_the_end_of_every_line_to_it() -> None:
     assert at_node.st["x"] == pytest.approx(on_line.st["x"], abs=1e-12)
 
 
+def test_a_fault_in_two_axes_is_one_in_three_phases() -> None:
+    """Two phases bolted to an ideal ground hold the third one there too: with machine, load of
+    constant power, delays and a trip, the circuits of two axes are as the balanced ones."""
+    found = []
+    for more in ({"kind": "LLG", "phases": "ab", "Z_0": 0j}, {}):
+        late = {"samples": 1, "fraction": 0.4}
+        trips = {**OFF, "over_current": {"threshold": 1.5}}
+        plant = make(
+            {"a": ({"delay": late}, "bus"), "b": ({"delay": late, "protection": trips}, "bus")},
+            lines={"l": {"start": "bus", "end": "far", "L": 0.3, "R": 0.02}},
+            capacitors={"c": {"node": "far", "Q": 0.1}},
+            constant_power={"d": {"node": "far", "P": 0.2}},
+            machines={"M": {"node": "bus", "S": 2.0, "H": 3.0, "P": 0.0}},
+        )
+        u = np.zeros((2, 4))
+        u[:, 1], u[:, 2] = 1.0, [1.0, 1.02]
+        x = np.zeros((2, 8))
+        x[:, DELTA], x[:, V_DC] = [0.05, 0.02], 1.0
+        plant.start(x, u, [(0.0, 1.0)])
+        go(plant, u, 20)
+        fault(plant, 0.6, 0.0, duration=0.03, line="l", **more)
+        for _ in range(5):
+            go(plant, u, 100)
+            take_out(plant)
+        found.append((plant.st["x"].copy(), plant.now["omega"].copy(), plant.st["trip"].copy()))
+    assert found[0][2].tolist() == found[1][2].tolist() == [0, 1]
+    for one, other in zip(found[0][:2], found[1][:2], strict=True):
+        assert one == pytest.approx(other, abs=1e-9)
+
+
+def test_a_transformer_is_its_leakage_and_its_magnetising_inductance() -> None:
+    """In p.u. of its own rating: as a line and a load of reactive power alone."""
+    converters = {"a": ({}, "m"), "b": ({"lcl": {"L": 0.1, "R": 0.02}}, "m")}
+    transformer = {"start": "m", "end": "far", "S": 2.0, "X": 0.2, "R": 0.02, "X_m": 10.0}
+    paper = Plant().real_factors()
+    assert not paper
+    nominal = load_converter("paper").pu()
+    longer = {"factors": {"L_g": 0.1 / nominal["L_g"], "R_g": 0.02 / nominal["R_g"]}}
+    one = make(converters, grid="far", transformers={"t": transformer})
+    other = make(
+        {"a": ({}, "m"), "b": (longer, "m")}, grid="far",
+        lines={"t": {"start": "m", "end": "far", "L": 0.1, "R": 0.01}},
+        loads={"z": {"node": "m", "P": 0.0, "Q": 0.2}},
+    )  # fmt: skip
+    assert one.wiring.order[-2:] == ("t", "t.m")
+    assert set(one.wiring.breakers()) == {"a", "b", "t"} and not one.wiring.has_load
+    for plant in (one, other):
+        u = start(plant, 1.0, [0.1, 0.15])
+        phase_jump(plant, 10.0)
+        go(plant, u, 300)
+    assert one.st["x"] == pytest.approx(other.st["x"], abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("earthed", "node", "Z_0"),
+    [
+        ("end", "n", 1 / (1 / (0.005 + 0.05j) + 1 / (0.02 + 0.2j))),
+        ("end", "m", None),
+        ("start", "m", 0.005 + 0.05j),
+        ("start", "n", 0.02 + 0.2j),
+        ("both", "m", 0.005 + 0.05j + 0.02 + 0.2j),
+        ("none", "n", 0.02 + 0.2j),
+        ("none", "m", None),
+    ],
+)
+def test_the_path_of_a_zero_sequence(earthed: str, node: str, Z_0: complex | None) -> None:
+    """Leakage and line, in series or in parallel, by hand."""
+    plant = make(
+        {"a": ({}, "m")}, grid="far",
+        transformers={
+            "t": {"start": "m", "end": "n", "S": 4.0, "X": 0.2, "R": 0.02, "earthed": earthed}
+        },
+        lines={"l": {"start": "n", "end": "far", "L": 0.2, "R": 0.02}},
+    )  # fmt: skip
+    u = start(plant, 1.0, 0.1)
+    if Z_0 is None:
+        with pytest.raises(ValueError, match=f"X_0: not set, and no closed line.*node {node}"):
+            fault(plant, None, 0.1, node=node, kind="LG")
+        return
+    fault(plant, None, 0.1, node=node, kind="LG")
+    assert plant.wiring.zero_sequence() == pytest.approx(Z_0, abs=1e-15)
+    go(plant, u, 100)
+    told = make(
+        {"a": ({}, "m")}, grid="far",
+        lines={"t": {"start": "m", "end": "n", "L": 0.05, "R": 0.005},
+               "l": {"start": "n", "end": "far", "L": 0.2, "R": 0.02}},
+    )  # fmt: skip
+    start(told, 1.0, 0.1)
+    fault(told, None, 0.1, node=node, kind="LG", Z_0=Z_0)
+    go(told, u, 100)
+    assert plant.st["x"] == pytest.approx(told.st["x"], abs=1e-11)
+
+
 BUS = {"a": ({}, "bus")}
 
 
@@ -276,6 +388,12 @@ BUS = {"a": ({}, "bus")}
         ({"loads": {"y": {"node": "bus", "P": 0.1}, "z": {"node": "bus", "P": 0.1}}},
          "y and z: two resistors at node bus"),
         ({}, "node bus: only a.i_o ends there"),
+        ({"transformers": {"t": {"start": "bus", "end": "x", "S": 1.0, "X": 0.1}}},
+         "node x: only t ends there"),
+        ({"transformers": {"a": {"start": "bus", "end": "x", "S": 1.0, "X": 0.1}}},
+         "a is the name of two parts"),
+        ({"transformers": {"t": {"start": "y", "end": "x", "S": 1.0, "X": 0.1}}},
+         "t is at node 'y', which has no path"),
     ],
 )  # fmt: skip
 def test_impossible_networks(parts: dict[str, Any], message: str) -> None:
@@ -289,6 +407,7 @@ def test_impossible_networks(parts: dict[str, Any], message: str) -> None:
         (lambda p: fault(p, None, 0.1, node="x"), r"node = 'x': must be one of \['bus', 'far'\]"),
         (lambda p: fault(p, 0.5, 0.1, line="x"), r"line = 'x': must be one of \['a', 'l'\]"),
         (lambda p: fault(p, None, 0.1, node="far"), "node = 'far': is an ideal voltage"),
+        (lambda p: fault(p, 0.5, 0.1, line="l", kind="LGG"), "kind = 'LGG': must be one of"),
         (lambda p: line_breaker(p, "x", closed=False), r"name = 'x': must be one of \['a', 'l'\]"),
     ],
 )

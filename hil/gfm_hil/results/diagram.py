@@ -67,7 +67,8 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
             _converter(axes, row, converter, plants[converter], laws[converter])
             _wire(axes, (_LINE, -_ROW * row), (x, -_ROW * row))
             _inductor(axes, _LINE + 0.2, -_ROW * row)
-            spots[converter] = -_ROW * row, _TERMINAL, x
+            behind = not converter and plants[converter].lcl is not None
+            spots[converter] = -_ROW * row, _LINE + 1.1 if behind else _TERMINAL, x
         for row, (kind, text, closed) in zip(bar.rows, bar.right, strict=False):
             _hang(axes, x, -_ROW * row, kind, text, closed)
         ys = [-_ROW * row for row in bar.rows]
@@ -79,7 +80,10 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
     for name, (row, start, end, text, closed) in lines.items():
         (left, right), y = sorted((_at(bars[start]), _at(bars[end]))), -_ROW * row
         _wire(axes, (left, y), (right, y))
-        _inductor(axes, (left + right) / 2 - 0.4, y)
+        if scenario.network is not None and name in scenario.network.transformers:
+            _windings(axes, (left + right) / 2, y)
+        else:
+            _inductor(axes, (left + right) / 2 - 0.4, y)
         _breaker(axes, left + 0.5, y, closed)
         axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
         spots[name] = (y, left, right) if _at(bars[start]) == left else (y, right, left)
@@ -122,7 +126,12 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
         for name, line in network.lines.items():
             text = f"L {line.L:.3g}, R {line.R:.3g} p.u."
             lines[name] = 0, line.start, line.end, text, line.closed
-            for node in (line.start, line.end):
+        for name, one in network.transformers.items():
+            text = f"S {one.S:g}, X {one.X:.3g}, R {one.R:.2g}"
+            text += "" if one.X_m is None else f", $X_m$ {one.X_m:g}"
+            lines[name] = 0, one.start, one.end, text, one.closed
+        for _, start, end, *_ in lines.values():
+            for node in (start, end):
                 bars.setdefault(node, _Bar())
         for name, load in network.loads.items():
             text = f"{name}\nP {load.P:g}, Q {load.Q:g} p.u."
@@ -193,6 +202,14 @@ def _inductor(axes: Axes, x: float, y: float) -> None:
                            lw=1.1, zorder=3))  # fmt: skip
 
 
+def _windings(axes: Axes, x: float, y: float) -> None:
+    """Two circles that overlap, in place of the wire between them."""
+    for side in (-0.13, 0.13):
+        axes.add_patch(Circle((x + side, y), 0.24, fc="white", ec="none", zorder=2.5))
+    for side in (-0.13, 0.13):
+        axes.add_patch(Circle((x + side, y), 0.24, fc="none", ec=_INK, lw=1.1, zorder=3))
+
+
 def _capacitor(axes: Axes, x: float, y: float) -> None:
     """From a wire down to ground."""
     _wire(axes, (x, y), (x, y - 0.3))
@@ -230,7 +247,10 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
     axes.plot([_TERMINAL], [y], "o", ms=3.5, color=_INK)
     title = f"{name}: {law}" if name else law
     axes.text(0.0, y + 0.47, f"{title}, {parameters.S_n / 1e3:g} kVA", fontsize=8.5, color=_INK)
-    line = f"$L_g$ {pu['L_g']:.3g}\n$R_g$ {pu['R_g']:.2g}"
+    second, line = plant.lcl, f"$L_g$ {pu['L_g']:.3g}\n$R_g$ {pu['R_g']:.2g}"
+    if second is not None:
+        own = f"$L_2$ {second.L:.3g}\n$R_2$ {second.R:.2g}"
+        line = own if name else f"{own}\n{line}"
     if not name:  # alone at its grid
         line += f"\nSCR {1 / abs(complex(pu['R_g'], pu['L_g'])):.3g}"
     for x, text in (
@@ -277,4 +297,4 @@ def _fault(
     _wire(axes, *((x + a, y + b) for a, b in flash), colour=_RED)
     axes.plot([x], [y], "v", ms=5, color=_RED, zorder=4)
     t = event.at(scenario.T_s) * scenario.T_s
-    axes.text(x + 0.26, y + 0.5, f"fault, {t:g} s", fontsize=7.5, color=_RED)
+    axes.text(x + 0.26, y + 0.5, f"{event.what}, {t:g} s", fontsize=7.5, color=_RED)

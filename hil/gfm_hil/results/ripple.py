@@ -5,7 +5,8 @@ spread over all frequencies, counts for little. It is judged over the last secon
 has passed since the last disturbance, over the second half of that time: what a disturbance set
 going has had as long to die away before. A ripple that has halved since the stretch before, of the
 same length, is dying away, and one that the last half of the stretch does not show was a step. An
-unbalance of the grid that is still there explains the even multiples of the grid's frequency.
+unbalance of the grid, or an unbalanced fault, that is still there explains the even multiples of
+the grid's frequency.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy.fft import next_fast_len
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.scenario.events import GridUnbalance
+from gfm_hil.scenario.events import Fault, GridUnbalance
 from gfm_hil.scenario.model import Scenario
 
 _SIGNALS = {"p": "p", "V": "V", "omega_u": "omega_u", "i": "|i|"}
@@ -109,15 +110,29 @@ def _even_multiples(
     scenario: Scenario, signals: Columns, log: Sequence[dict[str, Any]], done: int
 ) -> list[float]:
     """Frequencies, Hz, that an unbalance in force explains."""
-    last = next((e for e in reversed(log) if e["event"] == "grid-unbalance"), None)
-    if last is None or last["label"] == _EQUAL:
+    timed = [
+        (e.type, e.at(scenario.T_s))
+        for e in scenario.events
+        if isinstance(e, GridUnbalance | Fault) and e.duration is not None
+    ]
+    last = [_last(log, "grid-unbalance"), _last(log, "fault", "fault-clear")]
+    here = [
+        e
+        for e in last
+        if e is not None
+        and e["label"] != _EQUAL
+        and not e["label"].startswith("fault")  # of three phases, or cleared
+        and (e["event"], e["tick"]) not in timed
+    ]
+    if not here:
         return []
-    for e in scenario.events:
-        over = isinstance(e, GridUnbalance) and e.duration is not None
-        if over and e.at(scenario.T_s) == last["tick"]:
-            return []
     f_g = float(signals["true_omega_g"][done - 1 : done][0]) * nominal_frequency(scenario)
     return [2 * f_g, 4 * f_g]
+
+
+def _last(log: Sequence[dict[str, Any]], *kinds: str) -> dict[str, Any] | None:
+    """The last event of some kinds."""
+    return next((e for e in reversed(log) if e["event"] in kinds), None)
 
 
 def _sinusoid(x: NDArray[Any], T_s: float, explained: Sequence[float]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from gfm_plant.names import FAULTED_PHASES
 from gfm_runtime.signals import SIGNALS
 
 if TYPE_CHECKING:  # an operator's command loads no compiler
@@ -283,7 +284,8 @@ class GridUnbalance(_Event):
 
 
 class Fault(_Event):
-    """A three-phase fault to ground on a line, or at a node of a network, through ``R`` [p.u.]."""
+    """A fault on a line, or at a node of a network, through ``R`` [p.u.]: three phases or one (LG)
+    or two (LLG) to ground, or two to each other (LL)."""
 
     type: Literal["fault"] = Field(description="kind of event")
     position: float | None = Field(
@@ -291,13 +293,32 @@ class Fault(_Event):
         ge=0,
         lt=1,
         description="place on the line: 0 at its start, which for a converter's line is the filter "
-        "capacitor, 1 at its end",
+        "capacitor, with plant.lcl the point of connection; 1 at its end",
     )
     line: str | None = Field(
         None, description="in a network: name of the line, or of the converter whose line it is"
     )
     node: str | None = Field(None, description="in a network: the node, in place of a position")
-    R: float = Field(ge=0, le=1e6, description="resistance, p.u.; at least 1e-4 at a capacitor")
+    kind: Literal["3ph", "LG", "LL", "LLG"] = Field("3ph", description="which phases it connects")
+    phases: str | None = Field(
+        None, description="a, b or c (LG); bc, ca or ab (LL, LLG); the first of these if none"
+    )
+    R: float = Field(
+        ge=0,
+        le=1e6,
+        description="resistance from each phase to ground, of an LL fault between the two, p.u.; "
+        "at least 1e-4 at a capacitor",
+    )
+    X_0: float | None = Field(
+        None,
+        ge=0,
+        le=1e6,
+        description="of LG and LLG: reactance to ground for the zero sequence, p.u.; that of the "
+        "lines to earthed star points if neither X_0 nor R_0 is given",
+    )
+    R_0: float | None = Field(
+        None, ge=0, le=1e6, description="of LG and LLG: resistance for the zero sequence, p.u."
+    )
     duration: float | None = Field(
         None, gt=0, description="s until it is cleared; none: fault-clear clears it"
     )
@@ -310,14 +331,26 @@ class Fault(_Event):
             raise ValueError(f"line = {self.line!r}: goes with a position")
         return self
 
+    @property
+    def Z_0(self) -> complex | None:
+        """Impedance for the zero sequence, p.u.; None: that of the lines to star points."""
+        if self.X_0 is None and self.R_0 is None:
+            return None
+        return complex(self.R_0 or 0.0, self.X_0 or 0.0)
+
+    @property
+    def what(self) -> str:
+        """The kind and the phases, in words."""
+        if self.kind == "3ph":
+            return "fault"
+        return f"{self.kind} fault of {self.phases or FAULTED_PHASES[self.kind][0]}"
+
     def label(self) -> str:
         line = "the line" if self.line is None else f"line {self.line}"
-        where = f"{self.position:g} of {line}" if self.position else "the filter"
-        if self.position == 0 and self.line is not None:
-            where = f"the start of {line}"
+        where = f"{self.position:g} of {line}" if self.position else f"the start of {line}"
         if self.node is not None:
             where = f"node {self.node}"
-        return f"fault at {where}" + (f" for {self.duration:g} s" if self.duration else "")
+        return f"{self.what} at {where}" + (f" for {self.duration:g} s" if self.duration else "")
 
 
 class FaultClear(_Event):
@@ -447,8 +480,9 @@ def apply_grid_event(event: Any, plant: Network) -> None:
             grid.grid_unbalance(plant, event.factors(), event.duration)
         case Fault():
             grid.fault(
-                plant, event.position, event.R, event.duration, line=event.line, node=event.node
-            )
+                plant, event.position, event.R, event.duration, line=event.line, node=event.node,
+                kind=event.kind, phases=event.phases, Z_0=event.Z_0,
+            )  # fmt: skip
         case FaultClear():
             grid.clear_fault(plant)
         case Breaker() | LineBreaker() if event.check is not None:

@@ -35,7 +35,7 @@ class Plan:
         self.tick = 0  # of the next step
         self._steps: list[Any] = []
 
-    def step(self, kind: str, **fields: Any) -> None:
+    def step(self, kind: str, /, **fields: Any) -> None:
         """Add an event at the present tick, after the ticks planned so far.
 
         Raises:
@@ -186,10 +186,18 @@ class Steps:
             "grid-unbalance", retained=list(retained), degrees=list(degrees), duration=duration
         )
 
-    def fault(self, position: float, R: float, duration: float | None = None) -> None:
-        """A three-phase fault to ground through ``R`` [p.u.], at 0 (filter) to 1 (grid) of the
-        line, for ``duration`` [s] or until ``clear_fault``."""
-        self._planned.step("fault", position=position, R=R, duration=duration)
+    def fault(
+        self,
+        position: float,
+        R: float,
+        duration: float | None = None,
+        kind: str = "3ph",
+        **more: Any,
+    ) -> None:
+        """A fault through ``R`` [p.u.], at 0 (filter) to 1 (grid) of the line, for ``duration`` [s]
+        or until ``clear_fault``; ``kind`` is "3ph", "LG", "LL" or "LLG", and ``more`` are the other
+        keys of the event."""
+        self._planned.step("fault", position=position, R=R, duration=duration, kind=kind, **more)
 
     def clear_fault(self) -> None:
         """The fault is cleared."""
