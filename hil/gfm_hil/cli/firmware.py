@@ -18,6 +18,7 @@ from gfm_hil.core.terminal import numbers, terminal
 from gfm_runtime import Law, LawSet, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
+    FIXED,
     FMI,
     OPTIMISED,
     REALS,
@@ -41,7 +42,7 @@ ALL = "all"
 def add(command: argparse.ArgumentParser) -> None:
     kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
     out = kinds.add_parser("export", help="write laws as C99, with golden vectors and a self-test")
-    _add_laws(out)
+    _add_laws(out, (*REALS, FIXED))
     out.add_argument(
         "--style", choices=STYLES, default=STYLES[0],
         help="unrolled: constants in the code (default); records: a generic step for records",
@@ -62,7 +63,7 @@ def add(command: argparse.ArgumentParser) -> None:
     unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
     unit.set_defaults(call=call_fmu)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
-    _add_laws(vectors)
+    _add_laws(vectors, (*REALS, FIXED))
     vectors.add_argument(
         "--ticks", type=int, default=SHIPPED, metavar="N", help=f"rows of each law ({SHIPPED})"
     )
@@ -86,15 +87,15 @@ def add(command: argparse.ArgumentParser) -> None:
     proof.set_defaults(call=call_check)
 
 
-def _add_laws(command: argparse.ArgumentParser) -> None:
+def _add_laws(command: argparse.ArgumentParser, reals: Sequence[str]) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
-    _add_how(command)
+    _add_how(command, reals)
 
 
-def _add_how(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--real", choices=REALS, default=REALS[0], help="precision (float32)")
+def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> None:
+    command.add_argument("--real", choices=reals, default=reals[0], help="precision (float32)")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
     command.add_argument(
         "--inner", metavar="NAME",
@@ -114,6 +115,7 @@ def call_export(options: argparse.Namespace) -> int:
     files = export(laws, options.T_s, options.real, options.style, omega_b, scheduled)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
+        (options.out / name).parent.mkdir(exist_ok=True)
         write_text(options.out / name, text)
     print(f"{options.out}: {', '.join(files)}")
     stale = sorted({path.name for path in options.out.glob("gfm_*.[ch]")} - set(files))

@@ -1,5 +1,6 @@
 from .check import OPTIMISED, TARGETS, Checked, check, need_tools
 from .dll import build_dll, dll_sources
+from .fixed import FIXED
 from .fmu import FMI, fmu
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
@@ -10,6 +11,7 @@ from .schedule import stage_names
 __all__ = [
     "CHANGE",
     "CHECKED",
+    "FIXED",
     "FMI",
     "FROM",
     "OPTIMISED",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal, template
+from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
 from gfm_runtime.firmware.module import (
     REALS,
     STYLES,
@@ -52,11 +54,15 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "states": m.n,
             "bytes": sizes(m, style),
             "operations": operations(m, style),
-            "record": {name: _hex(m.record[name]) for part in fields(m.stages) for name in part},
+            "record": {
+                name: _hex(m.record[name])
+                for part in fields(m.stages, m.fixed is not None)
+                for name in part
+            },
         }
         for m in modules
     ]
-    real, stages = str(modules[0].real), modules[0].stages
+    real, stages = modules[0].precision, modules[0].stages
     whole = {
         "format": FORMAT,
         "signal_table": table_hash(),
@@ -99,17 +105,21 @@ def read_report(folder: Path) -> Exported:
 
 @np.errstate(over="ignore")  # what overflows is refused
 def _exported(whole: Any) -> Exported:
-    for key, allowed in (("format", (FORMAT,)), ("real", REALS), ("style", STYLES)):
+    for key, allowed in (("format", (FORMAT,)), ("real", (*REALS, FIXED)), ("style", STYLES)):
         if whole[key] not in allowed:
             raise LawError(key, f"{whole[key]!r} must be {' or '.join(map(str, allowed))}")
-    dtype, stages = law_dtype(whole["real"]), bool(whole.get("stages"))
+    fixed = whole["real"] == FIXED
+    dtype = law_dtype("float64" if fixed else whole["real"])
+    stages = bool(whole.get("stages")) and not fixed
     modules = [
-        Module(str(law["name"]), None, _record(law["record"], dtype, stages), stages)
+        Module(str(law["name"]), None, _record(law["record"], dtype, fields(stages, fixed)), stages)
         for law in whole["laws"]
     ]
     if not modules:
         raise LawError("laws", "there must be one")
     check_modules(modules)
+    if fixed:
+        modules = [replace(m, fixed=make_fixed(m.name, m.record)) for m in modules]
     return Exported(modules, whole["real"], whole["style"])
 
 
@@ -120,9 +130,11 @@ def _hex(value: Any) -> str | int | list[int]:
     return " ".join(literal(v, value.dtype).rstrip("f") for v in np.ravel(value))
 
 
-def _record(given: Mapping[str, Any], dtype: np.dtype[Any], stages: bool) -> np.void:
+def _record(
+    given: Mapping[str, Any], dtype: np.dtype[Any], named: tuple[tuple[str, ...], ...]
+) -> np.void:
     out = np.zeros(1, dtype)
-    integers, numbers_of = fields(stages)
+    integers, numbers_of = named
     for name in (*integers, *numbers_of):
         text = given[name]
         if name in integers:
@@ -140,6 +152,9 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
     measures what came of it.
     """
     state = max(1, m.n) + 3 * NU + SIZE * m.stages
+    if m.fixed:
+        rests = 2 * NU + m.n
+        return {"state": 4 * state + 8 * rests, "constants": 4 * _products(m.fixed)}
     if style == "records":
         n, of = m.n, 2 * NY + NU
         constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
@@ -154,8 +169,10 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
 
 
 def operations(m: Module, style: Style) -> dict[str, int]:
-    """Floating-point operations of a step in which all limits clamp, the refusal included."""
+    """Operations of a step in which all limits clamp, the refusal included; without shifts."""
     n = m.n
+    if m.fixed:
+        return _integer_operations(m.fixed)
     stage = _stage_step(m, style)
     if style == "records":
         products = NU * (n + 3 * NY - 1) + 3 + NU * n + 2 * NU + n * (2 * NY + n)
@@ -187,6 +204,22 @@ def operations(m: Module, style: Style) -> dict[str, int]:
         + len(re.findall(r" [<>]=? ", said))
         + ranges  # of the inputs
         + 1,  # whether u is finite
+    }
+
+
+def _products(law: FixedLaw) -> int:
+    """Products of a step, 32 by 32 to 64 bits."""
+    return sum(len(s.terms) for s in (*law.output, *law.decay, *law.follow, *law.state))
+
+
+def _integer_operations(law: FixedLaw) -> dict[str, int]:
+    moved = 2 * NU + law.n
+    return {
+        "multiplications": _products(law),
+        "additions": _products(law) + moved + 2 * NU,
+        "divisions": 0,
+        "square_roots": 0,
+        "comparisons": 2 * (moved + NU + 2 * NY),
     }
 
 
