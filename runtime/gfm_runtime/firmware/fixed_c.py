@@ -99,7 +99,13 @@ def _keys(m: Module) -> dict[str, str]:
         "WANTED": "\n".join(_wanted(law)),
         "OFFSETS": "\n".join(_offsets(law)),
         "BUMPS": "\n".join(_bumps()),
-        "INTERVALS": "\n".join(_intervals()),
+        "HINTS": ", ".join(
+            dict.fromkeys(
+                str(end)
+                for one in (*US, *law.numbers[TREND:])
+                for end in (one.low, one.high)
+            )
+        ),
     }
 
 
@@ -224,9 +230,3 @@ def _bumps() -> list[str]:
         ]
     return lines
 
-
-def _intervals() -> list[str]:
-    return [
-        f"        {one.text.removeprefix('t->')} = Frama_C_interval({_range(one)});"
-        for one in (*REFS, *YS)
-    ]

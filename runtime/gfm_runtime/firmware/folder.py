@@ -13,11 +13,18 @@ from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.fixed_c import fixed_sources
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
 from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
+from gfm_runtime.firmware.proof import script
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.stage import SIZE
 from gfm_runtime.law import Law
 from gfm_runtime.signals import NU, carried
+
+
+_PROVE = """
+# cmake --build build --target proof
+add_custom_target(proof COMMAND sh ${CMAKE_CURRENT_SOURCE_DIR}/proof/prove.sh)
+"""
 
 
 def export(
@@ -59,7 +66,8 @@ def export(
         **selftest(modules, style),
         "golden.h": _golden_header(rows),
         "golden.csv": rows.csv(),
-        "CMakeLists.txt": _cmake(modules, style, choosing),
+        **({"proof/prove.sh": script(modules)} if fixed else {}),
+        "CMakeLists.txt": _cmake(modules, style, choosing) + _PROVE * fixed,
         **reports(modules, T_s, style),
     }
 
@@ -144,4 +152,4 @@ def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -
 
 def needs_sqrt(m: Module) -> bool:
     """Whether a law's unrolled step takes a square root."""
-    return m.stages or int(m.record["error_map"]) == HYBRID_ANGLE
+    return not m.fixed and (m.stages or int(m.record["error_map"]) == HYBRID_ANGLE)

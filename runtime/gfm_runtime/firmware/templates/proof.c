@@ -1,5 +1,5 @@
-/* Frama-C proves by this program that @P@ never overflows, and reads and writes only what is its own:
- * for all inputs, in every order of calls, for ever. @MADE@ */
+/* Frama-C proves by this program that @P@ never overflows, and reads and writes only its own: for all
+ * inputs, in every order of calls, for ever. @MADE@ */
 #include "@P@.h"
 
 #include "__fc_builtin.h"
@@ -15,12 +15,19 @@ int main(void)
     int32_t ref[@GUARD@_NREF], y[@GUARD@_NY], u[@GUARD@_NU], trend[@GUARD@_NU], bump;
     int i;
     @P@_init(&law);
+    /* where EVA stops widening: the bounds of the state */
+    /*@ loop widen_hints "all", @HINTS@; */
     for (;;) {
         for (i = 0; i < @GUARD@_NU; i++) {
             u[i] = any();
             trend[i] = any();
         }
-@INTERVALS@
+        for (i = 0; i < @GUARD@_NREF; i++) {
+            ref[i] = any();
+        }
+        for (i = 0; i < @GUARD@_NY; i++) {
+            y[i] = any();
+        }
         switch (Frama_C_interval(0, 8)) {
         case 0:
             @P@_init(&law);
