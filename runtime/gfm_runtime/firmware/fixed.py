@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.error_maps import LINEAR
+from gfm_runtime.error_maps import DC_ENERGY, DVOC, LINEAR, V_MIN
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY, U_NAMES, Signal, group
 from gfm_runtime.states import BAD_Y, OK
@@ -121,6 +121,18 @@ class FixedLaw:
     def shift(self, total: Sum, place: int) -> int:
         """Bits from a sum to the number at a place."""
         return total.e - self.numbers[place].q
+
+    def moving(self) -> list[tuple[Sum, int]]:
+        """Of all that moves from tick to tick: its increment and its place."""
+        return [
+            *((total, OFFSET + i) for i, total in enumerate(self.decay)),
+            *((total, TREND + i) for i, total in enumerate(self.follow)),
+            *((total, X + k) for k, total in enumerate(self.state)),
+        ]
+
+    def halves(self) -> list[int]:
+        """The rests from which they begin: half a unit, the middle of what a rest can be."""
+        return [1 << (self.shift(total, place) - 1) for total, place in self.moving()]
 
 
 def number(text: str, low: float, high: float) -> Number:
@@ -308,6 +320,75 @@ def _many_states(
     return np.asarray(peak @ first + total @ (inputs + pull * raw / 2))
 
 
+# --- error maps ---
+
+G_MOST = 60.0  # p.u.; where p/V^2 and q/V^2 of dvoc saturate
+QUOTIENT = 31  # exponent of p/V on the way to p/V^2
+
+
+def _mapped(code: int) -> dict[int, Number] | None:
+    """The numbers of the columns that an error map changes; None if it is not covered."""
+    if code == LINEAR:
+        return {}
+    if code == DC_ENERGY:
+        (low, high), most_y = REFS[0].span, YS[0].span[1]
+        return {
+            R: number("t->r[0]", low * low / 2, high * high / 2),
+            M: number("t->m[0]", 0.0, most_y * most_y / 2),
+        }
+    if code == DVOC:
+        return {
+            place + j: number(f"t->{name}[{j}]", -G_MOST, G_MOST)
+            for place, name in ((R, "r"), (M, "m"))
+            for j in (1, 3)
+        }
+    return None
+
+
+class Ratio(NamedTuple):
+    """What p/V^2 is computed with: the least V, the shifts before the two divisions, and where the
+    first quotient saturates, so that the second numerator fits."""
+
+    least: int
+    first: int
+    most: int
+    second: int
+
+
+def ratio_of(p: Number, V: Number, out: Number) -> Ratio:
+    """Of the numbers p and V, for the number p/V^2."""
+    most = math.ceil(math.ldexp(V.span[1] * G_MOST, QUOTIENT))
+    return Ratio(round(math.ldexp(V_MIN, V.q)), QUOTIENT + V.q - p.q, most, V.q + out.q - QUOTIENT)
+
+
+def divided(a: int, b: int) -> int:
+    """a/b towards 0, as C divides; b > 0."""
+    return a // b if a >= 0 else -(-a // b)
+
+
+def map_integers(
+    law: FixedLaw, ref: Sequence[int], y: Sequence[int]
+) -> tuple[Sequence[int], Sequence[int]]:
+    """References and measurements after the error map."""
+    if law.error_map == LINEAR:
+        return ref, y
+    out = []
+    for values, many, place in ((ref, REFS, R), (y, YS, M)):
+        now = list(values)
+        if law.error_map == DC_ENERGY:
+            now[0] = rounded(now[0] * now[0], 2 * many[0].q + 1 - law.numbers[place].q)
+        if law.error_map == DVOC:
+            for j in (1, 3):
+                one = law.numbers[place + j]
+                of = ratio_of(many[j], many[4], one)
+                V = max(values[4], of.least)
+                quotient = divided(values[j] << of.first, V)
+                quotient = min(max(quotient, -of.most), of.most)
+                now[j] = between(divided(quotient << of.second, V), one)
+        out.append(now)
+    return out[0], out[1]
+
+
 # --- a law ---
 
 
@@ -335,8 +416,9 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
     """
     where = f"law {name!r} in fixed point"
     n, code = int(record["n"]), int(record["error_map"])
-    if code != LINEAR:
-        raise LawError(where, "its error map is not covered, only linear is")
+    mapped = _mapped(code)
+    if mapped is None:
+        raise LawError(where, "its error map is not covered")
     f: dict[str, Matrix] = {
         key: np.asarray(record[key], np.float64)
         for key in ("B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "low", "high", "W", "E_r",
@@ -344,11 +426,16 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
     }  # fmt: skip
     A, rows = np.asarray(record["A"][:n, :n], np.float64), record["row"][:n]
     loop = float(record["loop"])
-    r, m = REF, Y  # places of the mapped inputs
+    r, m = (R, M) if mapped else (REF, Y)  # places of the mapped inputs
     numbers: dict[int, Number] = {}
     fade, follow = 1.0 - float(record["decay"]), float(record["follow"])
     for place, many in ((REF, REFS), (Y, YS), (U, US), (TREND, trends(follow))):
         numbers |= {place + k: one for k, one in enumerate(many)}
+    if mapped:
+        numbers |= {R + j: one for j, one in enumerate(REFS)} | {
+            M + j: one for j, one in enumerate(YS)
+        }
+        numbers |= mapped
     numbers |= {
         LAST + i: Number(f"s->u[{i}]", one.q, one.low, one.high) for i, one in enumerate(US)
     }
@@ -526,17 +613,21 @@ class Instance:
 
     def __init__(self, law: FixedLaw) -> None:
         self.law = law
-        self.u = [round(math.ldexp(s.default, one.q)) for s, one in zip(group("u"), US, strict=True)]
+        self.u = [
+            round(math.ldexp(s.default, one.q)) for s, one in zip(group("u"), US, strict=True)
+        ]
         self.raw = [0] * NU
         self.reset()
 
     def reset(self) -> None:
         """States 0; the last u stays."""
         self.x, self.offset, self.trend = [0] * self.law.n, [0] * NU, [0] * NU
-        self.rest = [0] * (2 * NU + self.law.n)
+        self.rest = self.law.halves()
 
     def _values(self, ref: Sequence[int], y: Sequence[int], u: Sequence[int]) -> list[int]:
-        return [*ref, *y, *[0] * 10, *u, 0, 0, 0, *self.u, *self.trend, *self.offset, *self.x]
+        r, m = map_integers(self.law, ref, y)
+        state = (*self.u, *self.trend, *self.offset, *self.x)
+        return [*ref, *y, *r, *m, *u, 0, 0, 0, *state]
 
     def output(self, ref: Sequence[int], y: Sequence[int]) -> list[int]:
         """All numbers of a tick up to u and the excess."""
@@ -558,10 +649,8 @@ class Instance:
     def step(self, ref: Sequence[int], y: Sequence[int]) -> list[int]:
         """One tick; u."""
         law, v = self.law, self.output(ref, y)
-        sums = (*law.decay, *law.follow, *law.state)
-        places = [*range(OFFSET, OFFSET + NU), *range(TREND, TREND + NU), *range(X, X + law.n)]
         moved = []
-        for k, (total, place) in enumerate(zip(sums, places, strict=True)):
+        for k, (total, place) in enumerate(law.moving()):
             shift = law.shift(total, place)
             now = self.rest[k] + total(v)
             moved.append(between(v[place] + (now >> shift), law.numbers[place]))
@@ -577,9 +666,14 @@ class Instance:
         law = self.law
         wanted = [between(value, one) for value, one in zip(u, US, strict=True)]
         self.reset()
-        self.trend = [between(value, one) for value, one in zip(trend, self.law.numbers[TREND : TREND + NU], strict=True)]
+        self.trend = [
+            between(value, one)
+            for value, one in zip(trend, self.law.numbers[TREND : TREND + NU], strict=True)
+        ]
         v = self._values(ref, y, wanted)
-        self.u = [between(rounded(s(v), law.shift(s, U + i)), US[i]) for i, s in enumerate(law.last)]
+        self.u = [
+            between(rounded(s(v), law.shift(s, U + i)), US[i]) for i, s in enumerate(law.last)
+        ]
         self.x = [
             between(rounded(s(v), law.shift(s, X + k)), law.numbers[X + k])
             for k, s in enumerate(law.settle)
@@ -595,9 +689,7 @@ class Instance:
 
 def bump_of(before: Sequence[int], after: Sequence[int]) -> int:
     """The largest change of u, times 2^BUMP_Q."""
-    return max(
-        abs(b - a) >> (one.q - BUMP_Q) for a, b, one in zip(before, after, US, strict=True)
-    )
+    return max(abs(b - a) >> (one.q - BUMP_Q) for a, b, one in zip(before, after, US, strict=True))
 
 
 def refusal(ref: Sequence[int], y: Sequence[int], bad_ref: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, LINEAR
 from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.firmware.fixed import (
     BUMP_Q,
@@ -15,10 +16,13 @@ from gfm_runtime.firmware.fixed import (
     US,
     YS,
     FixedLaw,
+    M,
     Number,
+    R,
     Sum,
     U,
     X,
+    ratio_of,
 )
 from gfm_runtime.firmware.module import FIXED_CHOICES, MADE, Module, about, keys_of
 from gfm_runtime.firmware.unrolled import body
@@ -79,7 +83,8 @@ def _keys(m: Module) -> dict[str, str]:
                 f"enum {{ {guard}_NREST = 2 * {guard}_NU + {law.n} }};",
             ]
         ),
-        "TICK": "    const int32_t *ref;\n    const int32_t *y;\n",
+        "TICK": _tick(law),
+        "MAP": _map(law),
         "CHECKS": "\n".join(_checks(guard)),
         "U_DEFAULT": ", ".join(
             str(round(math.ldexp(s.default, one.q))) for s, one in zip(group("u"), US, strict=True)
@@ -87,7 +92,7 @@ def _keys(m: Module) -> dict[str, str]:
         "FUNCTIONS": "\n".join(
             [
                 "static void set_inputs(tick_t *t, const int32_t ref[], const int32_t y[])",
-                *body(["t->ref = ref;", "t->y = y;"]),
+                *body(["t->ref = ref;", "t->y = y;", *_mapping(law)]),
                 f"static void output(const {m.prefix}_t *s, tick_t *t)",
                 *body(_output(law)),
                 f"static void advance({m.prefix}_t *s, const tick_t *t)",
@@ -96,17 +101,51 @@ def _keys(m: Module) -> dict[str, str]:
                 *body(_set_states(law)),
             ]
         ),
+        "HALVES": ",\n        ".join(_wide(half) for half in law.halves()),
         "WANTED": "\n".join(_wanted(law)),
         "OFFSETS": "\n".join(_offsets(law)),
         "BUMPS": "\n".join(_bumps()),
         "HINTS": ", ".join(
             dict.fromkeys(
-                str(end)
-                for one in (*US, *law.numbers[TREND:])
-                for end in (one.low, one.high)
+                str(end) for one in (*US, *law.numbers[TREND:]) for end in (one.low, one.high)
             )
         ),
     }
+
+
+def _tick(law: FixedLaw) -> str:
+    lines = ["    const int32_t *ref;", "    const int32_t *y;"]
+    if law.error_map != LINEAR:
+        lines += ["    int32_t r[5]; /* what the error map makes of ref */"]
+        lines += ["    int32_t m[5]; /* and of y */"]
+    return "\n".join([*lines, ""])
+
+
+def _map(law: FixedLaw) -> str:
+    """The function of an error map."""
+    names = [name for name, code in ERROR_MAPS.items() if code and code == law.error_map]
+    _, *parts = template("fixed_maps.c").split("/* @map ")
+    by_name = dict(part.split("@ */\n", 1) for part in parts)
+    return "".join(by_name[name] for name in names)
+
+
+def _mapping(law: FixedLaw) -> list[str]:
+    """What set_inputs does for an error map."""
+    lines = []
+    for vector, out, many, place in (("ref", "r", REFS, R), ("y", "m", YS, M)):
+        if law.error_map == DC_ENERGY:
+            shift = 2 * many[0].q + 1 - law.numbers[place].q
+            lines.append(f"t->{out}[0] = half_square({vector}[0], {shift});")
+        if law.error_map == DVOC:
+            for j in (1, 3):
+                one = law.numbers[place + j]
+                of = ratio_of(many[j], many[4], one)
+                lines.append(
+                    f"t->{out}[{j}] = over_square({vector}[{j}], {vector}[4], {of.least}, "
+                    f"{_wide(1 << of.first)}, {_wide(of.most)}, {_wide(1 << of.second)}, "
+                    f"{one.high});"
+                )
+    return lines
 
 
 def _range(one: Number) -> str:
@@ -165,10 +204,7 @@ def _advance(law: FixedLaw) -> list[str]:
     """Increments of the offset, the trend and x: the upper bits now, the others in later ticks."""
     lines = ["int64_t now;"]
     lines += [f"int32_t {', '.join(f'x{k}' for k in range(law.n))};"] * (law.n > 0)
-    sums = [(total, OFFSET + i) for i, total in enumerate(law.decay)]
-    sums += [(total, TREND + i) for i, total in enumerate(law.follow)]
-    sums += [(total, X + k) for k, total in enumerate(law.state)]
-    for k, (total, place) in enumerate(sums):
+    for k, (total, place) in enumerate(law.moving()):
         one, shift = law.numbers[place], law.shift(total, place)
         to = f"x{place - X}" if place >= X else one.text
         lines += [
@@ -223,10 +259,8 @@ def _bumps() -> list[str]:
         lines += [
             "    {",
             f"        int64_t change = (int64_t)u[{i}] - old[{i}];",
-            "        change = (change < 0 ? -change : change) >> "
-            f"{one.q - BUMP_Q};",
+            f"        change = (change < 0 ? -change : change) >> {one.q - BUMP_Q};",
             "        *bump = between(change, *bump, INT32_MAX);",
             "    }",
         ]
     return lines
-

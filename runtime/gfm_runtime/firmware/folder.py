@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.error_maps import HYBRID_ANGLE
-from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.errors import LawError
+from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.fixed_c import fixed_sources
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
@@ -19,7 +20,6 @@ from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.stage import SIZE
 from gfm_runtime.law import Law
 from gfm_runtime.signals import NU, carried
-
 
 _PROVE = """
 # cmake --build build --target proof

@@ -38,7 +38,18 @@ static int refused(const @P@_t *s, const int32_t ref[], const int32_t y[], int *
     return @GUARD@_OK;
 }
 
-@FUNCTIONS@
+@MAP@@FUNCTIONS@
+/* A rest begins in the middle of what it can be. */
+static void begin_rests(@P@_t *s)
+{
+    static const int64_t half[] = {
+        @HALVES@};
+    int i;
+    for (i = 0; i < @GUARD@_NREST; i++) {
+        s->rest[i] = half[i];
+    }
+}
+
 void @P@_init(@P@_t *s)
 {
     static const int32_t u[] = {@U_DEFAULT@};
@@ -59,9 +70,7 @@ void @P@_reset(@P@_t *s)
         s->offset[i] = 0;
         s->trend[i] = 0;
     }
-    for (i = 0; i < @GUARD@_NREST; i++) {
-        s->rest[i] = 0;
-    }
+    begin_rests(s);
     s->reason = @GUARD@_OK;
     s->channel = -1;
 }
@@ -111,9 +120,7 @@ int @P@_settle(@P@_t *s, const int32_t ref[], const int32_t y[], int32_t u[], co
     for (i = 0; i < @GUARD@_NU; i++) {
         s->offset[i] = 0;
     }
-    for (i = 0; i < @GUARD@_NREST; i++) {
-        s->rest[i] = 0;
-    }
+    begin_rests(s);
 @WANTED@
     set_inputs(&t, ref, y);
     set_states(s, &t);
