@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.error_maps import DC_ENERGY, DVOC, LINEAR, V_MIN
+from gfm_runtime.error_maps import DC_ENERGY, DVOC, HYBRID_ANGLE, LINEAR, V_MIN
 from gfm_runtime.firmware.fixed import (
     EXCESS,
     FIXED,
@@ -99,7 +99,7 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
     rows, A = record["row"][: law.n], np.asarray(record["A"][: law.n, : law.n], np.float64)
     out: dict[int, Deviation] = {}
     for i in (OMEGA - 1, 0, 2):
-        own = np.flatnonzero(rows == i)
+        own = [int(k) for k in np.flatnonzero(rows == i)]
         gain = float(record["loop"]) if i == OMEGA - 1 else 1.0
         c, W = gain * record["C"][i, own].astype(float), record["W"][own, i].astype(float)
         block = Block(A[np.ix_(own, own)], c, W)
@@ -112,13 +112,14 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
         feedback = b
         if i != OMEGA - 1:  # omega_u, which has its own deviation, is an input of this row
             omega, feedback = out[OMEGA - 1], np.zeros(len(own))
-            ways = abs(float(record["D_y"][i, OMEGA]))
-            local = local._replace(
-                raw=local.raw + ways * omega.bound, x=local.x + np.abs(b) * omega.bound
-            )
-            if omega.drift and (ways or b.any()):
-                out[i] = Deviation(math.inf, math.inf)
-                continue
+            at_once = abs(float(record["D_y"][i, OMEGA]))
+            if at_once or b.any():
+                if omega.drift or math.isinf(omega.bound):
+                    out[i] = Deviation(math.inf, math.inf)
+                    continue
+                local = local._replace(
+                    raw=local.raw + at_once * omega.bound, x=local.x + np.abs(b) * omega.bound
+                )
         out[i] = _row(block, feedback, local)
     return [out[i] for i in range(NU)]
 
@@ -173,6 +174,19 @@ def _spans(law: FixedLaw, near: bool) -> dict[int, Span]:
     return spans
 
 
+def _of_angle(law: FixedLaw) -> float:
+    """Of sin((delta_ref - delta)/2) near the default inputs: half of what turns the two vectors and
+    their product, and four roundings. A vector without length has no direction, and at +-180
+    degrees the map jumps, so there is no bound for all inputs."""
+    turned = 3 * math.sqrt(2) * 2.0**-29
+    for of, many in zip(law.across, (REFS, YS), strict=True):
+        exponent = 2 * many[4].q - many[1].q
+        power = max(abs(s.default) for s in group("ref")[1:4:2]) + NEAR
+        length = (1 - NEAR) ** 2 - math.ldexp(abs(of.R) + abs(of.X), -exponent) * power
+        turned += 2 * power * 2.0 ** (-1 - exponent) * math.sqrt(2) / length
+    return turned / 2 + 4 * 2.0**-30
+
+
 def _error(
     total: Sum,
     numbers: Sequence[Number],
@@ -205,6 +219,8 @@ def _of_map(law: FixedLaw, real: str, near: bool) -> dict[int, float]:
         return {p: 4 * _unit(real) * most(law.numbers[p].span) for p in places}
     if law.error_map == DC_ENERGY:
         return {p: unit / 2 for p, unit in units.items()}
+    if law.error_map == HYBRID_ANGLE:
+        return {R + 1: _of_angle(law) if near else math.inf}
     V = 1 - NEAR if near else V_MIN
     first = math.ldexp(1.0, -QUOTIENT) / V
     # the least V is an integer, and p/V^2 has twice its relative error
@@ -213,7 +229,7 @@ def _of_map(law: FixedLaw, real: str, near: bool) -> dict[int, float]:
 
 
 def _in_fixed_point(
-    law: FixedLaw, i: int, own: Vector, spans: Mapping[int, Span], maps: Mapping[int, float]
+    law: FixedLaw, i: int, own: Sequence[int], spans: Mapping[int, Span], maps: Mapping[int, float]
 ) -> Local:
     numbers = law.numbers
 
@@ -230,16 +246,16 @@ def _in_fixed_point(
         offset=faded + 1.5 * unit(OFFSET + i),
         x=np.array([_error(law.state[k], numbers, spans, maps) for k in own]),
         first=np.array(
-            [_error(law.settle[k], numbers, settled, maps) + unit(X + int(k)) / 2 for k in own]
+            [_error(law.settle[k], numbers, settled, maps) + unit(X + k) / 2 for k in own]
         ),
-        q=np.array([unit(X + int(k)) / 2 for k in own]),
+        q=np.array([unit(X + k) / 2 for k in own]),
     )
 
 
 def _in_floating_point(
     law: FixedLaw,
     i: int,
-    own: Vector,
+    own: Sequence[int],
     spans: Mapping[int, Span],
     maps: Mapping[int, float],
     u: float,
@@ -263,7 +279,7 @@ def _in_floating_point(
         u=u * limit,
         excess=raw + u * limit,
         offset=gamma * offset / fade + raw,
-        x=np.array([size(law.state[k], 2 * most(spans[X + int(k)])) for k in own]),
+        x=np.array([size(law.state[k], 2 * most(spans[X + k])) for k in own]),
         first=np.array([size(law.settle[k]) for k in own]),
         q=np.zeros(len(own)),
     )

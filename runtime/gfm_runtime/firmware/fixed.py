@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.error_maps import DC_ENERGY, DVOC, LINEAR, V_MIN
+from gfm_runtime.error_maps import DC_ENERGY, DVOC, HYBRID_ANGLE, LINEAR, V_MIN
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY, U_NAMES, Signal, group
 from gfm_runtime.states import BAD_Y, OK
@@ -104,6 +104,7 @@ class FixedLaw:
         settle: x at a bumpless change.
         last: u of the tick before a bumpless change.
         error_map: its code.
+        across: of hybrid-angle, for the references and for the measurements.
     """
 
     n: int
@@ -117,6 +118,7 @@ class FixedLaw:
     settle: tuple[Sum, ...]
     last: tuple[Sum, ...]
     error_map: int
+    across: tuple[Across, ...] = ()
 
     def shift(self, total: Sum, place: int) -> int:
         """Bits from a sum to the number at a place."""
@@ -165,6 +167,9 @@ def trends(follow: float) -> tuple[Number, ...]:
 REFS = tuple(of_signal(f"t->ref[{j}]", s) for j, s in enumerate(group("ref")))
 YS = tuple(of_signal(f"t->y[{j}]", s) for j, s in enumerate(group("y")))
 US = tuple(of_signal(f"t->u[{i}]", s) for i, s in enumerate(group("u")))
+U_DEFAULT = tuple(
+    round(math.ldexp(s.default, one.q)) for s, one in zip(group("u"), US, strict=True)
+)
 BUMP_Q = min(one.q for one in US) - 1  # two u may be as far apart as their range is wide
 
 
@@ -342,6 +347,8 @@ def _mapped(code: int) -> dict[int, Number] | None:
             for place, name in ((R, "r"), (M, "m"))
             for j in (1, 3)
         }
+    if code == HYBRID_ANGLE:
+        return {R + 1: number("t->r[1]", -1.0, 1.0)}
     return None
 
 
@@ -359,6 +366,44 @@ def ratio_of(p: Number, V: Number, out: Number) -> Ratio:
     """Of the numbers p and V, for the number p/V^2."""
     most = math.ceil(math.ldexp(V.span[1] * G_MOST, QUOTIENT))
     return Ratio(round(math.ldexp(V_MIN, V.q)), QUOTIENT + V.q - p.q, most, V.q + out.q - QUOTIENT)
+
+
+class Across(NamedTuple):
+    """The integers R and X (p.u.) that p and q are multiplied with, at the exponent of V^2."""
+
+    R: int
+    X: int
+
+
+def across(parameters: Sequence[float], p: Number, V: Number) -> Across:
+    """For the numbers p (and q) and V."""
+    return Across(*(round(math.ldexp(float(one), 2 * V.q - p.q)) for one in parameters))
+
+
+def _direction(x: int, y: int) -> tuple[int, int]:
+    """A vector's direction as two integers up to 2^30, the larger at least 2^29; or (0, 0)."""
+    if x or y:
+        for bits in (32, 16, 8, 4, 2, 1):
+            if max(abs(x), abs(y)) < 1 << (62 - bits):
+                x, y = x << bits, y << bits
+    return x >> 32, y >> 32
+
+
+ONE = 1 << 30  # of sines and cosines
+
+
+def sine_of_half(x_a: int, y_a: int, x_b: int, y_b: int) -> int:
+    """As ``error_maps``, from vectors at any exponent: sin((a - b)/2) 2^30."""
+    a_below, b_below = y_a < 0, y_b < 0
+    (x_a, y_a), (x_b, y_b) = _direction(x_a, y_a), _direction(x_b, y_b)
+    if not (x_a or y_a) or not (x_b or y_b):
+        return 0
+    dot, cross = x_a * x_b + y_a * y_b, y_a * x_b - x_a * y_b
+    d, c = map(abs, _direction(dot, cross))
+    length = max(math.isqrt(d * d + c * c), ONE // 2)
+    larger = max(math.isqrt((ONE + min(d * ONE // length, ONE)) * (ONE // 2)), ONE // 2)
+    sine = min(c * ONE // length, ONE) * (ONE // 2) // larger if dot >= 0 else larger
+    return -sine if (cross < 0 if a_below == b_below else a_below) else sine
 
 
 def divided(a: int, b: int) -> int:
@@ -386,6 +431,11 @@ def map_integers(
                 quotient = min(max(quotient, -of.most), of.most)
                 now[j] = between(divided(quotient << of.second, V), one)
         out.append(now)
+    if law.error_map == HYBRID_ANGLE:
+        vectors: list[int] = []
+        for (_, p, _, q, V), (R_pu, X_pu) in zip((ref, y), law.across, strict=True):
+            vectors += [V * V - (R_pu * p + X_pu * q), X_pu * p - R_pu * q]
+        out[0][1] = sine_of_half(*vectors)
     return out[0], out[1]
 
 
@@ -436,6 +486,17 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
             M + j: one for j, one in enumerate(YS)
         }
         numbers |= mapped
+    impedances: tuple[Across, ...] = ()
+    if code == HYBRID_ANGLE:
+        impedances = tuple(
+            across(record["error_parameters"], many[1], many[4]) for many in (REFS, YS)
+        )
+        for impedance, many in zip(impedances, (REFS, YS), strict=True):
+            size = abs(impedance.R) + abs(impedance.X)
+            if size > WORD or many[4].high ** 2 + size * many[1].high >= SUM:
+                raise LawError(where, "R and X of its error map must be less than 1 p.u. in all")
+        for key in ("B_y", "D_y", "E_y"):  # the map has the difference in r
+            f[key] = f[key] * [1, 0, 1, 1, 1]
     numbers |= {
         LAST + i: Number(f"s->u[{i}]", one.q, one.low, one.high) for i, one in enumerate(US)
     }
@@ -456,7 +517,7 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
     outputs: list[Sum] = []
     for i in range(NU):
         gain = loop if i == OMEGA - 1 else 1.0
-        own = np.flatnonzero(rows == i)
+        own = [int(k) for k in np.flatnonzero(rows == i)]
         on_d = _merged(
             _row_of(gain * f["D_u0"][i], REF),
             _row_of(gain * f["D_r"][i], r),
@@ -487,9 +548,7 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
                     "the anti-windup holds: its states have no bound that is proven",
                 )
             numbers[X + k] = number(f"s->x[{k}]", *span)
-        on_raw = _merged(
-            {OFFSET + i: 1.0}, {X + int(k): float(gain * f["C"][i, k]) for k in own}, on_d
-        )
+        on_raw = _merged({OFFSET + i: 1.0}, {X + k: float(gain * f["C"][i, k]) for k in own}, on_d)
         total = make_sum(on_raw, numbers | limited, start, beside=most(US[i].span))
         outputs.append(total)
         raw = span_of(on_raw, numbers | limited, start)
@@ -532,6 +591,7 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
         tuple(make_sum(*_settling(f, k, r, m, numbers)) for k in range(n)),
         tuple(make_sum({U + i: 1.0, TREND + i: -1.0}, numbers) for i in range(NU)),
         code,
+        impedances,
     )
     _check(where, law)
     return law

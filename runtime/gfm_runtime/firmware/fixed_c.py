@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, LINEAR
+from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, HYBRID_ANGLE, LINEAR
 from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.firmware.fixed import (
     BUMP_Q,
@@ -13,6 +12,7 @@ from gfm_runtime.firmware.fixed import (
     OFFSET,
     REFS,
     TREND,
+    U_DEFAULT,
     US,
     YS,
     FixedLaw,
@@ -73,9 +73,8 @@ def _keys(m: Module) -> dict[str, str]:
             [
                 keys["SIGNALS"],
                 "",
-                "/* All numbers are integers: value in p.u. = number / 2^Q. The trend is in p.u. per"
-                " tick, and bump",
-                " * is the largest change of u. To convert: (int32_t)lrint(ldexp(value, Q)). */",
+                "/* All numbers are integers: a value in p.u. is the number / 2^Q; the other way,",
+                " * (int32_t)lrint(ldexp(value, Q)). A trend is in p.u. per tick. */",
                 "enum {",
                 ",\n".join(f"    {guard}_Q_{name} = {q}" for name, q in qs),
                 "};",
@@ -86,13 +85,11 @@ def _keys(m: Module) -> dict[str, str]:
         "TICK": _tick(law),
         "MAP": _map(law),
         "CHECKS": "\n".join(_checks(guard)),
-        "U_DEFAULT": ", ".join(
-            str(round(math.ldexp(s.default, one.q))) for s, one in zip(group("u"), US, strict=True)
-        ),
+        "U_DEFAULT": ", ".join(map(str, U_DEFAULT)),
         "FUNCTIONS": "\n".join(
             [
                 "static void set_inputs(tick_t *t, const int32_t ref[], const int32_t y[])",
-                *body(["t->ref = ref;", "t->y = y;", *_mapping(law)]),
+                *body([*_mapping(law), "t->ref = ref;", "t->y = y;"]),
                 f"static void output(const {m.prefix}_t *s, tick_t *t)",
                 *body(_output(law)),
                 f"static void advance({m.prefix}_t *s, const tick_t *t)",
@@ -145,6 +142,19 @@ def _mapping(law: FixedLaw) -> list[str]:
                     f"{_wide(1 << of.first)}, {_wide(of.most)}, {_wide(1 << of.second)}, "
                     f"{one.high});"
                 )
+    if law.error_map == HYBRID_ANGLE:
+        arguments = []
+        for vector, (R_pu, X_pu) in zip(("ref", "y"), law.across, strict=True):
+            p, q, V = (f"{vector}[{j}]" for j in (1, 3, 4))
+            arguments += [
+                f"product({V}, {V}) - product({R_pu}, {p}) - product({X_pu}, {q})",
+                f"product({X_pu}, {p}) - product({R_pu}, {q})",
+            ]
+        lines += [
+            f"const int64_t {name} = {text};"
+            for name, text in zip(("x_a", "y_a", "x_b", "y_b"), arguments, strict=True)
+        ]
+        lines = [*lines, "t->r[1] = sine_of_half(x_a, y_a, x_b, y_b);"]
     return lines
 
 

@@ -22,7 +22,7 @@ from gfm_runtime.firmware.report import read_report
 EVA = "eva"
 FRAMA_C, PACKAGE = "frama-c", "frama-c-base"
 #: int and pointers of 32 bits, as on a Cortex-M; an alarm also where a conversion loses bits
-OPTIONS = ("-eva", "-eva-slevel", "20", "-eva-auto-loop-unroll", "16", "-eva-split-return", "auto",
+OPTIONS = ("-eva", "-eva-slevel", "20", "-eva-auto-loop-unroll", "32", "-eva-split-return", "auto",
            "-warn-signed-downcast", "-machdep", "gcc_x86_32", "-cpp-extra-args=-I.")  # fmt: skip
 
 
