@@ -176,8 +176,7 @@ def _spans(law: FixedLaw, near: bool) -> dict[int, Span]:
 
 def _of_angle(law: FixedLaw) -> float:
     """Of sin((delta_ref - delta)/2) near the default inputs: half of what turns the two vectors and
-    their product, and four roundings. A vector without length has no direction, and at +-180
-    degrees the map jumps, so there is no bound for all inputs."""
+    their product, and four roundings."""
     turned = 3 * math.sqrt(2) * 2.0**-29
     for of, many in zip(law.across, (REFS, YS), strict=True):
         exponent = 2 * many[4].q - many[1].q
@@ -210,17 +209,19 @@ def _through(total: Sum, maps: Mapping[int, float]) -> float:
 
 def _of_map(law: FixedLaw, real: str, near: bool) -> dict[int, float]:
     """By place, the error of what an error map gives: in fixed point of its roundings; in floating
-    point 4 roundings."""
+    point 8 roundings at most."""
     if law.error_map == LINEAR:
         return {}
     places = [p for p in range(R, M + 5) if law.numbers[p].text.startswith(("t->r[", "t->m["))]
     units = {p: math.ldexp(1.0, -law.numbers[p].q) for p in places}
+    if law.error_map == HYBRID_ANGLE and not near:  # at a vector without length the map jumps
+        return {R + 1: math.inf}
     if real != FIXED:
-        return {p: 4 * _unit(real) * most(law.numbers[p].span) for p in places}
+        return {p: 8 * _unit(real) * most(law.numbers[p].span) for p in places}
     if law.error_map == DC_ENERGY:
         return {p: unit / 2 for p, unit in units.items()}
     if law.error_map == HYBRID_ANGLE:
-        return {R + 1: _of_angle(law) if near else math.inf}
+        return {R + 1: _of_angle(law)}
     V = 1 - NEAR if near else V_MIN
     first = math.ldexp(1.0, -QUOTIENT) / V
     # the least V is an integer, and p/V^2 has twice its relative error

@@ -217,11 +217,14 @@ def _advance(law: FixedLaw) -> list[str]:
     for k, (total, place) in enumerate(law.moving()):
         one, shift = law.numbers[place], law.shift(total, place)
         to = f"x{place - X}" if place >= X else one.text
-        lines += [
+        moves = [
             f"now = {text_of(total, law, f's->rest[{k}]')};",
             f"{to} = between({one.text} + (now >> {shift}), {_range(one)});",
             f"s->rest[{k}] = now & {_wide((1 << shift) - 1)};",
         ]
+        if OFFSET <= place < X:  # at 0 it does not move
+            moves = [f"if ({one.text} != 0) {{", *(f"    {line}" for line in moves), "}"]
+        lines += moves
     return [*lines, *(f"s->x[{k}] = x{k};" for k in range(law.n))]
 
 

@@ -244,10 +244,9 @@ def _stage_step(m: Module, style: Style) -> str:
 def _deviations(law: FixedLaw, record: np.void, T_s: float) -> dict[str, list[dict[str, Any]]]:
     """Of each output, p.u. and p.u./s; None where there is no bound. Float64's own is included."""
     out = {}
-    exact = deviations(law, record, "float64")
     for name, real, near in (("fixed", FIXED, False), ("fixed, small signals", FIXED, True),
                              ("float32", "float32", False)):  # fmt: skip
-        found = deviations(law, record, real, near)
+        found, exact = (deviations(law, record, which, near) for which in (real, "float64"))
         out[name] = [
             {
                 "bound": _finite(d.bound + own.bound),
