@@ -188,7 +188,7 @@ def test_equal_inputs_cancel_exactly() -> None:
         one = instance(module(name))
         rest = [1, 0.5, 1, 0, 1]
         ref, y = to_integers(rest, REFS).tolist(), to_integers(rest, YS).tolist()
-        for _ in range(50_000):
+        for _ in range(10_000):
             one.step(ref, y)
         assert one.x[0] == 0 and one.x[-1] == 0
 
@@ -223,11 +223,12 @@ def test_what_is_seen_is_within_what_is_proven(name: str) -> None:
         assert rows[:, 2 + i].max() > 1e-10
     angle = name == "hybrid-angle"
     assert rows[:, 2:][:, [0, 2] if angle else [0, 1, 2]].max() < 1e-4
-    small = rows[(kind == 0) & (rows[:, 1] > 0)][:, 2:]
-    assert small.max() < 1e-6
-    if angle:
-        near = deviations(m.fixed, m.record, FIXED, near=True)[1]
-        assert small[:, 1].max() <= near.bound < 2e-8
+    assert rows[kind == 0][:, 2:].max() < 1e-6  # the first ticks of each 210 have small signals
+    first = rows[rows[:, 0] < SEGMENT]  # none before them that are not small
+    for i, found in enumerate(deviations(m.fixed, m.record, FIXED, near=True)):
+        assert (first[:, 2 + i] <= found.after(first[:, 1])).all()
+        # the square of the DC voltage, up to 4.5 p.u., has half the resolution
+        assert found.after(SEGMENT) < (1.5e-6 if name == "psc-dc" else 1e-6)
 
 
 @pytest.mark.full
@@ -350,9 +351,7 @@ class TestCompiled:
     def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return exported(tmp_path_factory.mktemp("fixed"), FIXED, "unrolled")
 
-    @pytest.mark.parametrize(
-        ("target", "flags"), [("host", "-O0"), ("host", "-O3"), ("clang", "-O2"), ("m4f", "-O2")]
-    )
+    @pytest.mark.parametrize(("target", "flags"), [("host", "-O0"), ("m4f", "-O2")])
     def test_every_law_has_the_references_bits(self, folder: Path, target: str, flags: str) -> None:
         found = check(folder, target, flags, SHIPPED)
         assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {SHIPPED}
@@ -368,15 +367,18 @@ class TestCompiled:
 
     def test_many_rows_have_the_references_bits(self, tmp_path: Path) -> None:
         folder = exported(tmp_path, FIXED, "unrolled", "vsg-2", "hybrid-angle")
-        assert [(c.rows, c.differ) for c in check(folder, "m4f")] == [(CHECKED, 0)] * 2
+        for target, flags in (("m4f", "-O2"), ("host", "-O3"), ("clang", "-O3")):
+            found = check(folder, target, flags)
+            assert [(c.rows, c.differ) for c in found] == [(CHECKED, 0)] * 2
 
     def test_a_wrong_bit_is_found(self, tmp_path: Path) -> None:
         """The negative control: a coefficient that is one off."""
         folder = exported(tmp_path, FIXED, "unrolled", "vsg-1")
         source = folder / "gfm_vsg_1.c"
-        text = source.read_text(encoding="utf-8")
-        source.write_text(text.replace("product(42949673, t->ref[0])",
-                                       "product(42949674, t->ref[0])"), encoding="utf-8")  # fmt: skip
+        one_off = source.read_text(encoding="utf-8").replace(
+            "(42949673, t->ref", "(42949674, t->ref"
+        )
+        source.write_text(one_off, encoding="utf-8")
         assert main(["firmware", "check", str(folder)]) == 3
 
     @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -400,19 +402,15 @@ class TestCompiled:
                 assert set(said.split()) <= {"U", "_GLOBAL_OFFSET_TABLE_"}
 
     def test_eva_has_no_alarm_but_with_a_wrong_exponent(self, tmp_path: Path) -> None:
-        """0 alarms for a linear law and the largest map; an exponent that is 3 too large has some."""
+        """0 alarms for a linear law and the largest map; some where a coefficient is times 2^4."""
         folder = exported(tmp_path, FIXED, "unrolled", "vsg-1", "hybrid-angle")
         assert [p.alarms for p in prove(folder)] == [0, 0]
+        (tmp_path / "wrong").mkdir()
+        folder = exported(tmp_path / "wrong", FIXED, "unrolled", "vsg-1")
         source = folder / "gfm_vsg_1.c"
         text = source.read_text(encoding="utf-8")
-        wrong = re.sub(
-            r"now >> (\d+)\), -13425", lambda m: f"now >> {int(m[1]) - 8}), -13425", text
-        )
-        wrong = re.sub(
-            r"product\((\d+), s->x\[0\]\)", lambda m: f"product({m[1]}, s->x[0]) * 8", wrong
-        )
-        assert wrong != text
-        source.write_text(wrong, encoding="utf-8")
-        first, second = prove(folder)
-        assert first.alarms >= 1 and second.alarms == 0
-        assert main(["firmware", "check", str(folder), "--target", "eva"]) == 3
+        found = re.search(r"product\(\d+, s->x\[0\]\)", text)
+        assert found is not None
+        source.write_text(text.replace(found[0], f"16 * {found[0]}", 1), encoding="utf-8")
+        (one,) = prove(folder)
+        assert one.alarms >= 1

@@ -46,6 +46,7 @@ from gfm_runtime.firmware.fixed import (
     X,
     Y,
     most,
+    powers,
     sector,
 )
 from gfm_runtime.signals import NU, group
@@ -120,7 +121,7 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
                 local = local._replace(
                     raw=local.raw + at_once * omega.bound, x=local.x + np.abs(b) * omega.bound
                 )
-        out[i] = _row(block, feedback, local)
+        out[i] = _row(block, feedback, local, clamped=not near)
     return [out[i] for i in range(NU)]
 
 
@@ -129,27 +130,33 @@ def _unit(real: str) -> float:
     return 2.0 ** (-24 if real == "float32" else -53)
 
 
-def _row(block: Block, feedback: Vector, local: Local) -> Deviation:
-    """From what a tick adds to what it makes of the row's u."""
+def _row(block: Block, feedback: Vector, local: Local, clamped: bool) -> Deviation:
+    """From what a tick adds to what it makes of the row's u; ``clamped`` if the limits may act."""
     c = np.abs(block.c)
     at_once = local.raw + float(c @ local.q)
     at_once += local.offset + float(c @ local.first) + at_once  # the offset takes that of a settle
     if not len(c):
         return Deviation(at_once + local.u, 0.0)
-    pull = block.A @ block.W
-    to_excess = at_once + local.excess
+    pull = block.A @ block.W * clamped
+    to_excess = at_once + local.excess * clamped
+    each = local.x + np.abs(np.eye(len(c)) - block.A) @ local.q + np.abs(feedback) * local.u
     try:
-        _, total, peak, gain = sector(block, feedback)
+        if clamped:
+            _, total, peak, gain = sector(block, feedback)
+            each += np.abs(pull - feedback) / 2 * to_excess
+        else:
+            total, peak = powers(block.A + np.outer(feedback, block.c))
+            each += np.abs(feedback) * at_once
+            gain = 0.0
     except ValueError:
         gain = 1.0
     if gain < 1 - 1e-6:
-        each = local.x + np.abs(np.eye(len(c)) - block.A) @ local.q
-        each += np.abs(pull - feedback) / 2 * to_excess + np.abs(feedback) * local.u
         raw = float(c @ (peak @ local.first + total @ each)) + to_excess
         return Deviation(raw / (1 - gain) + local.u, 0.0)
     if len(c) > 1 or abs(block.A[0, 0] - 1) > _ON_CIRCLE or feedback.any():
         return Deviation(math.inf, math.inf)
-    state = max(float(local.first[0]), to_excess / float(c[0]))
+    # at a limit the state of an integrator takes over what raw has; else it keeps what it had
+    state = max(float(local.first[0]), to_excess / float(c[0]) * clamped)
     return Deviation(float(c[0]) * state + at_once + local.u, float(c[0] * local.x[0]))
 
 

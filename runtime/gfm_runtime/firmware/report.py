@@ -265,15 +265,19 @@ def _finite(value: float) -> float | None:
     return float(f"{math.ceil(value / unit) * unit:.2g}")
 
 
-def _deviation_table(laws: Sequence[Mapping[str, Any]]) -> list[str]:
-    def cell(found: Mapping[str, Any]) -> str:
-        if found["bound"] is None:
-            return "–"
-        return f"{found['bound']:.1e}" + f" + {found['drift']:.0e} t" * (found["drift"] != 0.0)
+def deviation_text(found: Mapping[str, float | None]) -> str:
+    """A bound as report.json has it: p.u., and t in s; a dash for none."""
+    if found["bound"] is None:
+        return "–"
+    return f"{found['bound']:.1e}" + (f" + {found['drift']:.0e} t" if found["drift"] else "")
 
+
+def _deviation_table(laws: Sequence[Mapping[str, Any]]) -> list[str]:
     kinds = list(laws[0]["deviation"])
     rows = [
-        (law["name"], kind, *map(cell, law["deviation"][kind])) for law in laws for kind in kinds
+        (law["name"], kind, *map(deviation_text, law["deviation"][kind]))
+        for law in laws
+        for kind in kinds
     ]
     return [
         "How far u gets from float64 at most, for all inputs in range, p.u.; t is the time in s "
