@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import tempfile
 from pathlib import Path
@@ -12,12 +13,15 @@ from pathlib import Path
 from _ext.outputs import command
 
 from gfm_hil.core.files import write_text
-from gfm_runtime import law_names
-from gfm_runtime.firmware import TARGETS, Checked, check
+from gfm_runtime import law_names, load_law
+from gfm_runtime.firmware import FIXED, SHIPPED, TARGETS, Checked, check, export, stage_names
+from gfm_runtime.firmware.report import deviation_text
 from gfm_runtime.inner_file import inner_names
+from gfm_runtime.signals import U_NAMES
 
 #: the law that is shown with each inner stage
 STAGED = "vsg-2"
+T_S = 1e-4  # s
 TABLES = Path(__file__).parent / "tables"
 #: target, precision and style of the columns
 MEASURED = (
@@ -39,6 +43,7 @@ def main() -> None:
             ]
             for stage in inner_names()
         }
+        write_text(TABLES / "firmware_fixed.md", _fixed(folder / "fixed", results[0]))
         export = command("gfmhil firmware export vsg-1 -o firmware", folder=folder)
         host = command("gfmhil firmware check firmware", folder=folder)
         cortex = command("gfmhil firmware check firmware --target m4f", folder=folder)
@@ -65,11 +70,7 @@ def _table(results: list[dict[str, Checked]]) -> str:
             assert law.instructions is not None and law.differ == 0
             cells += ["{}…{}".format(*law.instructions), str(law.code)]
         lines.append("| " + " | ".join(cells) + " |")
-    versions = {
-        subprocess.run([f"{t.prefix}{t.compiler}", "--version"], capture_output=True, text=True,
-                       check=True).stdout.splitlines()[0]
-        for t in (TARGETS[target] for target, *_ in MEASURED)
-    }  # fmt: skip
+    versions = {_version(target) for target, *_ in MEASURED}
     rows = {found.rows for result in results for found in result.values()}
     return "\n".join(
         [
@@ -80,6 +81,39 @@ def _table(results: list[dict[str, Checked]]) -> str:
             "",
         ]
     )
+
+
+def _fixed(folder: Path, in_float32: dict[str, Checked]) -> str:
+    """What the laws cost in fixed point, and how far they get from float64 at most."""
+    laws = {
+        name: law
+        for found in map(load_law, law_names())
+        for name, law in zip(stage_names(found), found.laws, strict=True)
+    }
+    for name, text in export(laws, T_S, FIXED, "unrolled").items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_text(folder / name, text)
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    proven = {law["name"]: law["deviation"] for law in report["laws"]}
+    kinds = ("fixed", "fixed, small signals")
+    heads = ["law", "m4f fixed: instructions", "code [B]", "m4f float32: instructions", "code [B]"]
+    heads += [f"{name}{end}" for end in ("", ", small") for name in U_NAMES]
+    lines = ["| " + " | ".join(heads) + " |", "| --- " + "| ---: " * (len(heads) - 1) + "|"]
+    for c in check(folder, "m4f", ticks=SHIPPED):
+        assert c.differ == 0
+        cells = [c.name]
+        for found in (c, in_float32[c.name]):
+            assert found.instructions is not None
+            cells += ["{}…{}".format(*found.instructions), str(found.code)]
+        cells += [deviation_text(one) for kind in kinds for one in proven[c.name][kind]]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", f"{_version('m4f')}, `-O2`.", ""])
+
+
+def _version(target: str) -> str:
+    compiler = f"{TARGETS[target].prefix}{TARGETS[target].compiler}"
+    said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True)
+    return said.stdout.splitlines()[0]
 
 
 def _stages(results: dict[str, list[Checked]]) -> str:

@@ -55,6 +55,7 @@ def exported(
     """A folder with laws, all by default."""
     laws = {name: of[name] for name in names} or of
     for name, text in export(laws, T_S, real, style).items():
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
     return folder
 

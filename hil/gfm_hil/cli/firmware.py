@@ -18,6 +18,8 @@ from gfm_hil.core.terminal import numbers, terminal
 from gfm_runtime import Law, LawSet, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
+    EVA,
+    FIXED,
     FMI,
     OPTIMISED,
     REALS,
@@ -25,6 +27,7 @@ from gfm_runtime.firmware import (
     STYLES,
     TARGETS,
     Checked,
+    Proved,
     build_dll,
     check,
     dll_sources,
@@ -32,6 +35,7 @@ from gfm_runtime.firmware import (
     fmu,
     golden,
     make_modules,
+    prove,
     stage_names,
 )
 
@@ -41,7 +45,7 @@ ALL = "all"
 def add(command: argparse.ArgumentParser) -> None:
     kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
     out = kinds.add_parser("export", help="write laws as C99, with golden vectors and a self-test")
-    _add_laws(out)
+    _add_laws(out, (*REALS, FIXED))
     out.add_argument(
         "--style", choices=STYLES, default=STYLES[0],
         help="unrolled: constants in the code (default); records: a generic step for records",
@@ -62,7 +66,7 @@ def add(command: argparse.ArgumentParser) -> None:
     unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
     unit.set_defaults(call=call_fmu)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
-    _add_laws(vectors)
+    _add_laws(vectors, (*REALS, FIXED))
     vectors.add_argument(
         "--ticks", type=int, default=SHIPPED, metavar="N", help=f"rows of each law ({SHIPPED})"
     )
@@ -75,8 +79,9 @@ def add(command: argparse.ArgumentParser) -> None:
     proof = kinds.add_parser("check", help="build and run a folder, and compare every bit")
     proof.add_argument("folder", type=Path, metavar="DIR", help="what export wrote")
     proof.add_argument(
-        "--target", choices=list(TARGETS), default="host",
-        help="; ".join(f"{name}: {target.what}" for name, target in TARGETS.items()),
+        "--target", choices=[*TARGETS, EVA], default="host",
+        help="; ".join(f"{name}: {target.what}" for name, target in TARGETS.items())
+        + f"; {EVA}: no run, but Frama-C's proof that --real fixed never overflows",
     )  # fmt: skip
     proof.add_argument("--flags", default=OPTIMISED, help=f"for the compiler ({OPTIMISED})")
     proof.add_argument(
@@ -86,15 +91,15 @@ def add(command: argparse.ArgumentParser) -> None:
     proof.set_defaults(call=call_check)
 
 
-def _add_laws(command: argparse.ArgumentParser) -> None:
+def _add_laws(command: argparse.ArgumentParser, reals: Sequence[str]) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
-    _add_how(command)
+    _add_how(command, reals)
 
 
-def _add_how(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--real", choices=REALS, default=REALS[0], help="precision (float32)")
+def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> None:
+    command.add_argument("--real", choices=reals, default=reals[0], help="precision (float32)")
     command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
     command.add_argument(
         "--inner", metavar="NAME",
@@ -114,6 +119,7 @@ def call_export(options: argparse.Namespace) -> int:
     files = export(laws, options.T_s, options.real, options.style, omega_b, scheduled)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
+        (options.out / name).parent.mkdir(exist_ok=True)
         write_text(options.out / name, text)
     print(f"{options.out}: {', '.join(files)}")
     stale = sorted({path.name for path in options.out.glob("gfm_*.[ch]")} - set(files))
@@ -166,7 +172,14 @@ def call_include(_: argparse.Namespace) -> int:
 
 
 def call_check(options: argparse.Namespace) -> int:
-    """Check a folder and print a table; 3 if a bit differs."""
+    """Check a folder and print a table; 3 if a bit differs, or Frama-C has an alarm."""
+    if options.target == EVA:
+        proofs = prove(options.folder)
+        if options.json:
+            print(json.dumps([asdict(proof) for proof in proofs], indent=2))
+        else:
+            _print_proofs(proofs)
+        return EXIT_OTHERWISE if any(proof.alarms for proof in proofs) else 0
     results = check(options.folder, options.target, options.flags, _ticks(options.ticks))
     if options.json:
         print(json.dumps([asdict(result) for result in results], indent=2))
@@ -201,6 +214,13 @@ def _ticks(ticks: int) -> int:
     if ticks < 1:
         raise UserError(f"--ticks {ticks}: must be at least 1")
     return ticks
+
+
+def _print_proofs(proofs: Sequence[Proved]) -> None:
+    table = numbers("law", "functions", "alarms", "seconds")
+    for p in proofs:
+        table.add_row(p.name, str(p.functions), str(p.alarms), f"{p.seconds:g}")
+    terminal().print(table, highlight=False)
 
 
 def _print(results: Sequence[Checked]) -> None:

@@ -1,15 +1,19 @@
 from .check import OPTIMISED, TARGETS, Checked, check, need_tools
 from .dll import build_dll, dll_sources
+from .fixed import FIXED
 from .fmu import FMI, fmu
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
 from .loop import CHANGE, FROM, START, TICK, TO, LoopProgram, build_loop
 from .module import REALS, STYLES, Module, Style, make_modules, sources
+from .proof import EVA, Proved, prove
 from .schedule import stage_names
 
 __all__ = [
     "CHANGE",
     "CHECKED",
+    "EVA",
+    "FIXED",
     "FMI",
     "FROM",
     "OPTIMISED",
@@ -24,6 +28,7 @@ __all__ = [
     "Golden",
     "LoopProgram",
     "Module",
+    "Proved",
     "Style",
     "build_dll",
     "build_loop",
@@ -34,6 +39,7 @@ __all__ = [
     "golden",
     "make_modules",
     "need_tools",
+    "prove",
     "sources",
     "stage_names",
 ]

@@ -5,20 +5,26 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
-
-import numpy as np
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.error_maps import HYBRID_ANGLE
+from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, template
+from gfm_runtime.firmware.fixed import FIXED
+from gfm_runtime.firmware.fixed_c import fixed_sources
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
 from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
+from gfm_runtime.firmware.proof import script
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.stage import SIZE
 from gfm_runtime.law import Law
-from gfm_runtime.signals import carried
+from gfm_runtime.signals import NU, carried
+
+_PROVE = """
+# cmake --build build --target proof
+add_custom_target(proof COMMAND sh ${CMAKE_CURRENT_SOURCE_DIR}/proof/prove.sh)
+"""
 
 
 def export(
@@ -34,14 +40,19 @@ def export(
     Args:
         laws: the laws by name; a change between any two of them is bumpless.
         T_s: sampling time, s.
-        real: float32 or float64.
+        real: float32 or float64, or ``FIXED``, which has one style only.
         style: see ``gfm_runtime.firmware.module``.
         omega_b: base frequency of the converter, rad/s, for an inner stage.
         scheduled: laws whose stages, under the names of ``stage_names``, are among ``laws``.
 
     Raises:
-        LawError: as ``make_modules``.
+        LawError: as ``make_modules``, and what fixed point does not cover.
     """
+    fixed = real == FIXED
+    if fixed and style != "unrolled":
+        raise LawError("--style records", "fixed point has its constants in the code")
+    for one in scheduled if fixed else ():
+        raise LawError(f"law {one.name!r}", "is scheduled, which fixed point does not cover")
     modules = make_modules(laws, T_s, real, omega_b)
     by_name = {m.name: m for m in modules}
     choosing: dict[str, str] = {}
@@ -50,12 +61,13 @@ def export(
         choosing |= schedule_sources(one, own, T_s, omega_b, style)
     rows = golden(modules, SHIPPED)
     return {
-        **sources(modules, T_s, style),
+        **(fixed_sources(modules, T_s) if fixed else sources(modules, T_s, style)),
         **choosing,
         **selftest(modules, style),
-        "golden.h": _golden_header(rows, np.dtype(real)),
+        "golden.h": _golden_header(rows),
         "golden.csv": rows.csv(),
-        "CMakeLists.txt": _cmake(modules, style, choosing),
+        **({"proof/prove.sh": script(modules)} if fixed else {}),
+        "CMakeLists.txt": _cmake(modules, style, choosing) + _PROVE * fixed,
         **reports(modules, T_s, style),
     }
 
@@ -65,7 +77,8 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     adapters, table, names, sizes = [], [], [], []
     parts = ("init", "reset", "step", "look", "settle", "change", "view")
     stages = modules[0].stages
-    choices = {"stages": stages}
+    precision, fixed = modules[0].precision, modules[0].fixed is not None
+    choices = {"stages": stages, "fixed": fixed}
     e = {"E": ", const golden_real *e" * stages, "e": ", e" * stages, "NOW_E": ", now.e" * stages}
     for m in modules:
         own = style == "unrolled"
@@ -74,6 +87,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
             "T": m.prefix if own else "gfm",
             "ARGUMENT": "" if own else f"&{m.prefix}_law, ",
             "N": str(m.n),
+            "REST": str(2 * NU + m.n),
             **e,
         }
         adapters.append(filled(chosen(template("adapter.c"), choices), keys))
@@ -83,13 +97,13 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     states = max([1, *(m.n for m in modules)])
     keys = {
         "MADE": MADE,
-        **C_TYPES[str(modules[0].real)],
+        **C_TYPES[precision],
         "LAWS": str(len(modules)),
         "NX": str(states),
         "NY": str(len(carried("y", stages))),
         "NU": str(len(carried("u", stages))),
         "STAGE": str(SIZE),
-        "WORDS": str(len(columns(states, stages))),
+        "WORDS": str(len(columns(states, stages, fixed))),
         **e,
         "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),
         "ADAPTERS": "".join(adapters).rstrip("\n") + "\n",
@@ -102,8 +116,8 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     }
 
 
-def _golden_header(rows: Golden, real: np.dtype[Any]) -> str:
-    bits = 8 * real.itemsize
+def _golden_header(rows: Golden) -> str:
+    bits = 8 * rows.words.itemsize
     suffix = "U" if bits == 32 else "ULL"
     lines = [
         "    {" + ",".join(f"0x{w:x}{suffix}" for w in row) + "}," for row in rows.words.tolist()
@@ -138,4 +152,4 @@ def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -
 
 def needs_sqrt(m: Module) -> bool:
     """Whether a law's unrolled step takes a square root."""
-    return m.stages or int(m.record["error_map"]) == HYBRID_ANGLE
+    return not m.fixed and (m.stages or int(m.record["error_map"]) == HYBRID_ANGLE)

@@ -22,6 +22,15 @@ from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import step_with_inner
+from gfm_runtime.firmware.fixed import (
+    REFS,
+    YS,
+    Instance,
+    U,
+    bump_of,
+    refusal,
+    to_integers,
+)
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.firmware.stage import VARIABLES
 from gfm_runtime.inner import settle_inner, take_measurements
@@ -48,7 +57,8 @@ class Golden:
     Attributes:
         words: shape (rows, columns), uint32 or uint64.
         columns: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the
-            law's u of the last tick), trend_*; with an inner stage its variables, and limited.
+            law's u of the last tick), trend_*; with an inner stage its variables, and limited; in
+            fixed point the rests, 31 lower bits and what is above.
     """
 
     words: NDArray[Any]
@@ -63,7 +73,7 @@ class Golden:
         )
 
 
-def columns(states: int, stages: bool) -> tuple[str, ...]:
+def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
     """The columns of golden rows whose laws have up to ``states`` states, and inner stages."""
     y, u, ref = carried("y", stages), carried("u", stages), names("ref")
     own = names("u")
@@ -79,6 +89,7 @@ def columns(states: int, stages: bool) -> tuple[str, ...]:
         *(f"x_{i}" for i in range(states)), *(f"offset_{name}" for name in own),
         *(f"last_{name}" for name in own), *(f"trend_{name}" for name in own),
         *([*variables, "limited"] if stages else ()),
+        *(f"rest_{i}_{end}" for i in range(fixed * (2 * NU + states)) for end in ("low", "high")),
     )  # fmt: skip
 
 
@@ -87,6 +98,8 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
 
     The first law starts by init, each of the others by a change from the law before it.
     """
+    if modules[0].fixed:
+        return _fixed_rows(modules, ticks)
     real, stages = modules[0].real, modules[0].stages
     states = max([1, *(m.n for m in modules)])
     word = np.dtype(f"u{real.itemsize}")
@@ -116,6 +129,44 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
             columns_of.append(after["limited"][:, None].astype(word))
         parts.append(np.hstack(columns_of))
     return Golden(np.vstack(parts), columns(states, stages))
+
+
+def _fixed_rows(modules: Sequence[Module], ticks: int) -> Golden:
+    """As ``_drive``, by the exact reference of the arithmetic in fixed point."""
+    states = max([1, *(m.n for m in modules)])
+    instances = [[Instance(m.fixed), Instance(m.fixed)] for m in modules if m.fixed]
+    old, now, latched, held, bump = 0, 0, OK, [0] * NU, 0
+    rows = []
+    for k, module in enumerate(modules):
+        op, refs, ys = inputs(zlib.crc32(module.prefix.encode()), ticks, np.dtype("f8"))
+        op[0] = INIT if k == 0 else SWITCH
+        ref_rows, y_rows = to_integers(refs, REFS).tolist(), to_integers(ys, YS).tolist()
+        for what, ref, y in zip(op.tolist(), ref_rows, y_rows, strict=True):
+            refused = refusal(ref, y, BAD_REF)
+            if what == SWITCH:
+                before, now = instances[old][now], 1 - now
+                instances[k][now] = fresh = Instance(instances[k][now].law)
+                if refused == OK and latched == OK:
+                    u = before.output(ref, y)[U : U + NU]
+                    bump = bump_of(u, fresh.settle(ref, y, u, before.trend))
+            elif what == RESET:
+                latched = OK
+                one, u = instances[k][now], instances[k][now].u
+                one.reset()
+                if refused == OK:
+                    one.settle(ref, y, u, [0] * NU)
+            old = k
+            one, latched = instances[k][now], latched or refused
+            if latched == OK:
+                held = one.step(ref, y)
+            rest = [part for r in one.rest for part in (r & 0x7FFFFFFF, r >> 31)]
+            pad = [0] * (states - len(one.x))
+            rows.append(
+                [what, k, latched, *ref, *y, *held, bump, *one.x, *pad, *one.offset, *one.u,
+                 *one.trend, *rest, *pad, *pad]
+            )  # fmt: skip
+    words = np.array(rows, np.int64).astype(np.uint32)
+    return Golden(words, columns(states, False, True))
 
 
 def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -28,6 +28,7 @@ from gfm_runtime.firmware.c_text import (
     plain,
     template,
 )
+from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
 from gfm_runtime.firmware.stage import (
     AT_RUN_TIME,
     CONSTANTS,
@@ -55,6 +56,7 @@ MADE = "Made by gfmhil firmware export; do not edit."
 Style = Literal["unrolled", "records"]
 STYLES: tuple[Style, ...] = get_args(Style)
 REALS = ("float32", "float64")
+FIXED_CHOICES: Choices = dict(WITHOUT) | {"fixed": True}
 
 #: what a step returns; the bench's scenario refuses a reference out of range before it gets here
 BAD_REF = len(REASONS)
@@ -68,6 +70,7 @@ RESULTS = {
 C_TYPES = {
     "float32": {"C_REAL": "float", "BITS": "32", "DIG": "FLT_MANT_DIG", "MANTISSA": "24"},
     "float64": {"C_REAL": "double", "BITS": "64", "DIG": "DBL_MANT_DIG", "MANTISSA": "53"},
+    FIXED: {"C_REAL": "int32_t", "BITS": "32"},
 }
 #: fields of a law's record that are integers, and those in its precision
 INTEGERS = ("n", "error_map")
@@ -79,8 +82,10 @@ NUMBERS = (
 STAGE_INTEGERS = ("inner", "priority", "freeze", "row")
 
 
-def fields(stages: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def fields(stages: bool, fixed: bool = False) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The fields of a law's record that are integers, and those in its precision."""
+    if fixed:
+        return (*INTEGERS, "row"), NUMBERS
     if not stages:
         return INTEGERS, NUMBERS
     return INTEGERS + STAGE_INTEGERS, NUMBERS + INNER_CONSTANTS
@@ -95,12 +100,14 @@ class Module:
         law: the law itself; None for one that was read back from a report.
         record: the law as ``pack_law`` gives it.
         stages: whether a law of its folder has an inner stage: y has 11 signals then, and u 4.
+        fixed: the law in fixed point; None in a floating-point precision.
     """
 
     name: str
     law: Law | None
     record: np.void
     stages: bool = False
+    fixed: FixedLaw | None = None
 
     @property
     def prefix(self) -> str:
@@ -119,24 +126,36 @@ class Module:
 
     @property
     def real(self) -> np.dtype[Any]:
-        """float32 or float64."""
+        """float32 or float64; of a law in fixed point that of its record."""
         return np.dtype(self.record["u_0"].dtype)
+
+    @property
+    def precision(self) -> str:
+        """One of ``REALS``, or ``FIXED``."""
+        return FIXED if self.fixed else str(self.real)
 
 
 def make_modules(
     laws: Mapping[str, Law], T_s: float, real: DTypeLike, omega_b: float = 100 * math.pi
 ) -> list[Module]:
-    """The laws by name, discretised at T_s [s] and packed in float32 or float64.
+    """The laws by name, discretised at T_s [s] and packed in float32 or float64, or in fixed point.
 
     Args:
         laws: if one has an inner stage, all are made for y and u with its signals.
         T_s: sampling time, s.
-        real: float32 or float64.
+        real: float32 or float64, or ``FIXED``.
         omega_b: base frequency of the converter, rad/s, for the inner stage.
 
     Raises:
-        LawError: a law that does not discretise, and as ``check_modules``.
+        LawError: a law that does not discretise, or that fixed point does not cover, and as
+            ``check_modules``.
     """
+    if real == FIXED:
+        for name, law in laws.items():
+            if law.inner is not None:
+                raise LawError(f"law {name!r}", "has an inner stage, which fixed point has not")
+        plain_ones = make_modules(laws, T_s, np.float64, omega_b)
+        return [replace(m, fixed=make_fixed(m.name, m.record)) for m in plain_ones]
     stages = any(law.inner is not None for law in laws.values())
     modules = [
         Module(name, law, pack_law(discretise(law, T_s), real, omega_b)[0], stages)
@@ -214,7 +233,7 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         guard = f"{m.prefix.upper()}_H"
         out[f"{m.prefix}.h"] = "\n".join(
             [
-                _about(m, T_s),
+                about(m, T_s),
                 f"#ifndef {guard}",
                 f"#define {guard}",
                 "",
@@ -235,7 +254,7 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
 def _header(m: Module, T_s: float) -> str:
     keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
     text = filled(chosen(template("interface.h"), m.choices), keys)
-    return _about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
+    return about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
 
 
 def _unrolled(m: Module) -> str:
@@ -257,7 +276,7 @@ def _unrolled(m: Module) -> str:
     )
 
 
-def _about(m: Module, T_s: float) -> str:
+def about(m: Module, T_s: float) -> str:
     """The comment at the top: the law, its source, its parameters with units and sources."""
     lines = [f"{m.name}. {MADE}", ""]
     if m.law is not None:
@@ -276,8 +295,10 @@ def _about(m: Module, T_s: float) -> str:
             numbers = ", ".join(f"{name} = {value}" for name, value in acting(m.law.inner).items())
             lines += [f"Inner stage at f_n = {f_n:g} Hz: {m.law.inner.kind}, {numbers}"]
     lines += [
-        f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.real}.",
-        "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
+        f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.precision}.",
+        "Integers only: every compiler gives the same bits."
+        if m.fixed
+        else "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
     ]
     return "/* " + "\n * ".join(_wrapped(lines)) + "\n */"
 

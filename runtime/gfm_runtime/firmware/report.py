@@ -7,8 +7,10 @@ anew from them, so that ``gfmhil firmware check`` needs no law file.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +19,8 @@ import numpy as np
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal, template
+from gfm_runtime.firmware.deviation import NEAR, deviations
+from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
 from gfm_runtime.firmware.module import (
     REALS,
     STYLES,
@@ -28,7 +32,7 @@ from gfm_runtime.firmware.module import (
 from gfm_runtime.firmware.stage import CONSTANTS, SIZE, numbers_of, stage_text
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.kernel import law_dtype
-from gfm_runtime.signals import NU, NY, carried_rows, group, table_hash
+from gfm_runtime.signals import NU, NY, U_NAMES, carried_rows, group, table_hash
 
 FORMAT = 1  # of report.json
 
@@ -52,11 +56,18 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "states": m.n,
             "bytes": sizes(m, style),
             "operations": operations(m, style),
-            "record": {name: _hex(m.record[name]) for part in fields(m.stages) for name in part},
+            "record": {
+                name: _hex(m.record[name])
+                for part in fields(m.stages, m.fixed is not None)
+                for name in part
+            },
         }
         for m in modules
     ]
-    real, stages = str(modules[0].real), modules[0].stages
+    for law, m in zip(laws, modules, strict=True):
+        if m.fixed:
+            law["deviation"] = _deviations(m.fixed, m.record, T_s)
+    real, stages = modules[0].precision, modules[0].stages
     whole = {
         "format": FORMAT,
         "signal_table": table_hash(),
@@ -99,17 +110,21 @@ def read_report(folder: Path) -> Exported:
 
 @np.errstate(over="ignore")  # what overflows is refused
 def _exported(whole: Any) -> Exported:
-    for key, allowed in (("format", (FORMAT,)), ("real", REALS), ("style", STYLES)):
+    for key, allowed in (("format", (FORMAT,)), ("real", (*REALS, FIXED)), ("style", STYLES)):
         if whole[key] not in allowed:
             raise LawError(key, f"{whole[key]!r} must be {' or '.join(map(str, allowed))}")
-    dtype, stages = law_dtype(whole["real"]), bool(whole.get("stages"))
+    fixed = whole["real"] == FIXED
+    dtype = law_dtype("float64" if fixed else whole["real"])
+    stages = bool(whole.get("stages")) and not fixed
     modules = [
-        Module(str(law["name"]), None, _record(law["record"], dtype, stages), stages)
+        Module(str(law["name"]), None, _record(law["record"], dtype, fields(stages, fixed)), stages)
         for law in whole["laws"]
     ]
     if not modules:
         raise LawError("laws", "there must be one")
     check_modules(modules)
+    if fixed:
+        modules = [replace(m, fixed=make_fixed(m.name, m.record)) for m in modules]
     return Exported(modules, whole["real"], whole["style"])
 
 
@@ -120,9 +135,11 @@ def _hex(value: Any) -> str | int | list[int]:
     return " ".join(literal(v, value.dtype).rstrip("f") for v in np.ravel(value))
 
 
-def _record(given: Mapping[str, Any], dtype: np.dtype[Any], stages: bool) -> np.void:
+def _record(
+    given: Mapping[str, Any], dtype: np.dtype[Any], named: tuple[tuple[str, ...], ...]
+) -> np.void:
     out = np.zeros(1, dtype)
-    integers, numbers_of = fields(stages)
+    integers, numbers_of = named
     for name in (*integers, *numbers_of):
         text = given[name]
         if name in integers:
@@ -140,6 +157,9 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
     measures what came of it.
     """
     state = max(1, m.n) + 3 * NU + SIZE * m.stages
+    if m.fixed:
+        rests = 2 * NU + m.n
+        return {"state": 4 * state + 8 * rests, "constants": 4 * _products(m.fixed)}
     if style == "records":
         n, of = m.n, 2 * NY + NU
         constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
@@ -154,8 +174,10 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
 
 
 def operations(m: Module, style: Style) -> dict[str, int]:
-    """Floating-point operations of a step in which all limits clamp, the refusal included."""
+    """Operations of a step in which all limits clamp, the refusal included; without shifts."""
     n = m.n
+    if m.fixed:
+        return _integer_operations(m.fixed)
     stage = _stage_step(m, style)
     if style == "records":
         products = NU * (n + 3 * NY - 1) + 3 + NU * n + 2 * NU + n * (2 * NY + n)
@@ -190,6 +212,22 @@ def operations(m: Module, style: Style) -> dict[str, int]:
     }
 
 
+def _products(law: FixedLaw) -> int:
+    """Products of a step, 32 by 32 to 64 bits."""
+    return sum(len(s.terms) for s in (*law.output, *law.decay, *law.follow, *law.state))
+
+
+def _integer_operations(law: FixedLaw) -> dict[str, int]:
+    moved = 2 * NU + law.n
+    return {
+        "multiplications": _products(law),
+        "additions": _products(law) + moved + 2 * NU,
+        "divisions": 0,
+        "square_roots": 0,
+        "comparisons": 2 * (moved + NU + 2 * NY),
+    }
+
+
 def _stage_step(m: Module, style: Style) -> str:
     """The text of the inner stage that a step goes through."""
     if not m.stages:
@@ -201,6 +239,57 @@ def _stage_step(m: Module, style: Style) -> str:
     return stage_text(
         "stage.c", choices, keys | {"sqrt": "sqrt", "0": "0", "1": "1"} | numbers_of(m.record)
     )
+
+
+def _deviations(law: FixedLaw, record: np.void, T_s: float) -> dict[str, list[dict[str, Any]]]:
+    """Of each output, p.u. and p.u./s; None where there is no bound. Float64's own is included."""
+    out = {}
+    for name, real, near in (("fixed", FIXED, False), ("fixed, small signals", FIXED, True),
+                             ("float32", "float32", False)):  # fmt: skip
+        found, exact = (deviations(law, record, which, near) for which in (real, "float64"))
+        out[name] = [
+            {
+                "bound": _finite(d.bound + own.bound),
+                "drift": _finite((d.drift + own.drift) / T_s),
+            }
+            for d, own in zip(found, exact, strict=True)
+        ]
+    return out
+
+
+def _finite(value: float) -> float | None:
+    """Rounded up to two digits; None for no bound."""
+    if not math.isfinite(value) or value == 0.0:
+        return None if value else 0.0
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit) * unit:.2g}")
+
+
+def deviation_text(found: Mapping[str, float | None]) -> str:
+    """A bound as report.json has it: p.u., and t in s; a dash for none."""
+    if found["bound"] is None:
+        return "–"
+    return f"{found['bound']:.1e}" + (f" + {found['drift']:.0e} t" if found["drift"] else "")
+
+
+def _deviation_table(laws: Sequence[Mapping[str, Any]]) -> list[str]:
+    kinds = list(laws[0]["deviation"])
+    rows = [
+        (law["name"], kind, *map(deviation_text, law["deviation"][kind]))
+        for law in laws
+        for kind in kinds
+    ]
+    return [
+        "How far u gets from float64 at most, for all inputs in range, p.u.; t is the time in s "
+        "since the start or the last settle. The state of an integrator drifts in open loop, in "
+        f"any precision; a loop that is closed holds it. Small signals are within {NEAR:g} p.u. of "
+        "the default inputs.",
+        "",
+        _line(("law", "precision", *U_NAMES)),
+        "|---" * 5 + "|",
+        *map(_line, rows),
+        "",
+    ]
 
 
 def _page(laws: Sequence[Mapping[str, Any]], T_s: float, real: str, style: str) -> str:
@@ -224,7 +313,11 @@ def _page(laws: Sequence[Mapping[str, Any]], T_s: float, real: str, style: str) 
             "The operations are those of one step in which every limit clamps. "
             "`gfmhil firmware check` counts instructions, code and stack on a target.",
             "",
-            "Bits: compile without `-ffast-math` and with `-ffp-contract=off`; `selftest.c` "
+            *(_deviation_table(laws) if real == FIXED else ()),
+            "Bits: `selftest.c` compares every output and state with `golden.h`, bit by bit. "
+            "`proof/prove.sh` proves with Frama-C that nothing overflows."
+            if real == FIXED
+            else "Bits: compile without `-ffast-math` and with `-ffp-contract=off`; `selftest.c` "
             "compares every output and state with `golden.h`, bit by bit.",
             "",
         ]

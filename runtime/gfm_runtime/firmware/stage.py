@@ -37,10 +37,11 @@ CONSTANTS = tuple(name for name in INNER_CONSTANTS if name not in SHARED)
 #: templates: a tick, and what settles the stage
 STAGE_PARTS = ("stage.c", "stage_settle.c")
 #: no law of the folder has a stage
-WITHOUT: Choices = {"stages": False, "pll": False}
+WITHOUT: Choices = {"stages": False, "pll": False, "fixed": False}
 #: of the generic step
 AT_RUN_TIME: Choices = {
     "stages": True,
+    "fixed": False,
     "stage": f"law->inner != {NONE}",
     "stator": f"law->inner == {STATOR}",
     "voltage": f"law->inner != {STATOR}",
@@ -64,6 +65,7 @@ def choices_of(record: np.void) -> Choices:
     p = next(s for s in group("y") if s.name == "p")
     return {
         "stages": True,
+        "fixed": False,
         "stage": kind != NONE,
         "stator": kind == STATOR,
         "voltage": kind not in (NONE, STATOR),

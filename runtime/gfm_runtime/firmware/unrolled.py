@@ -39,7 +39,7 @@ class Unrolled:
         return "\n".join(
             [
                 "static void set_inputs(tick_t *t, const real ref[], const real y[])",
-                *_body(self._set_inputs()),
+                *body(self._set_inputs()),
                 "/* A copy of its own for step saves it a call and the way through memory. */",
                 "#ifdef __GNUC__",
                 "#define IN_PLACE static inline __attribute__((always_inline))",
@@ -48,11 +48,11 @@ class Unrolled:
                 "#endif",
                 "",
                 f"IN_PLACE void output(const {prefix}_t *s, tick_t *t)",
-                *_body(self._output()),
+                *body(self._output()),
                 f"static void advance({prefix}_t *s, const tick_t *t)",
-                *_body(self._advance()),
+                *body(self._advance()),
                 f"static void set_states({prefix}_t *s, tick_t *t, const real u[])",
-                *_body(self._set_states()),
+                *body(self._set_states()),
             ]
         )
 
@@ -218,7 +218,7 @@ def _sum(terms: Sequence[str]) -> str:
     )
 
 
-def _body(lines: list[str]) -> list[str]:
+def body(lines: list[str]) -> list[str]:
     """A function's body; long sums go on over several lines."""
     out = ["{"]
     for line in lines:

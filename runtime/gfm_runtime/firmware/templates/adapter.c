@@ -43,6 +43,15 @@ static view_t @P@_do_view(int k)
     const view_t view = {s->x, s->offset, s->u, s->trend, @N@, stage, s->stage.e, s->limited};
     memcpy(stage, &s->stage, sizeof stage);
     return view;
+/* @elif fixed@ */
+    static golden_real rest[2 * @REST@];
+    const view_t view = {s->x, s->offset, s->u, s->trend, @N@, rest, 2 * @REST@};
+    int i;
+    for (i = 0; i < @REST@; i++) {
+        rest[2 * i] = (golden_real)(s->rest[i] & INT32_MAX);
+        rest[2 * i + 1] = (golden_real)(s->rest[i] >> 31);
+    }
+    return view;
 /* @else@ */
     const view_t view = {s->x, s->offset, s->u, s->trend, @N@};
     return view;

@@ -1,6 +1,10 @@
 #ifndef @GUARD@_H
 #define @GUARD@_H
 
+/* @if fixed@ */
+#include <stdint.h>
+
+/* @end@ */
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -33,6 +37,9 @@ typedef struct {
 /* @if stages@ */
     @P@_stage_t stage;
     int limited;                /* whether the stage limited the current in this tick */
+/* @end@ */
+/* @if fixed@ */
+    int64_t rest[@GUARD@_NREST]; /* of the offset, the trend and x: their lower bits */
 /* @end@ */
     int reason;                 /* 0, or why it is in the safe state */
     int channel;                /* which signal was the reason, or -1 */

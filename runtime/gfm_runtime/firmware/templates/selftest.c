@@ -26,6 +26,9 @@ typedef struct {
 /* @if stages@ */
     const golden_real *stage, *e;
     int limited;
+/* @elif fixed@ */
+    const golden_real *rest;
+    int rests;
 /* @end@ */
 } view_t;
 
@@ -114,6 +117,8 @@ unsigned golden_row(const golden_word row[])
 /* @if stages@ */
     differ += compare(now.stage, row + 9, GOLDEN_STAGE);
     differ += (golden_word)now.limited != row[9 + GOLDEN_STAGE];
+/* @elif fixed@ */
+    differ += compare(now.rest, row + 9, now.rests);
 /* @end@ */
     return differ;
 }
