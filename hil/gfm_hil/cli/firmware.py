@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_runtime import Law, LawSet, law_names, load_law
@@ -28,6 +28,7 @@ from gfm_runtime.firmware import (
     build_dll,
     check,
     dll_sources,
+    elf_a2l,
     export,
     fmu,
     golden,
@@ -61,6 +62,10 @@ def add(command: argparse.ArgumentParser) -> None:
     unit.add_argument("--fmi", choices=FMI, default=FMI[-1], help=f"version of FMI ({FMI[-1]})")
     unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
     unit.set_defaults(call=call_fmu)
+    a2l = kinds.add_parser("a2l", help="write the calibration file (A2L) of a firmware's ELF file")
+    a2l.add_argument("elf", type=Path, metavar="ELF", help="linked, with debug information (-g)")
+    a2l.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .a2l")
+    a2l.set_defaults(call=call_a2l)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
     _add_laws(vectors)
     vectors.add_argument(
@@ -144,6 +149,21 @@ def call_fmu(options: argparse.Namespace) -> int:
     with replacing(options.out) as part:
         part.write_bytes(packed)
     print(options.out)
+    return 0
+
+
+def call_a2l(options: argparse.Namespace) -> int:
+    """Write the calibration file; returns the exit code."""
+    need("elftools", "pyelftools", "firmware a2l", "calibration")
+    text, measured, calibrated = elf_a2l(options.elf)
+    write_text(options.out, text)
+    print(f"{options.out}: {measured} measurements, {calibrated} characteristics")
+    if not calibrated:
+        print(
+            "gfmhil: the gains are constants in the code; a law of --style records whose record "
+            "lies in RAM can be calibrated",
+            file=sys.stderr,
+        )
     return 0
 
 

@@ -1,5 +1,7 @@
+from .a2l import Entry, a2l_text, unit_of
 from .check import OPTIMISED, TARGETS, Checked, check, need_tools
 from .dll import build_dll, dll_sources
+from .elf import elf_a2l, elf_entries
 from .fmu import FMI, fmu
 from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
@@ -21,14 +23,18 @@ __all__ = [
     "TICK",
     "TO",
     "Checked",
+    "Entry",
     "Golden",
     "LoopProgram",
     "Module",
     "Style",
+    "a2l_text",
     "build_dll",
     "build_loop",
     "check",
     "dll_sources",
+    "elf_a2l",
+    "elf_entries",
     "export",
     "fmu",
     "golden",
@@ -36,4 +42,5 @@ __all__ = [
     "need_tools",
     "sources",
     "stage_names",
+    "unit_of",
 ]
