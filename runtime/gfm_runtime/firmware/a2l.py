@@ -149,27 +149,34 @@ def _number(value: float) -> str:
 
 def _method(entry: Entry, methods: dict[str, list[str]]) -> str:
     """The name of the entry's COMPU_METHOD, which is added to ``methods`` once."""
-    if entry.words:
-        name = f"{identifier(entry.name.rpartition('.')[2])}_code"
-        table = f"{name}_words"
-        rows = [f"  {code} {_quoted(word or 'none')}" for code, word in entry.words]
-        methods[name] = [
-            f'/begin COMPU_METHOD {name} "" TAB_VERB "%3.0" ""',
-            f"  COMPU_TAB_REF {table}",
-            "/end COMPU_METHOD",
-            f'/begin COMPU_VTAB {table} "" TAB_VERB {len(rows)}',
-            *rows,
-            "/end COMPU_VTAB",
-        ]
-        return name
-    if not entry.unit:
+    if not (entry.words or entry.unit):
         return "NO_COMPU_METHOD"
-    name = f"in_{identifier(entry.unit)}"
-    methods[name] = [
-        f'/begin COMPU_METHOD {name} "" IDENTICAL "%12.6" {_quoted(entry.unit)}',
+    own = entry.name.rpartition(".")[2]
+    first = f"{identifier(own)}_code" if entry.words else f"in_{identifier(entry.unit)}"
+    for k in range(len(methods) + 1):  # two units may be the same as an identifier
+        name = f"{first}_{k}" if k else first
+        lines = _coded(name, entry.words) if entry.words else _in_unit(name, entry.unit)
+        if methods.setdefault(name, lines) == lines:
+            return name
+    raise AssertionError(first)
+
+
+def _in_unit(name: str, unit: str) -> list[str]:
+    return [
+        f'/begin COMPU_METHOD {name} "" IDENTICAL "%12.6" {_quoted(unit)}',
         "/end COMPU_METHOD",
     ]
-    return name
+
+
+def _coded(name: str, words: Sequence[tuple[int, str]]) -> list[str]:
+    return [
+        f'/begin COMPU_METHOD {name} "" TAB_VERB "%3.0" ""',
+        f"  COMPU_TAB_REF {name}_words",
+        "/end COMPU_METHOD",
+        f'/begin COMPU_VTAB {name}_words "" TAB_VERB {len(words)}',
+        *(f"  {code} {_quoted(word or 'none')}" for code, word in words),
+        "/end COMPU_VTAB",
+    ]
 
 
 def _range(entry: Entry) -> str:
