@@ -74,7 +74,8 @@ def add(command: argparse.ArgumentParser) -> None:
     vectors.add_argument("-o", "--out", type=Path, metavar="FILE", help="else to the screen")
     vectors.set_defaults(call=call_golden)
     include = kinds.add_parser(
-        "include", help="print the folder of gfmhil_controller.h, for a controller in C of your own"
+        "include",
+        help="print the folder of gfmhil_controller.h and gfmhil_frames.h, for your own C code",
     )
     include.set_defaults(call=call_include)
     proof = kinds.add_parser("check", help="build and run a folder, and compare every bit")
@@ -180,7 +181,7 @@ def call_golden(options: argparse.Namespace) -> int:
 
 
 def call_include(_: argparse.Namespace) -> int:
-    """Print the folder of our header; returns the exit code."""
+    """Print the folder of our headers; returns the exit code."""
     print(files("gfm_hil.models"))
     return 0
 
