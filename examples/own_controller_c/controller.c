@@ -1,6 +1,7 @@
 /* A controller of your own in C: droop with a low-pass on p, against gfmhil's plant.
 
-   It uses nothing of gfmhil; docs/own-controller.md describes all that it has to know.
+   It uses nothing of gfmhil but its header gfmhil_frames.h; docs/own-controller.md describes all
+   that is in there.
 
    Usage: controller-zmq ENDPOINT [--realtime] TICK=P_REF ...
           controller-shm ENDPOINT [--realtime] TICK=P_REF ...
@@ -10,6 +11,7 @@
    something else. */
 
 #include "link.h"
+#include "gfmhil_frames.h"
 
 #include <math.h>
 #include <sched.h>
@@ -21,54 +23,14 @@
 #include <sys/mman.h>
 #include <time.h>
 
-enum { NY = 5, NU = 3, MAGIC = 0x4647, TABLE_VERSION = 2, Y_ID = 1, U_ID = 2 };
-enum { READY = 1, RUNNING = 2, SAFE = 3, STOPPED = 4 };
-enum { OK = 0, BAD_Y = 1, LOST_PEER = 4, OPERATOR = 6 };
+enum { NY = GFMHIL_NY, NU = GFMHIL_NU };
 enum { GREETING_WAIT_MS = 60000, LOCKSTEP_WAIT_MS = 20000, REALTIME_WAIT_MS = 1000 };
 enum { PRIORITY = 50, ANSWER_EVERY_MS = 100, LAST_TIMES = 3 };
 
-#define GREETING "GFMHIL "
 #define NAME "droop in C" /* what the plant's report calls this controller */
 
 /* The signal table that this program was written for; the plant sends its own. */
 #define TABLE "\"fb7ec5b6\""
-
-typedef struct __attribute__((packed)) {
-    uint16_t magic;
-    uint8_t version, data_id, state, reason;
-    uint16_t spare;
-    uint32_t sequence;
-    uint64_t tick;
-} header_t;
-
-typedef struct __attribute__((packed)) {
-    header_t head;
-    double y[NY]; /* v_dc, p, omega_u, q, V */
-    uint32_t crc;
-} y_frame_t;
-
-typedef struct __attribute__((packed)) {
-    header_t head;
-    double u[NU]; /* i_u, omega_u, E_u */
-    uint32_t crc;
-} u_frame_t;
-
-_Static_assert(sizeof(header_t) == 20, "header");
-_Static_assert(sizeof(y_frame_t) == 64, "frame of y");
-_Static_assert(sizeof(u_frame_t) == 48, "frame of u");
-_Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "frames are little-endian");
-
-/* CRC-32 of zlib and Ethernet: reflected polynomial, all ones before and after. */
-static uint32_t crc32(const void *data, size_t size) {
-    const uint8_t *byte = data;
-    uint32_t crc = 0xFFFFFFFF;
-    while (size-- > 0) {
-        crc ^= *byte++;
-        for (int bit = 0; bit < 8; bit++)
-            crc = crc >> 1 ^ (crc & 1 ? 0xEDB88320 : 0);
-    }
-    return ~crc;
-}
 
 /* ---- the law ----------------------------------------------------------------------------- */
 
@@ -100,32 +62,15 @@ static bool plausible(const double y[NY]) {
 
 /* ---- the greeting ------------------------------------------------------------------------ */
 
-/* The value of a key of a flat JSON object as it stands there, with quotes if it is a string. */
-static bool field(const char *json, const char *key, char *value, size_t room) {
-    char quoted[32];
-    snprintf(quoted, sizeof quoted, "\"%s\"", key);
-    const char *at = strstr(json, quoted);
-    if (at == NULL)
-        return false;
-    at += strlen(quoted);
-    at += strspn(at, " :");
-    const char *end = *at == '"' ? strchr(at + 1, '"') : at + strcspn(at, " ,}") - 1;
-    if (end == NULL || (size_t)(end + 1 - at) >= room)
-        return false;
-    memcpy(value, at, (size_t)(end + 1 - at));
-    value[end + 1 - at] = '\0';
-    return true;
-}
-
 /* Answer a HELLO of the plant, after a look at what it runs. Returns its T_s in s, or 0 if this
    program does not fit. */
 static double answer_hello(link_t *link, const char *hello) {
-    char boot[64] = "", version[64], table[64], T_s[64], laws[128], digest[128], answer[LONGEST];
-    if (!field(hello, "version", version, sizeof version) ||
-        !field(hello, "table", table, sizeof table) || !field(hello, "T_s", T_s, sizeof T_s) ||
-        !field(hello, "laws", laws, sizeof laws) || !field(hello, "digest", digest, sizeof digest))
+    char boot[64] = "", version[64], table[64], T_s[64], answer[GFMHIL_LONGEST];
+    if (!gfmhil_field(hello, "version", version, sizeof version) ||
+        !gfmhil_field(hello, "table", table, sizeof table) ||
+        !gfmhil_field(hello, "T_s", T_s, sizeof T_s))
         return 0;
-    if (atoi(version) != TABLE_VERSION || strcmp(table, TABLE) != 0) {
+    if (atoi(version) != GFMHIL_TABLE_VERSION || strcmp(table, TABLE) != 0) {
         fprintf(stderr, "the plant has another signal table: version %s, %s\n", version, table);
         return 0;
     }
@@ -135,13 +80,10 @@ static double answer_hello(link_t *link, const char *hello) {
             boot[strcspn(boot, "\n")] = '\0';
         fclose(file);
     }
-    const int size = snprintf(answer, sizeof answer,
-                              GREETING "{\"kind\": \"hello\", \"role\": \"controller\", "
-                                       "\"boot\": \"%s\", \"version\": %s, \"table\": %s, "
-                                       "\"T_s\": %s, \"laws\": %s, \"digest\": %s, "
-                                       "\"name\": \"" NAME "\"}",
-                              boot, version, table, T_s, laws, digest);
-    link_send(link, answer, (size_t)size);
+    const size_t size = gfmhil_answer(hello, boot, NAME, answer);
+    if (size == 0)
+        return 0;
+    link_send(link, answer, size);
     return atof(T_s);
 }
 
@@ -149,9 +91,9 @@ static double answer_hello(link_t *link, const char *hello) {
 
 typedef struct {
     link_t *link;
-    u_frame_t out;  /* the last frame sent */
-    uint32_t next;  /* sequence expected of the plant */
-    int64_t tick;   /* of the last y computed, -1 before the first */
+    gfmhil_u_frame out; /* the last frame sent */
+    uint32_t next;      /* sequence expected of the plant */
+    int64_t tick;       /* of the last y computed, -1 before the first */
 } loop_t;
 
 static volatile sig_atomic_t stopping;
@@ -167,20 +109,13 @@ static int64_t now_ms(void) {
     return now.tv_sec * (int64_t)1000 + now.tv_nsec / 1000000;
 }
 
-/* Whether a message is a frame of y that may be used. */
-static bool good(const loop_t *loop, const y_frame_t *y, size_t size) {
-    return size == sizeof *y && y->crc == crc32(y, offsetof(y_frame_t, crc)) &&
-           y->head.magic == MAGIC && y->head.version == TABLE_VERSION && y->head.data_id == Y_ID &&
-           y->head.sequence - loop->next < 0x80000000; /* not one that was there before */
-}
-
 /* Send the frame in `out` under the next sequence number. */
 static void send_u(loop_t *loop, uint8_t state, uint8_t reason) {
-    header_t *head = &loop->out.head;
+    gfmhil_header *head = &loop->out.head;
     head->state = state;
     head->reason = reason;
     head->tick = loop->tick < 0 ? 0 : (uint64_t)loop->tick;
-    loop->out.crc = crc32(&loop->out, offsetof(u_frame_t, crc));
+    gfmhil_seal(&loop->out);
     link_send(loop->link, &loop->out, sizeof loop->out);
     head->sequence++; /* modulo 2^32, as unsigned numbers go */
 }
@@ -194,17 +129,16 @@ static int leave(loop_t *loop, uint8_t state, uint8_t reason, int code) {
 
 /* Run until the plant ends the run; returns the exit code. `steps` are the arguments TICK=P_REF. */
 static int run(link_t *link, char **steps, int count, bool realtime) {
-    loop_t loop = {.link = link, .tick = -1};
-    loop.out.head = (header_t){.magic = MAGIC, .version = TABLE_VERSION, .data_id = U_ID};
+    loop_t loop = {.link = link, .out = gfmhil_first_u(), .tick = -1};
     loop.out.u[1] = loop.out.u[2] = 1.0;
     droop_t law = {.Q_ref = 0.0, .V_ref = 1.0};
-    uint8_t state = READY, reason = OK;
+    uint8_t state = GFMHIL_READY, reason = GFMHIL_OK;
     int64_t answered = -ANSWER_EVERY_MS;
     int wait_ms = GREETING_WAIT_MS;
     int64_t heard = now_ms();
     union {
         char text[LONGEST + 1];
-        y_frame_t y;
+        gfmhil_y_frame y;
     } message;
 
     while (!stopping) {
@@ -214,13 +148,13 @@ static int run(link_t *link, char **steps, int count, bool realtime) {
             if (now - heard < wait_ms)
                 continue; /* a signal */
             fprintf(stderr, "the plant is gone\n");
-            return leave(&loop, SAFE, LOST_PEER, 1);
+            return leave(&loop, GFMHIL_SAFE, GFMHIL_LOST_PEER, 1);
         }
         heard = now;
         message.text[size < LONGEST ? size : LONGEST] = '\0';
-        if (strncmp(message.text, GREETING, strlen(GREETING)) == 0) {
-            if (strstr(message.text, "\"hello\"") == NULL)
-                continue; /* START: frames follow; \"t0\" is the time of tick 0 */
+        if (gfmhil_is_greeting(message.text, "start"))
+            continue; /* frames follow; "t0" is the time of tick 0 */
+        if (gfmhil_is_greeting(message.text, "hello")) {
             if (now - answered < ANSWER_EVERY_MS)
                 continue; /* one answer for all that had piled up */
             answered = now;
@@ -231,22 +165,22 @@ static int run(link_t *link, char **steps, int count, bool realtime) {
             wait_ms = realtime ? REALTIME_WAIT_MS : LOCKSTEP_WAIT_MS;
             continue;
         }
-        if (!good(&loop, &message.y, size))
+        if (!gfmhil_is_y(&message, size, loop.next))
             continue; /* damaged: in lockstep the plant sends it again */
         loop.next = message.y.head.sequence + 1;
-        if (message.y.head.state == SAFE || message.y.head.state == STOPPED)
-            return leave(&loop, STOPPED, OK, 0); /* the plant tripped, or the run is over */
+        if (message.y.head.state == GFMHIL_SAFE || message.y.head.state == GFMHIL_STOPPED)
+            return leave(&loop, GFMHIL_STOPPED, GFMHIL_OK, 0); /* the plant tripped, or the run is over */
         const int64_t tick = (int64_t)message.y.head.tick;
         if (tick > loop.tick) { /* else the plant asks again: the answer was lost */
             loop.tick = tick;
             double y[NY];
             memcpy(y, message.y.y, sizeof y); /* the frame's may not be aligned */
-            if (state != SAFE && !plausible(y)) {
-                state = SAFE; /* for good: u stays, the plant blocks its bridge and ends the run */
-                reason = BAD_Y;
+            if (state != GFMHIL_SAFE && !plausible(y)) {
+                state = GFMHIL_SAFE; /* for good: u stays, the plant blocks its bridge and ends the run */
+                reason = GFMHIL_BAD_Y;
             }
-            if (state != SAFE) {
-                state = RUNNING;
+            if (state != GFMHIL_SAFE) {
+                state = GFMHIL_RUNNING;
                 for (int k = 0; k < count; k++)
                     if (strtoll(steps[k], NULL, 10) <= tick)
                         law.P_ref = atof(strchr(steps[k], '=') + 1);
@@ -257,7 +191,7 @@ static int run(link_t *link, char **steps, int count, bool realtime) {
         }
         send_u(&loop, state, reason);
     }
-    return leave(&loop, STOPPED, OPERATOR, 0);
+    return leave(&loop, GFMHIL_STOPPED, GFMHIL_OPERATOR, 0);
 }
 
 /* Ask for a processor, a real-time priority and memory that stays; do without what is refused. */

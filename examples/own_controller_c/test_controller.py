@@ -1,6 +1,7 @@
 """Tests of a controller in C against the emulated rig, over both links that it speaks."""
 
 import subprocess
+import sys
 import time
 import uuid
 from pathlib import Path
@@ -15,7 +16,8 @@ FAULTS = {"towards": "plant", "seed": 1, "loss": 0.01, "corrupt": 0.01, "duplica
 
 @pytest.fixture(scope="session", autouse=True)
 def programs():
-    subprocess.run(["make", "--silent"], cwd=HERE, check=True)
+    gfmhil = f"GFMHIL={sys.executable} -m gfm_hil"
+    subprocess.run(["make", "--silent", gfmhil], cwd=HERE, check=True)
 
 
 def begin(bench, link, *words, **changed):

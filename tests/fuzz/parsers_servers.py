@@ -35,6 +35,17 @@ from gfm_hil.scope.record import open_record
 
 from ..support.modbus_device import Bench as MadeUp
 from ..support.processes import free_port
+from ..support.xcp import (
+    CONNECT,
+    MASTER,
+    MadeUpRun,
+    datagram,
+    download,
+    set_mta,
+    short_download,
+    short_upload,
+)
+from ..support.xcp import slave as xcp_slave
 from .conftest import Parser, Take
 from .mutations import blobs, lines, texts
 from .parsers_peers import SCENARIO
@@ -266,8 +277,37 @@ def _jsons(many: tuple[dict[str, Any], ...]) -> st.SearchStrategy[bytes]:
     return texts([json.dumps(one) for one in many])
 
 
+@contextlib.contextmanager
+def _xcp(place: Path) -> Iterator[Take]:
+    """An input is a datagram of XCP on UDP, to a slave that has a master."""
+
+    def take(message: bytes) -> None:
+        run = MadeUpRun()  # each command that comes must be an event
+        slave = xcp_slave(run)
+        slave.take(datagram(CONNECT), MASTER)
+        answer = slave.take(message, MASTER)
+        while answer:
+            length, _ = struct.unpack_from("<HH", answer)
+            packet, answer = answer[4 : 4 + length], answer[4 + length :]
+            assert len(packet) == length and 1 <= length <= 255 and packet[0] in (0xFE, 0xFF)
+            assert packet[0] == 0xFF or length == 2
+
+    yield take
+
+
+def _packets() -> st.SearchStrategy[bytes]:
+    packets = [
+        CONNECT, b"\xfe", b"\xfd", b"\xfc", b"\xfb", b"\xfa\x04", b"\xf5\x10", set_mta(0x8000),
+        short_upload(0x1000, 64), short_download(0x8008, 0.5), short_download(0x9000, 1.0),
+        short_download(0x11000, 0.01), download(1.0, 0.5), set_mta(0, extension=1),
+    ]  # fmt: skip
+    seeds = [datagram(packet) for packet in packets]
+    return blobs([*seeds, datagram(set_mta(0x8000), download(1.0, 0.6), b"\xf5\x08")])
+
+
 SERVERS = (
     Parser("modbus", _modbus, _requests),
     Parser("scope", _scope, lambda: lines(_jsons(LOOKS))),
+    Parser("xcp", _xcp, _packets),
     Parser("commands", _commands, lambda: _jsons(EVENTS) | lines(_jsons(EVENTS))),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ import gfm_hil.models
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.models import PortMap, Rig, library, open_model
+from gfm_hil.models.model import ModelError
 from gfm_hil.results.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
@@ -220,3 +222,101 @@ def test_what_is_no_such_library_is_refused(
     ):
         with pytest.raises(UserError, match=message):
             open_model(f"c:{tmp_path / name}", PortMap(), rig)
+
+
+# --- the adapter of a firmware whose tasks a timer calls ---
+
+TASKS = Path(__file__).parents[2] / "examples" / "task_firmware"
+#: keeps what each call gets; its bridge gives the voltage that it measures
+RECORDER = """
+#include "firmware.h"
+double seen[80000][11];
+int calls, pwm_on = 1;
+void app_task_init(double H, double D, double kDroop)
+{
+    calls = H > 0 && D > 0 && kDroop > 0 ? 0 : -1;
+}
+void app_task_5kHz(double e[3], bool *pwm, const double v[3], const double i[3], double v_dc,
+                   double P, double Q, bool enable, double high, double low)
+{
+    const double all[11] = {v[0], v[1], v[2], i[0], i[1], i[2], v_dc, P, Q, enable, high - low};
+    for (int k = 0; k < 11; k++)
+        seen[calls][k] = all[k];
+    for (int k = 0; k < 3; k++)
+        e[k] = v[k];
+    calls++;
+    *pwm = enable && pwm_on;
+}
+"""
+MEGAWATT = Bases(S_n=1e6, V_n=480.0, V_dcref=900.0, omega_n=2 * math.pi * 60)
+
+
+def adapted(folder: Path, firmware: str) -> Path:
+    """The adapter with a firmware, by its own Makefile."""
+    shutil.copytree(TASKS, folder, ignore=shutil.ignore_patterns("*.so"))
+    (folder / "other.c").write_text(RECORDER)
+    command = ["make", f"CFLAGS={' '.join(FLAGS)}", f"GFMHIL_INCLUDE={HEADERS}"]
+    done = subprocess.run(
+        [*command, f"FIRMWARE={firmware}"], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder / "controller.so"
+
+
+@pytest.mark.apt
+def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path: Path) -> None:
+    path = adapted(tmp_path / "tasks", "other.c")
+    rig, ports = Rig(1e-4, True, MEGAWATT), PortMap(step_s=2e-4)
+    model = library.LibraryModel(path, ports, rig)
+    with pytest.raises(UserError, match="refuses this bench"):  # its variables are static
+        library.LibraryModel(path, ports, rig)
+    places = {name: k for k, name in enumerate(carried("y", True))}
+    y, u = np.zeros(11), np.array([0.5, 1.0, 0.9, 0.1])
+    y[[places["v_d"], places["v_q"], places["i_d"], places["i_q"]]] = 0.9, 0.1, 0.5, -0.1
+    y[places["v_dc"]] = 1.0
+    ref = np.array([1.0, 0.5, 1.0, 0.1, 1.0])
+    model.start(u)
+    model.tick(ref, y, u)
+    of = ctypes.CDLL(str(path))
+    calls = ctypes.c_int.in_dll(of, "calls").value
+    seen = np.ctypeslib.as_array((ctypes.c_double * (80000 * 11)).in_dll(of, "seen"))
+    seen = np.array(seen).reshape(-1, 11)[:calls]
+    assert calls == 20000 + 40000 + 1
+    at = 2 * math.pi * 60 * 2e-4 * (np.arange(calls) - (calls - 1))  # rad, 0 at the start
+    V, A = 480 * math.sqrt(2 / 3), 1e6 / (1.5 * 480 * math.sqrt(2 / 3))
+    for column, base, vector in ((0, V, 0.9 + 0.1j), (3, A, 0.5 - 0.1j)):
+        waves = [
+            abs(vector) * base * np.cos(at + np.angle(vector) - 2 * math.pi * k / 3)
+            for k in range(3)
+        ]
+        if column == 3:
+            waves = [wave * (np.arange(calls) >= 20000) for wave in waves]
+        np.testing.assert_allclose(seen[:, column : column + 3].T, waves, atol=1e-6 * base)
+    assert (seen[:, 9] == (np.arange(calls) >= 20000)).all()
+    assert set(map(tuple, seen[:, 6:9])) == {(900.0, 5e5, 1e5)} and seen[0, 10] == 2e6
+    assert u[2] + 1j * u[3] == pytest.approx(0.9 + 0.1j, rel=0.05)  # turned by half a period
+    ctypes.c_int.in_dll(of, "pwm_on").value = 0
+    model.tick(ref, y, u)
+    with pytest.raises(ModelError, match="fault 1, the firmware does not enable its PWM"):
+        model.tick(ref, y, u)
+    model.close()
+
+
+@pytest.mark.apt
+def test_the_firmware_of_the_example_holds_the_plant(tmp_path: Path) -> None:
+    path = adapted(tmp_path / "tasks", "firmware.c")
+    scenario = tmp_path / "tasks" / "short.toml"
+    text = (path.parent / "events.toml").read_text()
+    for was, now in (("8.0", "3.2"), ("t = 1.0", "t = 0.1"), ("t = 3.0", "t = 0.5"),
+                     ("t = 6.0", "t = 2.5")):  # fmt: skip
+        assert text.count(was) == 1
+        text = text.replace(was, now)
+    scenario.write_text(text)
+    map_file = str(path.parent / "map.toml")
+    found = run(tmp_path, path, str(scenario), "--map", map_file, "--inner", "virtual-stator")
+    assert found.summary["status"] == "completed"
+    assert found.summary["controller"] == "c firmware of 5 kHz tasks"
+    p, i = found.columns["true_p"][:], found.columns["true_i"][:]
+    assert np.abs(p[:1000] - 0.5).max() < 0.05  # it begins where the plant rests
+    assert np.abs(p[5100:6900]).max() < 0.1 and i[5500:6900].max() < 1.7  # its limit is 1.6
+    assert p[-500:].mean() == pytest.approx(0.8, abs=0.1)

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_runtime import Law, LawSet, law_names, load_law
@@ -31,6 +31,7 @@ from gfm_runtime.firmware import (
     build_dll,
     check,
     dll_sources,
+    elf_a2l,
     export,
     fmu,
     golden,
@@ -65,6 +66,10 @@ def add(command: argparse.ArgumentParser) -> None:
     unit.add_argument("--fmi", choices=FMI, default=FMI[-1], help=f"version of FMI ({FMI[-1]})")
     unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
     unit.set_defaults(call=call_fmu)
+    a2l = kinds.add_parser("a2l", help="write the calibration file (A2L) of a firmware's ELF file")
+    a2l.add_argument("elf", type=Path, metavar="ELF", help="linked, with debug information (-g)")
+    a2l.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .a2l")
+    a2l.set_defaults(call=call_a2l)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
     _add_laws(vectors, (*REALS, FIXED))
     vectors.add_argument(
@@ -73,7 +78,8 @@ def add(command: argparse.ArgumentParser) -> None:
     vectors.add_argument("-o", "--out", type=Path, metavar="FILE", help="else to the screen")
     vectors.set_defaults(call=call_golden)
     include = kinds.add_parser(
-        "include", help="print the folder of gfmhil_controller.h, for a controller in C of your own"
+        "include",
+        help="print the folder of gfmhil_controller.h and gfmhil_frames.h, for your own C code",
     )
     include.set_defaults(call=call_include)
     proof = kinds.add_parser("check", help="build and run a folder, and compare every bit")
@@ -153,6 +159,21 @@ def call_fmu(options: argparse.Namespace) -> int:
     return 0
 
 
+def call_a2l(options: argparse.Namespace) -> int:
+    """Write the calibration file; returns the exit code."""
+    need("elftools", "pyelftools", "firmware a2l", "calibration")
+    text, measured, calibrated = elf_a2l(options.elf)
+    write_text(options.out, text)
+    print(f"{options.out}: {measured} measurements, {calibrated} characteristics")
+    if not calibrated:
+        print(
+            "gfmhil: the gains are constants in the code; a law of --style records whose record "
+            "lies in RAM can be calibrated",
+            file=sys.stderr,
+        )
+    return 0
+
+
 def call_golden(options: argparse.Namespace) -> int:
     """Write or print the vectors; returns the exit code."""
     laws, omega_b = _laws(_sets(options.laws, options.inner)), _omega_b(options.f_n)
@@ -166,7 +187,7 @@ def call_golden(options: argparse.Namespace) -> int:
 
 
 def call_include(_: argparse.Namespace) -> int:
-    """Print the folder of our header; returns the exit code."""
+    """Print the folder of our headers; returns the exit code."""
     print(files("gfm_hil.models"))
     return 0
 

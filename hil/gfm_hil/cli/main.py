@@ -29,6 +29,7 @@ COMMANDS = {
     ),
     "scope": ("scope", "show a run in the browser while it goes on, or afterwards"),
     "modbus": ("modbus", "serve a run that is going on as a SunSpec device on Modbus/TCP"),
+    "xcp": ("xcp", "serve a run that is going on to a calibration tool, by XCP on UDP"),
     "export": (
         "export",
         "write a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",

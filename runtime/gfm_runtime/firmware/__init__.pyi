@@ -1,5 +1,7 @@
+from .a2l import Entry, a2l_text, unit_of
 from .check import OPTIMISED, TARGETS, Checked, check, need_tools
 from .dll import build_dll, dll_sources
+from .elf import elf_a2l, elf_entries
 from .fixed import FIXED
 from .fmu import FMI, fmu
 from .folder import export
@@ -25,15 +27,19 @@ __all__ = [
     "TICK",
     "TO",
     "Checked",
+    "Entry",
     "Golden",
     "LoopProgram",
     "Module",
     "Proved",
     "Style",
+    "a2l_text",
     "build_dll",
     "build_loop",
     "check",
     "dll_sources",
+    "elf_a2l",
+    "elf_entries",
     "export",
     "fmu",
     "golden",
@@ -42,4 +48,5 @@ __all__ = [
     "prove",
     "sources",
     "stage_names",
+    "unit_of",
 ]

@@ -1,7 +1,8 @@
 /* The program of a processor in the loop: waits for a request in the file `to`, and answers in the file
  * `from`. A request is what a tick does first, the number of a law, whether its stage limits, the
  * references and the measurements; at a start the law's whole state follows. The first answer says
- * that the program runs; its count is what reading the clock takes. */
+ * that the program runs; its count is what reading the clock takes. The number of a law that is not
+ * there ends the program. */
 #define GOLDEN_NO_MAIN
 #define GOLDEN_CLOCK clock_now
 #include "selftest.c"
@@ -51,7 +52,7 @@ int main(void)
     view_t now;
     answer.count = (golden_word)ELAPSED(clock_now() - before);
     board_write(from, &answer, sizeof answer);
-    while (whole(to, &request, sizeof request)) {
+    while (whole(to, &request, sizeof request) && request.law < GOLDEN_LAWS) {
         if (request.what == START) {
             if (!whole(to, state, sizeof state))
                 break;

@@ -1,0 +1,185 @@
+"""Calibration files of firmware: what nm, another reader of DWARF and an A2L parser say of them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gfm_hil.cli import main
+from gfm_runtime.errors import LawError
+from gfm_runtime.firmware import Entry, a2l_text, elf_entries
+
+from ..support.firmware import cc, exported
+
+A2LTOOL = shutil.which("a2ltool", path=str(Path(sys.executable).parent)) or "a2ltool"
+RECORDS = """
+#include "gfm_vsg_2.h"
+static gfm_t law;
+static gfm_law_t gains;
+static gfm_real y[GFM_NY], u[GFM_NU], ref[GFM_NREF], other[GFM_NU];
+int main(void)
+{
+    static struct { int n; gfm_t laws[2]; } pair;
+    gains = gfm_vsg_2_law;
+    gfm_init(&law);
+    gfm_init(&pair.laws[pair.n]);
+    return gfm_step(&gains, &law, ref, y, u) + gfm_step(&gains, &pair.laws[1], ref, y, other);
+}
+"""
+UNROLLED = """
+#include "gfm_vsg_2_cascaded.h"
+static gfm_vsg_2_cascaded_t law;
+static gfm_vsg_2_cascaded_real y[GFM_VSG_2_CASCADED_NY], u[GFM_VSG_2_CASCADED_NU], ref[5];
+int main(void)
+{
+    gfm_vsg_2_cascaded_init(&law);
+    return gfm_vsg_2_cascaded_step(&law, ref, y, u);
+}
+"""
+ARM = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "--specs=nosys.specs")
+SETTINGS = pytest.mark.parametrize(
+    ("compiler", "flags"),
+    [("gcc", ()), ("clang", ("-gdwarf-5",)), ("arm-none-eabi-gcc", ARM)],
+    ids=["gcc", "clang", "arm"],
+)
+
+
+def built(place: Path, compiler: str, flags: tuple[str, ...], main_c: str, style: str) -> Path:
+    """A firmware of vsg-2, linked with debug information."""
+    if style == "records":
+        exported(place, "float32", style, "vsg-2")
+    else:
+        from ..support.firmware import STAGED
+
+        exported(place, "float32", style, "vsg-2 cascaded", of=STAGED)
+    (place / "main.c").write_text(main_c)
+    sources = sorted(path.name for path in place.glob("gfm*.c"))
+    done = cc(
+        place, "-g", "-O1", *flags, "main.c", *sources, "-o", "program.elf", "-lm",
+        compiler=compiler,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return place / "program.elf"
+
+
+def addresses(text: str) -> dict[str, int]:
+    """The address of every entry of an A2L file by its name."""
+    found = re.findall(
+        r"/begin (?:MEASUREMENT|CHARACTERISTIC) (\S+) .*?"
+        r"(?:ECU_ADDRESS|VALUE|VAL_BLK) (0x[0-9a-fA-F]+)",
+        text,
+        re.DOTALL,
+    )
+    return {name: int(address, 16) for name, address in found}
+
+
+def read_again(a2l: Path, elf: Path) -> str:
+    """The file as a2ltool, which reads DWARF itself, writes it with the addresses that it finds."""
+    again = a2l.with_suffix(".again.a2l")
+    subprocess.run(
+        [A2LTOOL, a2l, "--strict", "--check", "-e", elf, "--update", "ADDRESSES",
+         "--update-mode", "STRICT", "-o", again],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return again.read_text()
+
+
+@SETTINGS
+@pytest.mark.compilers
+def test_a_record_in_ram_is_calibrated_where_the_symbols_are(
+    tmp_path: Path, compiler: str, flags: tuple[str, ...]
+) -> None:
+    elf = built(tmp_path, compiler, flags, RECORDS, "records")
+    a2l = tmp_path / "program.a2l"
+    assert main(["firmware", "a2l", str(elf), "-o", str(a2l)]) == 0
+    text = a2l.read_text()
+    found = addresses(text)
+    assert found == addresses(read_again(a2l, elf))
+    symbols = {
+        name: int(address, 16)
+        for address, name in re.findall(r"^(\w+) \w (\w+)", cc(tmp_path, elf.name, compiler="nm")
+                                        .stdout, re.MULTILINE)
+    }  # fmt: skip
+    for first, symbol in {
+        "law.x": "law", "gains.n": "gains", "gfm_vsg_2_law.n": "gfm_vsg_2_law",
+        "y.v_dc": "y", "ref.V_dcref": "ref", "u.i_u": "u",
+    }.items():  # fmt: skip
+        assert found[first] == symbols[symbol]
+    assert found["u.E_u"] == symbols["u"] + 8 and found["law.offset.i_u"] == symbols["law"] + 12
+    assert "pair.laws[1].reason" in found and not any(n.startswith("other") for n in found)
+    flash = text.partition("CHARACTERISTIC gfm_vsg_2_law.A ")[2].partition("/end")[0]
+    ram = text.partition("CHARACTERISTIC gains.A ")[2].partition("/end")[0]
+    assert "READ_ONLY" in flash and "READ_ONLY" not in ram and "MATRIX_DIM 3 3" in ram
+    power = text.partition("MEASUREMENT y.p ")[2].partition("/end")[0]
+    assert "FLOAT32_IEEE in_p_u_s_n 0 0 -6 6" in power and "active power" in power
+    moved = a2l.with_name("moved.a2l")  # the check would see a wrong address
+    moved.write_text(text.replace(f"{found['y.p']:#x}", "0x12"))
+    assert addresses(read_again(moved, elf)) == found != addresses(moved.read_text())
+
+
+@SETTINGS
+@pytest.mark.compilers
+def test_of_constants_in_the_code_only_variables_are_measured(
+    tmp_path: Path, compiler: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    elf = built(tmp_path, compiler, flags, UNROLLED, "unrolled")
+    a2l = tmp_path / "program.a2l"
+    assert main(["firmware", "a2l", str(elf), "-o", str(a2l)]) == 0
+    said = capsys.readouterr()
+    assert ", 0 characteristics" in said.out and "--style records" in said.err
+    found = addresses(a2l.read_text())
+    assert found == addresses(read_again(a2l, elf))
+    assert found["u.E_q"] == found["u.i_u"] + 12 and found["y.i_oq"] == found["y.v_dc"] + 40
+    assert {"law.stage.pll", "law.limited", "law.trend.E_u"} <= set(found)
+
+
+@pytest.mark.compilers
+def test_what_has_no_addresses_or_no_law_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "main.c").write_text("static int n; int main(void) { return n; }")
+    assert cc(tmp_path, "-g", "-c", "main.c").returncode == 0
+    with pytest.raises(LawError, match=r"main\.o: is not linked"):
+        elf_entries(tmp_path / "main.o")
+    assert cc(tmp_path, "-g", "main.c", "-o", "without").returncode == 0
+    with pytest.raises(LawError, match="has no variable of an exported law"):
+        elf_entries(tmp_path / "without")
+    assert cc(tmp_path, "main.c", "-s", "-o", "stripped").returncode == 0
+    with pytest.raises(LawError, match="has no debug information; compile and link with -g"):
+        elf_entries(tmp_path / "stripped")
+
+
+def test_what_is_no_elf_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "law.elf"
+    for content in (b"", b"not one", b"\x7fELF" + bytes(100)):
+        file.write_bytes(content)
+        assert main(["firmware", "a2l", str(file), "-o", str(tmp_path / "x.a2l")]) == 2
+        assert capsys.readouterr().err.startswith(f"gfmhil: {file}: is no readable ELF file")
+    assert main(["firmware", "a2l", str(tmp_path / "none"), "-o", "x.a2l"]) == 2
+
+
+def test_without_pyelftools_the_command_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["firmware", "a2l", str(tmp_path / "x.elf"), "-o", str(tmp_path / "x.a2l")]) == 2
+    assert "needs pyelftools: pip install 'gfmhil[calibration]'" in capsys.readouterr().err
+
+
+def test_text_of_any_entry_is_read_by_a_parser(tmp_path: Path) -> None:
+    entries = [
+        Entry("a.b", 'has "quotes", a \\ and a ü', "FLOAT64_IEEE", 0x10, "p.u. (Z_b)", 0.0, 0.1),
+        Entry("c[1]", "", "UBYTE", 0xFFFFFFFF, words=((0, ""), (3, "three"))),
+        Entry("d", "", "SWORD", 0, shape=(2, 3), calibrated=True),
+    ]
+    file = tmp_path / "x.a2l"
+    file.write_text(a2l_text("1 x", "about", entries, big_endian=True))
+    subprocess.run([A2LTOOL, file, "--strict", "--check"], check=True, capture_output=True)
+    assert "MSB_FIRST" in file.read_text()
+    with pytest.raises(LawError, match="d: two variables have this name"):
+        a2l_text("x", "", [entries[2], entries[2]])
+    with pytest.raises(LawError, match="address 0x100000000 must have at most 32 bits"):
+        a2l_text("x", "", [Entry("x", "", "UBYTE", 2**32)])
