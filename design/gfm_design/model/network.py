@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -157,7 +157,7 @@ class NetworkLoop:
         plant: Network,
         laws: Sequence[DiscreteLaw],
         references: Sequence[Sequence[float] | Matrix],
-    ) -> NetworkLoop:
+    ) -> Self:
         """The loop of a network as it is when a run starts.
 
         Args:

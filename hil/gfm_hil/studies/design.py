@@ -203,9 +203,16 @@ def margins(
 
     Raises:
         UnstableLoop: the loop is unstable and has no margins.
-        UserError: no such scenario, or there is no operating point.
+        UserError: no such scenario, or there is no operating point; or the converter is one of a
+            network, whose loop has ``margins()`` without the ranges.
     """
-    return _margins(as_law(law).closed_loop(on, **more))
+    loop = as_law(law).closed_loop(on, **more)
+    if loop.around is not None:
+        raise UserError(
+            f"{loop.title}: ranges of elements and grids are those of one converter on its line;"
+            " Law.closed_loop(...).margins() has the other margins"
+        )
+    return _margins(loop)
 
 
 def _weights(given: Weights) -> tuple[Weight, ...]:

@@ -190,7 +190,12 @@ class Law:
         return control.tf(num, den, inputs=[f"error_{y}" for y in Y_NAMES], outputs=list(U_NAMES))
 
     def closed_loop(
-        self, on: str | Path | Scenario | Plant | None = None, *, ideal: bool = False, **more: Any
+        self,
+        on: str | Path | Scenario | Plant | None = None,
+        *,
+        converter: str | None = None,
+        ideal: bool = False,
+        **more: Any,
     ) -> Loop:
         """This law around a plant, linearised where both rest.
 
@@ -198,7 +203,9 @@ class Law:
             on: a scenario (name, file or ``Scenario``), of which plant, references, sampling time
                 and inner stage count, or a plant alone; the paper's converter without delay and
                 sensors if None.
-            ideal: the continuous loop, neither sampled nor delayed.
+            converter: of a scenario with a network the converter that gets this law, while the
+                others keep theirs.
+            ideal: the continuous loop, neither sampled nor delayed; not of a network.
             more: ``references`` (V_dcref, P_ref, omega_g, Q_ref, V_ref) in p.u. and ``T_s`` in s,
                 instead of those of the scenario.
 
@@ -212,6 +219,18 @@ class Law:
         file = self.file
         if isinstance(on, str | Path):
             on = load_scenario(on)
+        among = on.converters if isinstance(on, Scenario) else []
+        if converter not in among and (among or converter is not None):
+            raise UserError(f"converter = {converter!r}: must be {_one_of(among)}")
+        if isinstance(on, Scenario) and converter is not None:
+            from gfm_hil.studies.network_loop import network_loop
+
+            if ideal or more:
+                raise UserError(f"{', '.join(more) or 'ideal'}: not of a converter of a network")
+            inner = on.of(converter).inner
+            if inner is not None:
+                file = self.file.model_copy(update={"inner": named_inner(inner)})
+            return network_loop(on, {converter: build_law(file)}).converter(converter)
         if isinstance(on, Scenario):
             more = {"references": on.references.vector(), "T_s": on.T_s, **more}
             if on.inner is not None:
@@ -263,6 +282,10 @@ class Law:
             for name, value in self.gains.items()
         )
         return f"{table}<p>{gains}</p>"
+
+
+def _one_of(names: Sequence[str]) -> str:
+    return f"one of {[*names]}" if names else "left out: the plant has one converter"
 
 
 def _product(factors: Any) -> list[float]:

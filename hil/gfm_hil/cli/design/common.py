@@ -10,9 +10,11 @@ import numpy as np
 from rich.table import Table
 
 from gfm_design.norms.performance import Channel
+from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
+from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
 from gfm_hil.studies.tuned_law import problem_name
 from gfm_runtime import law_file
@@ -26,6 +28,39 @@ def add_inner_option(command: argparse.ArgumentParser) -> None:
         "--inner", metavar="NAME",
         help="inner stage: a shipped name (gfmhil laws), a file, or none; the law's own by default",
     )  # fmt: skip
+
+
+def add_converter_option(command: argparse.ArgumentParser) -> None:
+    """The converter of a network."""
+    command.add_argument(
+        "--converter", metavar="NAME",
+        help="of a scenario with a network: the converter whose loop it is, and that gets --law and"
+        " --inner",
+    )  # fmt: skip
+
+
+def chosen_scenario(given: str, options: argparse.Namespace) -> Scenario:
+    """A scenario with the law and the inner stage of --law and --inner; in a network those of
+    --converter.
+
+    Raises:
+        UserError: as ``load_scenario``; --converter does not name a converter of the network.
+    """
+    changed = {"law": options.law, "inner": options.inner}
+    name = options.converter
+    scenario = load_scenario(given)
+    if name is not None and name not in scenario.converters:
+        known = f"use one of {scenario.converters}" if scenario.network else "it has no network"
+        raise UserError(f"--converter {name}: {given} has no such converter; {known}")
+    if scenario.network is None:
+        return load_scenario(given, OPTIONS, **changed)
+    name = name or scenario.converter
+    for key, value in changed.items():
+        if value is not None and name is None:
+            raise UserError(f"--{key} {value}: name the converter that gets it with --converter")
+    own = {f"network__converters__{name}__{key}": value for key, value in changed.items()}
+    names = {f"network__converters__{name}__{key}": f"--{key}" for key in changed}
+    return load_scenario(given, names, **own)
 
 
 def chosen_law(options: argparse.Namespace) -> LawFile:

@@ -1,0 +1,119 @@
+"""The design commands on a scenario with several converters, and the same from Python."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.cli.main import main
+from gfm_hil.core.errors import UserError
+
+pytestmark = pytest.mark.full  # compiles the start of several converters
+
+Capture = pytest.CaptureFixture[str]
+THREE = "three_share_a_load"
+
+
+def said(capsys: Capture, *arguments: str, code: int = 0) -> dict[str, Any]:
+    assert main(["design", *arguments, "--json"]) == code
+    return dict(json.loads(capsys.readouterr().out))
+
+
+def test_modes_with_their_participations(capsys: Capture, tmp_path: Path) -> None:
+    figure = tmp_path / "poles.svg"
+    found = said(capsys, "poles", "--scenario", THREE, "--out", str(figure))
+    loop = gfmhil.design.network_loop(THREE)
+    assert found["modes"] == [mode.plain() for mode in loop.modes()]
+    assert found["law"] == "A (vsg-2), B (droop-3), C (mimo-gfm-deployable)" and found["stable"]
+    swing = next(m for m in found["modes"] if 3.0 < m["frequency_hz"] < 4.0)
+    assert swing["participation"]["A"] == pytest.approx(0.5, abs=0.01)
+    assert figure.read_text("utf-8").startswith("<?xml")
+    assert main(["design", "poles", "--scenario", THREE]) == 0
+    assert "A 50 %, B 50 %" in capsys.readouterr().out
+
+
+def test_a_step_of_all_and_of_one(capsys: Capture, tmp_path: Path) -> None:
+    arguments = "step", "--scenario", THREE, "--seconds", "8"
+    whole = said(capsys, *arguments, "--of", "C.P_ref", "--out", str(tmp_path / "step.png"))
+    own = said(capsys, *arguments, "--converter", "C")
+    assert own["of"] == "P_ref"
+    for name, row in own["y"].items():
+        assert row == pytest.approx(whole["y"]["C"][name], rel=1e-6, abs=1e-9)
+    # the loads take no more: what C gives more, A and B give less, and so does the frequency
+    ends = {name: y["p"]["end"] for name, y in whole["y"].items()}
+    assert ends["A"] == pytest.approx(ends["B"], abs=1e-3) and ends["A"] < 0.0 < ends["C"]
+    assert abs(sum(ends.values())) < 0.02
+
+
+def test_margins_are_those_of_one_with_the_others_closed(capsys: Capture, tmp_path: Path) -> None:
+    found = said(capsys, "margins", "--scenario", THREE, "--converter", "C")
+    margins = gfmhil.design.network_loop(THREE).converter("C").margins()
+    assert found["law"] == "C (mimo-gfm-deployable)"
+    assert found["delay_us"] == pytest.approx(1e6 * margins.delay.seconds)
+    assert set(found["u"]) == {"i_u", "omega_u", "E_u"} and "elements" not in found
+    figure = str(tmp_path / "bode.png")
+    drawn = said(capsys, "bode", "--scenario", THREE, "--converter", "C", "--out", figure)
+    assert drawn["at"] == found["u"]
+
+
+def test_another_law_for_one_converter(capsys: Capture) -> None:
+    other = said(capsys, "poles", "--scenario", THREE, "--converter", "C", "--law", "vsg-2")
+    assert other["law"] == "A (vsg-2), B (droop-3), C (vsg-2)"
+    loop = gfmhil.Law.load("vsg-2").closed_loop(THREE, converter="C")
+    assert other["modes"][0]["sigma"] == pytest.approx(loop.sigma())
+    np.testing.assert_allclose(
+        gfmhil.design.network_loop(THREE, network__converters__C__law="vsg-2").A,
+        gfmhil.design.network_loop(THREE, {"C": gfmhil.Law.load("vsg-2").built()}).A,
+    )
+
+
+def test_an_unstable_network_has_modes_and_no_margins(capsys: Capture) -> None:
+    """A load of constant power whose negative conductance outweighs all damping of its node."""
+    load = {"node": "bus", "P": 1.5, "tau_s": 0.0005}
+    loop = gfmhil.design.network_loop(
+        THREE, network__constant_power={"drive": load},
+        network__capacitors={"filter": {"node": "bus", "Q": 0.02}},
+        network__loads__base__P=0.1,
+    )  # fmt: skip
+    worst = loop.modes()[0]
+    assert worst.sigma > 0.0 and worst.participation["drive"] > 0.01
+    with pytest.raises(gfmhil.design.UnstableLoop):
+        loop.converter("A").margins()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["margins", "--scenario", THREE], "--converter names it, one of ['A', 'B', 'C']"),
+        (["bode", "--scenario", THREE, "--converter", "D"], "use one of ['A', 'B', 'C']"),
+        (["bode", "--converter", "A"], "--converter A: pref_step has no such converter"),
+        (["poles", "--scenario", THREE, "--law", "vsg-2"], "--law vsg-2: name the converter"),
+        (["step", "--scenario", THREE, "--of", "P_ref"], "'P_ref' is no input of the network"),
+        (["margins", "--scenario", THREE, "--converter", "A", "--figures", "x"], "--figures: they"),
+        (["poles", "--scenario", THREE, "--converter", "A", "--law", "no-such"], "no-such"),
+    ],
+)
+def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+    assert main(["design", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+def test_python_refuses_in_one_line() -> None:
+    law = gfmhil.Law.load("vsg-2")
+    for call, words in (
+        (lambda: law.closed_loop(THREE), "converter = None: must be one of"),
+        (lambda: law.closed_loop("pref_step", converter="A"), "must be left out"),
+        (lambda: law.closed_loop(THREE, converter="A", ideal=True), "ideal: not of a converter"),
+        (lambda: gfmhil.design.margins(law, THREE, converter="A"), "ranges of elements"),
+        (lambda: gfmhil.design.network_loop("pref_step"), "network: the scenario has none"),
+        (lambda: gfmhil.design.network_loop(THREE).converter("D"), "'D' is no converter"),
+        (lambda: gfmhil.design.network_loop(THREE).step("P"), "'P' is no input"),
+    ):
+        with pytest.raises(UserError, match=words):
+            call()
