@@ -12,6 +12,7 @@ import pytest
 import gfmhil
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.toml_out import write_scenario
 
 pytestmark = pytest.mark.full  # compiles the start of several converters
 
@@ -86,9 +87,78 @@ def test_an_unstable_network_has_modes_and_no_margins(capsys: Capture) -> None:
         loop.converter("A").margins()
 
 
+#: the printed MIMO-GFM, one sample late, in parallel to a VSG: an LC mode at 1.2 kHz grows
+PAIR: dict[str, Any] = {
+    "title": "pair", "duration": 4.0, "law": "vsg-2", "link": {"type": "inproc"},
+    "references": {"P_ref": 0.3}, "plant": {"delay": {"samples": 1}},
+    "network": {
+        "grid": "far",
+        "converters": {"A": {"node": "bus"}, "B": {"node": "bus", "law": "mimo-gfm"}},
+        "lines": {"feeder": {"start": "bus", "end": "far", "L": 0.2, "R": 0.02}},
+        "loads": {"base": {"node": "bus", "P": 0.4}},
+    },
+    "events": [{"type": "reference", "converter": "B", "t": 0.1, "P_ref": 0.5}],
+}  # fmt: skip
+
+
+def test_tuning_one_converter_damps_the_network_as_the_bench_shows(tmp_path: Path) -> None:
+    on = gfmhil.load_scenario(PAIR)
+    worst = gfmhil.design.network_loop(on).modes()[0]
+    assert worst.sigma > 0.0 and 1100.0 < worst.frequency_hz < 1250.0
+    run = gfmhil.run_network(PAIR)
+    assert run["B"].status == "tripped"
+    # at its new references the bench grows as the mode there says: by exp(sigma) in a second, seen
+    # in V without its slow part
+    there = gfmhil.design.network_loop(PAIR, network__converters__B__references={"P_ref": 0.5})
+    fast = np.abs(np.diff(run["B"].signals["V"], 2))
+    grown = np.log(fast[20000:22000].max() / fast[10000:12000].max())
+    assert grown == pytest.approx(there.sigma(), rel=0.02)
+
+    more = {"only": ("k_31", "k_34"), "evaluations": 40, "starts": 1}
+    found = gfmhil.design.tune("mimo-gfm", "tuned", on=on, converter="B", **more)
+    loop = gfmhil.design.network_loop(on, {"B": found.law.built()})
+    assert loop.sigma() < -0.5
+    assert gfmhil.design.gamma(found.law, on=on, converter="B").value == pytest.approx(
+        found.gamma.value, rel=1e-6
+    )
+    assert found.gamma.value == pytest.approx(loop.converter("B").gamma(), rel=1e-6)
+    file = str(found.law.save(tmp_path / "tuned.toml"))
+    assert gfmhil.run_network(PAIR, network__converters__B__law=file).status == "completed"
+
+
+def test_the_command_tunes_one_converter(capsys: Capture, tmp_path: Path) -> None:
+    scenario, law = tmp_path / "pair.toml", tmp_path / "tuned.toml"
+    write_scenario(tmp_path, gfmhil.load_scenario(PAIR))
+    (tmp_path / "scenario.toml").rename(scenario)
+    where = "--scenario", str(scenario), "--converter", "B", "--law"
+    found = said(capsys, "tune", *where, "mimo-gfm", "--only", "k_31,k_34", "--evaluations", "40",
+                 "--starts", "1", "--out", str(law), "--quiet")  # fmt: skip
+    assert said(capsys, "gamma", *where, str(law))["gamma"] == pytest.approx(found["gamma"])
+    assert "of the paper's weights on converter B of 'pair', sampled" in law.read_text()
+    none = said(capsys, "gamma", *where, "mimo-gfm", code=3)
+    assert none["gamma"] is None and "unstable" in none["reason"]
+
+
+def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop() -> None:
+    law = gfmhil.Law.load("mimo-gfm-deployable")
+    loop = law.closed_loop("rig_pref_step")
+    assert loop.T_s is not None
+    assert gfmhil.design.gamma(law, on="rig_pref_step").value == loop.gamma()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["gamma", "--law", "vsg-2", "--scenario", THREE], "--converter names the one of ['A', "),
+        (["gamma", "--law", "vsg-2", "--converter", "A"], "--converter A: needs --scenario"),
+        (
+            ["tune", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--full-order"],
+            "omit --scenario",
+        ),
+        (
+            ["gamma", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--discrete"],
+            "a scenario is sampled in any case",
+        ),
         (["margins", "--scenario", THREE], "--converter names it, one of ['A', 'B', 'C']"),
         (["bode", "--scenario", THREE, "--converter", "D"], "use one of ['A', 'B', 'C']"),
         (["bode", "--converter", "A"], "--converter A: pref_step has no such converter"),

@@ -105,6 +105,14 @@ class Surroundings(Protocol):
     def name(self) -> str:
         """That of the converter, and of its law."""
 
+    @property
+    def op(self) -> OperatingPoint:
+        """Where the converter rests."""
+
+    @property
+    def ref(self) -> Matrix:
+        """Its references, shape (5,), p.u."""
+
     def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
         """The network from tick to tick as the converter meets it, all others under their laws.
 
@@ -280,6 +288,29 @@ class ClosedLoop:
         if self.origin is None:
             raise ValueError("this loop was made of matrices, not of a plant and a law")
         return self.origin
+
+    @property
+    def op(self) -> OperatingPoint:
+        """Where the converter and its law rest.
+
+        Raises:
+            ValueError: the loop was made of matrices.
+        """
+        return self.made_of.op if self.around is None else self.around.op
+
+    @property
+    def ref(self) -> Matrix:
+        """The references there, shape (5,), p.u.
+
+        Raises:
+            ValueError: the loop was made of matrices.
+        """
+        return self.made_of.ref if self.around is None else self.around.ref
+
+    @property
+    def dc_control(self) -> bool:
+        """Whether i_u acts: the DC source does not regulate itself."""
+        return bool(self.plant.B[..., 0].any())
 
     # matrices
 

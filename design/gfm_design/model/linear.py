@@ -109,6 +109,11 @@ class Mode:
         size = float(np.hypot(self.sigma, 2 * np.pi * self.frequency_hz))
         return -self.sigma / size if size else 0.0
 
+    def words(self) -> str:
+        """Where it is and how fast it grows, for a message."""
+        where = f"at {self.frequency_hz:.4g} Hz" if self.frequency_hz else "(real)"
+        return f"mode {where} grows by {self.sigma:.3g} 1/s"
+
     def plain(self) -> dict[str, Any]:
         """sigma [1/s], frequency_hz and ratio, for JSON."""
         return {"sigma": self.sigma, "frequency_hz": self.frequency_hz, "ratio": self.ratio}

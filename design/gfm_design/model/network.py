@@ -86,6 +86,7 @@ class Member:
         title: its name and that of its law.
         law, stage: around the operating point.
         op: the operating point.
+        ref: the references, shape (5,), p.u.
         u, y: its places among the commands and the measurements of all.
     """
 
@@ -94,6 +95,7 @@ class Member:
     law: LinearLaw
     stage: LinearStage | None
     op: OperatingPoint
+    ref: Matrix
     u: slice
     y: slice
 
@@ -183,7 +185,7 @@ class NetworkLoop:
             n_u, n_y = (NU, NY) if stage is None else (NU_INNER, NY_INNER)
             places = slice(at_u, at_u + n_u), slice(at_y, at_y + n_y)
             title = f"{unit.name} ({law.law.name})"
-            members.append(Member(unit.name, title, linear, stage, op, *places))
+            members.append(Member(unit.name, title, linear, stage, op, ref, *places))
             delays += [float(r["delay"] + r["fraction"]) * T_s] * n_u
             at_u, at_y = at_u + n_u, at_y + n_y
         return cls(linearise_network(resting, members), members, T_s, np.array(delays))
@@ -359,6 +361,14 @@ class _Others:
     @property
     def name(self) -> str:
         return self.loop.members[self.place].title
+
+    @property
+    def op(self) -> OperatingPoint:
+        return self.loop.members[self.place].op
+
+    @property
+    def ref(self) -> Matrix:
+        return self.loop.members[self.place].ref
 
     def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
         loop, one = self.loop, self.loop.members[self.place]
@@ -561,7 +571,10 @@ class _Writing:
         C, C_true = self.C[:, order], self.C_true[:, order]
         for m in (A, C, C_true):
             m[:, last] = 0.0  # but for rounding
-        parts = {name: self._share(name)[np.ix_(order, order)] for name in [*self.at, LINES]}
+        names = [*self.at, LINES]
+        if self.plant.net[0]["H"][0] == 0.0 and GRID in names:
+            names.remove(GRID)  # an ideal grid takes part in nothing
+        parts = {name: self._share(name)[np.ix_(order, order)] for name in names}
         return LinearNetwork(LinearPlant(A, B, B_d, C, C_true), turn, parts)
 
     def _share(self, part: str) -> Matrix:

@@ -215,31 +215,40 @@ class Law:
                 runs from tick to tick.
         """
         from gfm_hil.studies.loop import Loop
+        from gfm_hil.studies.network_loop import loop_under
 
-        file = self.file
         if isinstance(on, str | Path):
             on = load_scenario(on)
-        among = on.converters if isinstance(on, Scenario) else []
-        if converter not in among and (among or converter is not None):
-            raise UserError(f"converter = {converter!r}: must be {_one_of(among)}")
-        if isinstance(on, Scenario) and converter is not None:
-            from gfm_hil.studies.network_loop import network_loop
-
+        try:
+            if not isinstance(on, Scenario):
+                return Loop.of(self.built(), on, ideal=ideal, **more)
+            law = build_law(self.staged(on, converter))
+            if converter is None:
+                more = {"references": on.references.vector(), "T_s": on.T_s, **more}
+                return Loop.of(law, on.plant, ideal=ideal, **more)
             if ideal or more:
                 raise UserError(f"{', '.join(more) or 'ideal'}: not of a converter of a network")
-            inner = on.of(converter).inner
-            if inner is not None:
-                file = self.file.model_copy(update={"inner": named_inner(inner)})
-            return network_loop(on, {converter: build_law(file)}).converter(converter)
-        if isinstance(on, Scenario):
-            more = {"references": on.references.vector(), "T_s": on.T_s, **more}
-            if on.inner is not None:
-                file = self.file.model_copy(update={"inner": named_inner(on.inner)})
-            on = on.plant
-        try:
-            return Loop.of(build_law(file), on, ideal=ideal, **more)
+            return loop_under(law, on, converter)
         except NoEquilibrium as problem:
             raise UserError(str(problem)) from None
+
+    def staged(self, scenario: Scenario, converter: str | None = None) -> LawFile:
+        """Its law file with the inner stage that a scenario gives its laws, if it gives one.
+
+        Args:
+            converter: of a scenario with a network, which one has this law.
+
+        Raises:
+            UserError: no such converter; or none is named, and the scenario has a network.
+        """
+        names = scenario.converters
+        if converter not in names and (names or converter is not None):
+            allowed = f"one of {names}" if names else "left out: the scenario has no network"
+            raise UserError(f"converter = {converter!r}: must be {allowed}")
+        inner = (scenario if converter is None else scenario.of(converter)).inner
+        if inner is None:
+            return self.file
+        return self.file.model_copy(update={"inner": named_inner(inner)})
 
     def to_toml(self) -> str:
         """The text of its law file."""
@@ -282,10 +291,6 @@ class Law:
             for name, value in self.gains.items()
         )
         return f"{table}<p>{gains}</p>"
-
-
-def _one_of(names: Sequence[str]) -> str:
-    return f"one of {[*names]}" if names else "left out: the plant has one converter"
 
 
 def _product(factors: Any) -> list[float]:

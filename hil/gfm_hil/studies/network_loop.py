@@ -164,16 +164,32 @@ def network_loop(
     scenario = load_scenario(on, **changes)
     if scenario.network is None:
         raise UserError("network: the scenario has none; use Law.closed_loop")
+    try:
+        return _linearised(scenario, laws)
+    except NoEquilibrium as problem:
+        raise UserError(f"network: {problem}") from None
+
+
+def loop_under(law: BuiltLaw, scenario: Scenario, converter: str | None) -> Loop:
+    """The sampled loop of a checked scenario under another law, of one converter if there is a
+    network.
+
+    Raises:
+        NoEquilibrium: there is no operating point.
+    """
+    if converter is not None:
+        return _linearised(scenario, {converter: law}).converter(converter)
+    return Loop.of(law, scenario.plant, scenario.references.vector(), T_s=scenario.T_s)
+
+
+def _linearised(scenario: Scenario, laws: Mapping[str, BuiltLaw]) -> NetworkLoop:
     each = [scenario.of(name) for name in scenario.converters]
     built = [
         discretise(laws[name], scenario.T_s) if name in laws else initial_law(one)[0]
         for name, one in zip(scenario.converters, each, strict=True)
     ]
     references = [one.references.vector() for one in each]
-    try:
-        return NetworkLoop.of(plant_of(scenario), built, references)
-    except NoEquilibrium as problem:
-        raise UserError(f"network: {problem}") from None
+    return NetworkLoop.of(plant_of(scenario), built, references)
 
 
 def _label(mode: Mode) -> str:

@@ -75,9 +75,35 @@ def chosen_law(options: argparse.Namespace) -> LawFile:
     return file.model_copy(update={"inner": named_inner(options.inner)})
 
 
-def judged(file: LawFile) -> str:
-    """The name of a law; with an inner stage also which problem its gamma is that of."""
-    return file.name if file.inner is None else f"{file.name}, {problem_name(file)}"
+def judged(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
+    """The name of a law, and which problem its gamma is that of if it is not the paper's."""
+    if on is None and file.inner is None:
+        return file.name
+    return f"{file.name}, {problem_name(file, on, converter)}"
+
+
+def add_judged_on(command: argparse.ArgumentParser) -> None:
+    """Where else than on the paper's converter gamma is judged."""
+    command.add_argument(
+        "--scenario",
+        help="scenario file or shipped name: its sampled loop in place of the paper's problem",
+    )
+    add_converter_option(command)
+
+
+def judged_on(options: argparse.Namespace) -> Scenario | None:
+    """The scenario of --scenario, under --law and --inner.
+
+    Raises:
+        UserError: as ``chosen_scenario``; --converter is missing, or without --scenario.
+    """
+    if options.scenario is None:
+        if options.converter is not None:
+            raise UserError(f"--converter {options.converter}: needs --scenario with a network")
+        return None
+    if options.converter is None and (names := load_scenario(options.scenario).converters):
+        raise UserError(f"--scenario {options.scenario}: --converter names the one of {names}")
+    return chosen_scenario(options.scenario, options)
 
 
 def add_law_options(command: argparse.ArgumentParser) -> None:
