@@ -126,6 +126,14 @@ def with_pll(place: Path) -> Scenario:
     return scenario({**given, "grid": "far"}, plant={"grid": {"omega_g": 0.999}})
 
 
+def two_islands(place: Path | None = None) -> Scenario:
+    """A alone, and B and C beyond an open line."""
+    given = copy.deepcopy(THREE)
+    given["converters"]["B"]["node"] = "far"
+    given["lines"]["feeder"]["closed"] = False
+    return scenario(given, references={"P_ref": 0.3})
+
+
 def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, np.ndarray]]:
     """The plant's columns of each converter, from the start, with references of the first one
     changed by so much."""
@@ -142,7 +150,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
 
 
 @pytest.mark.full  # compiles the loop of several converters
-@pytest.mark.parametrize("of", [island, with_machine, with_finite_grid, with_pll])
+@pytest.mark.parametrize("of", [island, two_islands, with_machine, with_finite_grid, with_pll])
 @pytest.mark.parametrize("reference", ["P_ref", "V_ref"])
 def test_a_step_is_that_of_the_nonlinear_bench(of: Any, reference: str, tmp_path: Path) -> None:
     # 1e-4 p.u.: nonlinear terms are of the order of 1e-8. The tolerance is that of one converter.
@@ -211,6 +219,19 @@ def test_participations_say_who_oscillates() -> None:
     # third of the inertia
     apart = [m for m in modes if 0.5 < m.frequency_hz < 2.0]
     assert len(apart) == 1 and apart[0].participation["C"] == pytest.approx(2 / 3, abs=0.01)
+
+
+@pytest.mark.full
+def test_islands_have_their_own_speed_and_their_own_modes() -> None:
+    network = loop(two_islands())
+    a, b, c = (member.op.u[1] for member in network.members)
+    assert b == pytest.approx(c, abs=1e-12) and abs(a - b) > 1e-3
+    for mode in network.modes():
+        assert (
+            min(mode.participation["A"], mode.participation["B"] + mode.participation["C"]) < 1e-6
+        )
+    _, y = network.step_response("A.P_ref", 0.1)
+    assert np.abs(y["A"]).max() > 1e-3 and max(np.abs(y[name]).max() for name in "BC") < 1e-9
 
 
 @pytest.mark.full

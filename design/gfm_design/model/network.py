@@ -55,7 +55,9 @@ GRID, LINES = "the grid", "lines and loads"
 power."""
 
 _GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
-_SAME = 1e-6  # relative distance of poles that count as one: identical converters have such
+_SAME = (
+    1e-6  # distance of poles that count as one, over 1 1/s + |s|: identical converters have such
+)
 _D = INPUTS[NY:]
 
 
@@ -280,17 +282,19 @@ class NetworkLoop:
         participations.
         """
         values, left, right = eig(self.A, left=True, right=True)
-        found, done = list[NetworkMode](), np.abs(values) <= _GONE
-        for k in np.flatnonzero(values.imag >= 0.0):
+        there = np.abs(values) > _GONE
+        values, left, right = values[there], left[:, there], right[:, there]
+        s = np.log(values) / self.T_s
+        found, done = list[NetworkMode](), s.imag < 0.0
+        for k in range(len(s)):
             if done[k]:
                 continue
-            equal = np.abs(values - values[k]) <= _SAME * abs(values[k])
-            r = right[:, equal]
-            rows = left[:, equal].conj().T
+            equal = np.abs(s - s[k]) <= _SAME * (1.0 + abs(s[k]))
+            r, rows = right[:, equal], left[:, equal].conj().T
             shares = self._participation(values[k], np.linalg.solve(rows @ r, rows), r)
+            modes = [Mode.of(one) for one in s[equal & ~done]]
+            found += [NetworkMode(m.sigma, m.frequency_hz, shares) for m in modes]
             done |= equal
-            upper = [Mode.of(np.log(z) / self.T_s) for z in values[equal] if z.imag >= 0.0]
-            found += [NetworkMode(m.sigma, m.frequency_hz, shares) for m in upper]
         return sorted(found, key=lambda mode: -mode.sigma)
 
     def _participation(self, z: complex, left: Complex, right: Complex) -> dict[str, float]:
