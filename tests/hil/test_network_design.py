@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_design.norms.performance import PAPER_WEIGHTS
+from gfm_design.tuning.gains import free_gains
+from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.toml_out import write_scenario
+from gfm_runtime.inner_file import named_inner
 
 pytestmark = pytest.mark.full  # compiles the start of several converters
 
@@ -126,6 +130,50 @@ def test_tuning_one_converter_damps_the_network_as_the_bench_shows(tmp_path: Pat
     assert gfmhil.run_network(PAIR, network__converters__B__law=file).status == "completed"
 
 
+def test_a_decay_is_that_of_all_modes_of_the_network(tmp_path: Path) -> None:
+    """The slowest mode of the island is almost C's own. Tuned with a decay of 2.5 1/s none is
+    slower, which leaves the swing of A against B, and the bench comes to rest sooner."""
+    weights = [w for w in PAPER_WEIGHTS if (w.i, w.j) != (1, 1)]  # the loads decide p, not P_ref
+    before = gfmhil.design.network_loop(THREE).modes()[0]
+    assert before.sigma > -2.0 and before.participation["C"] > 0.9
+    found = gfmhil.design.tune(
+        "mimo-gfm-deployable", "c", on=THREE, converter="C", weights=weights, decay=2.5,
+        evaluations=60, starts=2,
+    )  # fmt: skip
+    worst = gfmhil.design.network_loop(THREE, {"C": found.law.built()}).modes()[0]
+    assert worst.sigma < -2.5 and worst.participation["C"] < 0.9
+    file = str(found.law.save(tmp_path / "c.toml"))
+    rest = []
+    for changed in ({}, {"network__converters__C__law": file}):
+        p = gfmhil.run_network(THREE, **changed)["C"].signals["p"]
+        rest.append(np.abs(p[20000:] - p[-1]).max())  # from 1.5 s after the load step on
+    assert rest[1] < 0.2 * rest[0]
+
+
+@pytest.mark.parametrize("stage", [None, "virtual-stator"])
+def test_a_norm_with_a_decay_is_that_beside_the_axis(stage: str | None) -> None:
+    """Of the continuous and of the sampled loop, against the transfer function on a line of
+    complex frequencies."""
+    file = gfmhil.Law.load("vsg-2").file
+    if stage is not None:
+        file = file.model_copy(update={"inner": named_inner(stage)})
+    problem = PaperProblem(file, free_gains(file), decay=1.5)
+    values = np.array([gain.start for gain in problem.gains])
+    loop = problem.closed_loop(values)
+    A, B, C, D = loop.performance()
+    for channel, weight in zip(problem.channels(values), problem.weights, strict=True):
+        if not 0.0 < channel.omega < 1e4:
+            continue
+        s = 1j * channel.omega
+        T_s, at = loop.T_s, s - problem.decay
+        z = at if T_s is None else np.exp(at * T_s)
+        T = (C @ np.linalg.solve(z * np.eye(len(A)) - A, B) + D)[weight.i - 1, weight.j - 1]
+        if T_s is not None:  # weights by Tustin
+            s = 2j / T_s * np.tan(channel.omega * T_s / 2)
+        assert abs(weight(np.array([s]))[0] * T) == pytest.approx(channel.norm, rel=1e-4)
+    assert problem(values) == pytest.approx(max(c.norm for c in problem.channels(values)), rel=1e-3)
+
+
 def test_the_command_tunes_one_converter(capsys: Capture, tmp_path: Path) -> None:
     scenario, law = tmp_path / "pair.toml", tmp_path / "tuned.toml"
     write_scenario(tmp_path, gfmhil.load_scenario(PAIR))
@@ -158,6 +206,10 @@ def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop() -> N
         (
             ["gamma", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--discrete"],
             "a scenario is sampled in any case",
+        ),
+        (
+            ["tune", "--law", "vsg-2", "--decay", "-1"],
+            "decay = -1.0: must be finite and not negative",
         ),
         (["margins", "--scenario", THREE], "--converter names it, one of ['A', 'B', 'C']"),
         (["bode", "--scenario", THREE, "--converter", "D"], "use one of ['A', 'B', 'C']"),

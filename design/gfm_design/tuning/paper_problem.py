@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from gfm_design.model.closed_loop import REFERENCES, T_S, ClosedLoop
 from gfm_design.model.linear import LinearLaw, LinearPlant, inverse_tustin
 from gfm_design.model.operating_point import OperatingPoint
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
+from gfm_design.norms.performance import (
+    PAPER_WEIGHTS,
+    Channel,
+    StateSpace,
+    Weight,
+    channel_norms,
+)
 from gfm_design.norms.screen import Screen
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
 from gfm_design.tuning.polish import polish
@@ -52,6 +58,9 @@ class PaperProblem:
     gains. ``late`` is the loop there sampled at T_s with one sample of delay, for other laws to be
     put into it; a sampled loop as it is.
 
+    With a ``decay`` a > 0 [1/s] the cost is the norm of W_ij(s) T_ij(s - a) in place of
+    W_ij(s) T_ij(s), which is finite if every mode of the loop decays faster than a.
+
     ``among`` gives the loop of a law where else it is to be judged, sampled; as that of
     ``NetworkLoop.converter``. Plant, references and T_s are then those of that loop.
     """
@@ -63,6 +72,7 @@ class PaperProblem:
     weights: tuple[Weight, ...] = PAPER_WEIGHTS
     T_s: float = T_S
     among: Callable[[Law], ClosedLoop] | None = None
+    decay: float = 0.0
 
     def __post_init__(self) -> None:
         judged = LATE if self.has_stage else Plant()
@@ -108,8 +118,16 @@ class PaperProblem:
 
     def loops(self, values: Vector) -> StateSpace:
         """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
-        loops = self.closed_loops(values).performance()
+        loops = self._shifted(self.closed_loops(values).performance())
         return inverse_tustin(*loops, self.T_s / 2) if self.is_sampled else loops
+
+    def _shifted(self, loops: StateSpace) -> StateSpace:
+        """T(s - decay) of T(s), in continuous time or from tick to tick."""
+        A, B, C, D = loops
+        if self.is_sampled:
+            faster = np.exp(self.decay * self.T_s)
+            return faster * A, faster * B, C, D
+        return A + self.decay * np.eye(A.shape[-1]), B, C, D
 
     def closed_loop(self, values: Vector) -> ClosedLoop:
         """The loop at these gains, with as few states as the law needs.
@@ -151,5 +169,6 @@ class PaperProblem:
             return point
 
     def channels(self, values: Vector) -> tuple[Channel, ...]:
-        """Every channel's norm, guaranteed. Raises ``Unstable``."""
-        return self.closed_loop(values).channels(self.weights)
+        """Every channel's norm, guaranteed, with the decay if there is one. Raises ``Unstable``."""
+        loop = self.closed_loop(values)
+        return channel_norms(self._shifted(loop.performance()), self.weights, loop.T_s)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
@@ -158,6 +160,7 @@ def tune(
     weights: Weights = None,
     on: str | Path | Scenario | None = None,
     converter: str | None = None,
+    decay: float = 0.0,
     seed: int = 0,
     evaluations: int = EVALUATIONS,
     starts: int | None = None,
@@ -175,6 +178,8 @@ def tune(
         only: the free gains to move; all if None.
         weights: file of weights or the weights; the paper's six if None.
         on, converter: as for the function ``gamma``.
+        decay: how fast every mode of the loop, and so of the whole network, must decay at least,
+            1/s: the search then minimises the norm of W_ij(s) T_ij(s - decay).
         seed: of the search, >= 0; the same seed gives the same gains.
         evaluations: of each start, before its polish.
         starts: the given start and random ones; 6, and one more a gain, if None.
@@ -188,8 +193,9 @@ def tune(
     for what, value in (("evaluations", evaluations), ("starts", starts)):
         if value is not None and value < 1:
             raise UserError(f"{what} = {value}: must be at least 1")
-    if seed < 0:
-        raise UserError(f"seed = {seed}: must not be negative")
+    for what, number in (("seed", seed), ("decay", decay)):
+        if not 0 <= number < np.inf:
+            raise UserError(f"{what} = {number}: must be finite and not negative")
     law = as_law(law)
     file, among = law.file, None
     if on is not None:
@@ -203,7 +209,7 @@ def tune(
     at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
     gains = free_gains(law.file, at, only)
     try:
-        problem = PaperProblem(file, gains, weights=_weights(weights), among=among)
+        problem = PaperProblem(file, gains, weights=_weights(weights), among=among, decay=decay)
     except NoEquilibrium as none:
         raise UserError(str(none)) from None
     starts = starts or starts_for(len(problem.gains))
@@ -219,12 +225,14 @@ def tune(
         if on is None:
             where = f"on the paper's converter at P_ref = {problem.references[1]:g}"
             mode = culprit(loop).words()
-        raise NotTuned(f"{none}; in the way, {where}: {mode}") from None
+        wanted = f" against a decay of {decay:g} 1/s" if decay else ""
+        raise NotTuned(f"{none}{wanted}; in the way, {where}: {mode}") from None
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
     named = problem.law.named(found.values)
     tuned = law.with_gains(name or f"{law.name}-tuned", **named)
-    channels = Gamma(tuned.name, problem.channels(found.values))
+    loop = problem.closed_loop(found.values)
+    channels = Gamma(tuned.name, loop.channels(problem.weights))
     return Tuning(tuned, channels, named, found.evaluations, found.seconds, found.seed, problem)
 
 

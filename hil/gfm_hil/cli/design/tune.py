@@ -44,6 +44,10 @@ def add(kinds: Any) -> None:
         help="the given start and random ones; 6, and one more a gain, if left out",
     )
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
+    command.add_argument(
+        "--decay", type=float, default=0.0, metavar="A",
+        help="every mode of the loop must decay at least this fast, 1/s",
+    )  # fmt: skip
     command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
     command.add_argument("-o", "--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -112,6 +116,7 @@ def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tun
             weights=options.weights,
             on=on,
             converter=options.converter,
+            decay=options.decay,
             seed=options.seed,
             evaluations=options.evaluations,
             starts=options.starts,
