@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,7 +49,7 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import realise
 from gfm_runtime.signals import NY, REF_NAMES, Y_NAMES, carried
-from gfm_runtime.tustin import OMEGA_ROW, DiscreteLaw, discretise
+from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw, discretise
 
 if TYPE_CHECKING:
     from gfm_design.margins.all_margins import LoopMargins
@@ -98,6 +98,29 @@ class Origin:
     op: OperatingPoint
 
 
+class Surroundings(Protocol):
+    """The rest of a network around one converter, see ``gfm_design.model.network``."""
+
+    @property
+    def name(self) -> str:
+        """That of the converter, and of its law."""
+
+    @property
+    def op(self) -> OperatingPoint:
+        """Where the converter rests."""
+
+    @property
+    def ref(self) -> Matrix:
+        """Its references, shape (5,), p.u."""
+
+    def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
+        """The network from tick to tick as the converter meets it, all others under their laws.
+
+        Args:
+            u_delay, y_delay: of the converter, as for ``ClosedLoop``.
+        """
+
+
 class ClosedLoop:
     """A law on a plant around one operating point.
 
@@ -111,6 +134,8 @@ class ClosedLoop:
             (..., 11).
         origin: what it was made of, if known.
         stage: the inner stage between the law and the bridge, one or several on a leading axis.
+        around: the rest of the network, if the converter is one of several; ``plant`` is then the
+            network without any controller, of which the other ones are in ``around``.
 
     Raises:
         ValueError: a continuous loop with a delay or an inner stage.
@@ -125,10 +150,11 @@ class ClosedLoop:
         y_delay: ArrayLike = 0.0,
         origin: Origin | None = None,
         stage: LinearStage | None = None,
+        around: Surroundings | None = None,
     ) -> None:
         many, n_u, n_y = plant.A.shape[:-2], plant.B.shape[-1], plant.C.shape[-2]
         self.plant, self.law, self.T_s, self.origin = plant, law, T_s, origin
-        self.stage = stage
+        self.stage, self.around = stage, around
         self.u_delay: Matrix = np.broadcast_to(np.asarray(u_delay, float), (*many, n_u))
         self.y_delay: Matrix = np.broadcast_to(np.asarray(y_delay, float), (*many, n_y))
         if T_s is None and (self.u_delay.any() or self.y_delay.any()):
@@ -205,6 +231,7 @@ class ClosedLoop:
     def __repr__(self) -> str:
         kind = "continuous" if self.T_s is None else f"T_s = {self.T_s:g} s"
         name = f"{self.origin.law.law.name}, " if self.origin else ""
+        name = f"{self.around.name}, " if self.around else name
         return f"<{type(self).__name__} {name}{kind}, A {self.A.shape}>"
 
     # other loops
@@ -214,7 +241,8 @@ class ClosedLoop:
         return self._under(law, self.stage)
 
     def _under(self, law: LinearLaw, stage: LinearStage | None) -> Self:
-        out = type(self)(self.plant, law, self.T_s, self.u_delay, self.y_delay, stage=stage)
+        of = self.plant, law, self.T_s, self.u_delay, self.y_delay
+        out = type(self)(*of, stage=stage, around=self.around)
         out.__dict__["held"] = self.held
         return out
 
@@ -225,7 +253,7 @@ class ClosedLoop:
     def later(self, u: ArrayLike = 0.0, y: ArrayLike = 0.0) -> Self:
         """The sampled loop with more delay of each u and of each y, s; one number is for all."""
         u_delay, y_delay = self.u_delay + np.asarray(u), self.y_delay + np.asarray(y)
-        of = self.origin, self.stage
+        of = self.origin, self.stage, self.around
         return type(self)(self.plant, self.law, self.T_s, u_delay, y_delay, *of)
 
     def scaled(self, u: ArrayLike = 1.0, y: ArrayLike = 1.0) -> Self:
@@ -253,11 +281,36 @@ class ClosedLoop:
         """What the loop was made of.
 
         Raises:
-            ValueError: it was made of matrices.
+            ValueError: it was made of matrices, or the converter is one of a network.
         """
+        if self.around is not None:
+            raise ValueError(f"{self.around.name}: is one of a network; this takes one on its line")
         if self.origin is None:
             raise ValueError("this loop was made of matrices, not of a plant and a law")
         return self.origin
+
+    @property
+    def op(self) -> OperatingPoint:
+        """Where the converter and its law rest.
+
+        Raises:
+            ValueError: the loop was made of matrices.
+        """
+        return self.made_of.op if self.around is None else self.around.op
+
+    @property
+    def ref(self) -> Matrix:
+        """The references there, shape (5,), p.u.
+
+        Raises:
+            ValueError: the loop was made of matrices.
+        """
+        return self.made_of.ref if self.around is None else self.around.ref
+
+    @property
+    def dc_control(self) -> bool:
+        """Whether i_u acts: the DC source does not regulate itself."""
+        return bool(self.plant.B[..., 0].any())
 
     # matrices
 
@@ -272,7 +325,9 @@ class ClosedLoop:
         T_s = self.T_s
         if T_s is None:
             return self.plant
-        reads = self.stage is not None and self.stage.has_pll
+        if self.around is not None:
+            return self.around.held(self.u_delay, self.y_delay)
+        reads = [(OMEGA_ROW, OMEGA_COLUMN)] if self.stage and self.stage.has_pll else []
         if self.plant.A.ndim == 2:
             return sampled_plant(self.plant, T_s, self.u_delay, self.y_delay, reads)
         p = self.plant

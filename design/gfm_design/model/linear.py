@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
 from gfm_runtime.realisation import LawStateSpace
 from gfm_runtime.signals import NU, NY, NY_INNER
-from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw, close_omega_u, tustin
+from gfm_runtime.tustin import DiscreteLaw, close_omega_u, tustin
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.complex128]
@@ -108,7 +109,12 @@ class Mode:
         size = float(np.hypot(self.sigma, 2 * np.pi * self.frequency_hz))
         return -self.sigma / size if size else 0.0
 
-    def plain(self) -> dict[str, float]:
+    def words(self) -> str:
+        """Where it is and how fast it grows, for a message."""
+        where = f"at {self.frequency_hz:.4g} Hz" if self.frequency_hz else "(real)"
+        return f"mode {where} grows by {self.sigma:.3g} 1/s"
+
+    def plain(self) -> dict[str, Any]:
         """sigma [1/s], frequency_hz and ratio, for JSON."""
         return {"sigma": self.sigma, "frequency_hz": self.frequency_hz, "ratio": self.ratio}
 
@@ -162,10 +168,9 @@ def linearise_plant(
         B[V_DC, 0] = per_i_dc * (1 - regulated)
     if grid is not None:  # omega_g is a state, and so is the power of the turbines
         A[:, swing], B_d[:, 0] = B_d[:, 0], 0.0
-        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] / grid.S, slopes[-1, -1] / grid.S
-        A[swing, [swing, swing + 1]] = -grid.D, 1.0
-        A[swing], B_d[swing] = A[swing] / (2 * grid.H), B_d[swing] / (2 * grid.H)
-        A[swing + 1, [swing, swing + 1]] = -1 / (grid.droop * grid.T_gov), -1 / grid.T_gov
+        own, per_power = swing_equation(grid.H, grid.D, grid.droop, grid.T_gov, grid.S)
+        A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] * per_power, slopes[-1, -1] * per_power
+        A[swing : swing + 2, swing : swing + 2] = own
     if sensors:
         A[s, :n], A[s, s] = r["omega_s"] * C[_MEASURED, :n], -r["omega_s"] * np.eye(4)
         C = np.zeros_like(C)
@@ -175,6 +180,15 @@ def linearise_plant(
         prompt = np.eye(NY_INNER - NY, n + sensors)
         C = np.vstack([C, r["gain"][len(_MEASURED) :, None] * prompt])
     return LinearPlant(A, B, B_d, C, C_true)
+
+
+def swing_equation(
+    H: float, D: float, droop: float, T_gov: float, S: float
+) -> tuple[Matrix, float]:
+    """The swing equation and the governor of ``gfm_plant.ramps``: d/dt of (omega, power of the
+    turbines) by themselves, (2,2), and d(omega)/dt by a power that comes, p.u. of the network."""
+    own = np.array([[-D / (2 * H), 1 / (2 * H)], [-1 / (droop * T_gov), -1 / T_gov]])
+    return own, 1 / (2 * H * S)
 
 
 def _rates(x: Vector, u: Vector, d: Vector, par: Record) -> Vector:
@@ -275,8 +289,18 @@ def hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return out[:n, :n], out[:n, n:]
 
 
+def delay_lines(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix) -> list[int]:
+    """How many states the delay line of each u, then of each y, has; see ``sampled_plant``."""
+    u_split, y_split = _splits(plant, T_s, u_delay, y_delay)
+    return [whole + (part > 0.0) for whole, part in (*u_split, *y_split)]
+
+
 def sampled_plant(
-    plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix, reads_omega: bool = False
+    plant: LinearPlant,
+    T_s: float,
+    u_delay: Matrix,
+    y_delay: Matrix,
+    reads: Sequence[tuple[int, int]] = (),
 ) -> LinearPlant:
     """The plant from tick to tick, with delay lines as states.
 
@@ -287,16 +311,15 @@ def sampled_plant(
     Args:
         plant: a single continuous plant.
         T_s: sampling time, s.
-        u_delay, y_delay: shapes (3,) and (5,), or (4,) and (11,), s, all >= 0.
-        reads_omega: y has the omega_u that acts at its tick, as a PLL needs it.
+        u_delay, y_delay: of each u and each y, s, all >= 0.
+        reads: pairs of a command and a measurement that is the one that acts at its tick, as a PLL
+            needs omega_u.
     """
     n, n_u, n_y = len(plant.A), plant.B.shape[1], len(plant.C)
-    # a command that does not act needs no delay line
-    u_split = [_split(d, T_s) if plant.B[:, j].any() else (0, 0.0) for j, d in enumerate(u_delay)]
-    y_split = [_split(d, T_s) for d in y_delay]
-    lines = [whole + (part > 0.0) for whole, part in (*u_split, *y_split)]
+    u_split, y_split = _splits(plant, T_s, u_delay, y_delay)
+    lines = delay_lines(plant, T_s, u_delay, y_delay)
     at = n + np.concatenate([[0], np.cumsum(lines)]).astype(int)  # where each line begins
-    size = int(at[-1]) + reads_omega
+    size = int(at[-1]) + len(reads)
     now = np.eye(size + n_u + plant.B_d.shape[1])  # (state, u[k], d[k]) by rows
     aged = [np.vstack([now[size + j], now[at[j] : at[j + 1]]]) for j in range(n_u)]  # u_j[k], ...
     step = np.zeros((size, len(now)))
@@ -319,10 +342,21 @@ def sampled_plant(
     C_true = np.pad(plant.C_true, ((0, 0), (0, size - n)))
     prompt = np.pad(plant.C, ((0, 0), (0, size - n)))
     C = np.where(np.array(lines[n_u:])[:, None] > 0, read, prompt)
-    if reads_omega:
-        step[-1], C[OMEGA_COLUMN] = u[OMEGA_ROW], now[size - 1, :size]
+    for place, (command, measurement) in enumerate(reads, size - len(reads)):
+        step[place], C[measurement] = u[command], now[place, :size]
     A, B, B_d = np.split(step, [size, size + n_u], axis=1)
     return LinearPlant(A, B, B_d, C, C_true)
+
+
+Splits = list[tuple[int, float]]
+
+
+def _splits(
+    plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix
+) -> tuple[Splits, Splits]:
+    """Whole samples and fraction of each u and y; a command that does not act needs no line."""
+    u = [_split(d, T_s) if plant.B[:, j].any() else (0, 0.0) for j, d in enumerate(u_delay)]
+    return u, [_split(d, T_s) for d in y_delay]
 
 
 def _split(delay: float, T_s: float) -> tuple[int, float]:

@@ -28,10 +28,8 @@ class Culprit:
 
     def words(self) -> str:
         """The mode and its states in one line."""
-        f = self.mode.frequency_hz
-        where = f"at {f:.4g} Hz" if f else "(real)"
         who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.states)
-        return f"mode {where} grows by {self.mode.sigma:.3g} 1/s: {who}"
+        return f"{self.mode.words()}: {who}"
 
 
 def culprit(loop: ClosedLoop) -> Culprit:

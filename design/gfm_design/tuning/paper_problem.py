@@ -1,12 +1,14 @@
 """The paper's synthesis problem as a cost: gamma of the ideal continuous loop.
 
 A law with an inner stage has no continuous loop, since the stage runs from tick to tick. Its gamma
-is that of the sampled loop with u one sample late and the weights by Tustin. The searches work on
-that loop's inverse Tustin transform, which has the same norms.
+is that of the sampled loop with u one sample late and the weights by Tustin. On a scenario, and so
+in a network, it is that of the sampled loop with the delays and sensors there. The searches work on
+the inverse Tustin transform of such a loop, which has the same norms.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,12 +17,19 @@ from numpy.typing import NDArray
 from gfm_design.model.closed_loop import REFERENCES, T_S, ClosedLoop
 from gfm_design.model.linear import LinearLaw, LinearPlant, inverse_tustin
 from gfm_design.model.operating_point import OperatingPoint
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
+from gfm_design.norms.performance import (
+    PAPER_WEIGHTS,
+    Channel,
+    StateSpace,
+    Weight,
+    channel_norms,
+)
 from gfm_design.norms.screen import Screen
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
 from gfm_design.tuning.polish import polish
 from gfm_design.tuning.synthesis import UNSTABLE, unstable_cost
 from gfm_plant import Plant
+from gfm_runtime.law import Law
 from gfm_runtime.lawfile import LawFile, build_law
 
 Vector = NDArray[np.float64]
@@ -47,7 +56,13 @@ class PaperProblem:
     The plant is ideal whatever ``plant`` says of delay and sensors; factors and the DC source
     count. With an inner stage u acts one sample late. The operating point is that of the starting
     gains. ``late`` is the loop there sampled at T_s with one sample of delay, for other laws to be
-    put into it.
+    put into it; a sampled loop as it is.
+
+    With a ``decay`` a > 0 [1/s] the cost is the norm of W_ij(s) T_ij(s - a) in place of
+    W_ij(s) T_ij(s), which is finite if every mode of the loop decays faster than a.
+
+    ``among`` gives the loop of a law where else it is to be judged, sampled; as that of
+    ``NetworkLoop.converter``. Plant, references and T_s are then those of that loop.
     """
 
     file: LawFile
@@ -56,6 +71,8 @@ class PaperProblem:
     references: tuple[float, ...] = REFERENCES
     weights: tuple[Weight, ...] = PAPER_WEIGHTS
     T_s: float = T_S
+    among: Callable[[Law], ClosedLoop] | None = None
+    decay: float = 0.0
 
     def __post_init__(self) -> None:
         judged = LATE if self.has_stage else Plant()
@@ -67,21 +84,32 @@ class PaperProblem:
     def move_to(self, named: dict[str, float]) -> None:
         """Take the operating point of these gains (it hardly depends on them)."""
         law, ref = build_law(self.file, named), np.asarray(self.references)
-        ideal = not self.has_stage
-        self._rest = ClosedLoop.of(law, self._judged, ref, T_s=self.T_s, ideal=ideal)
-        self.late = self._rest.sampled(self.T_s, self.T_s) if ideal else self._rest
         controlled = self.plant.dc_source.mode == "controlled"
+        if self.among is None:
+            ideal = not self.is_sampled
+            self._rest = ClosedLoop.of(law, self._judged, ref, T_s=self.T_s, ideal=ideal)
+        else:
+            self._rest = self.among(law)
+            assert self._rest.T_s is not None
+            self.T_s, ref = self._rest.T_s, self._rest.ref
+            controlled = self._rest.dc_control
+        self.late = self._rest if self.is_sampled else self._rest.sampled(self.T_s, self.T_s)
         self.law = GainedLaw(self.file, self.gains, self.op, ref, controlled)
 
     @property
     def has_stage(self) -> bool:
-        """Whether the law has an inner stage, so that the sampled loop is judged."""
+        """Whether the law has an inner stage."""
         return self.file.inner is not None
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether the sampled loop is judged: with an inner stage, and in a network."""
+        return self.has_stage or self.among is not None
 
     @property
     def op(self) -> OperatingPoint:
         """Where plant and law rest."""
-        return self._rest.made_of.op
+        return self._rest.op
 
     @property
     def linear(self) -> LinearPlant:
@@ -90,8 +118,16 @@ class PaperProblem:
 
     def loops(self, values: Vector) -> StateSpace:
         """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
-        loops = self.closed_loops(values).performance()
-        return inverse_tustin(*loops, self.T_s / 2) if self.has_stage else loops
+        loops = self._shifted(self.closed_loops(values).performance())
+        return inverse_tustin(*loops, self.T_s / 2) if self.is_sampled else loops
+
+    def _shifted(self, loops: StateSpace) -> StateSpace:
+        """T(s - decay) of T(s), in continuous time or from tick to tick."""
+        A, B, C, D = loops
+        if self.is_sampled:
+            faster = np.exp(self.decay * self.T_s)
+            return faster * A, faster * B, C, D
+        return A + self.decay * np.eye(A.shape[-1]), B, C, D
 
     def closed_loop(self, values: Vector) -> ClosedLoop:
         """The loop at these gains, with as few states as the law needs.
@@ -107,7 +143,7 @@ class PaperProblem:
 
     def _runs(self, law: LinearLaw) -> LinearLaw:
         """The law as the loop has it, continuous or from tick to tick."""
-        return law.sampled(self.T_s) if self.has_stage else law
+        return law.sampled(self.T_s) if self.is_sampled else law
 
     def __call__(self, values: Vector) -> float:
         """Cost: a close lower bound of gamma, or what an unstable loop costs."""
@@ -133,5 +169,6 @@ class PaperProblem:
             return point
 
     def channels(self, values: Vector) -> tuple[Channel, ...]:
-        """Every channel's norm, guaranteed. Raises ``Unstable``."""
-        return self.closed_loop(values).channels(self.weights)
+        """Every channel's norm, guaranteed, with the decay if there is one. Raises ``Unstable``."""
+        loop = self.closed_loop(values)
+        return channel_norms(self._shifted(loop.performance()), self.weights, loop.T_s)

@@ -70,9 +70,7 @@ def tune_paper(
     moved = tuple(w for w in problem.weights if w not in fixed)
     if fixed and moved:
         told, gamma = found.evaluations, found.cost
-        rest = PaperProblem(
-            problem.file, problem.gains, problem.plant, problem.references, moved, problem.T_s
-        )
+        rest = replace(problem, weights=moved)
         again = tune_paper(
             rest, seed, evaluations, starts, lambda done, best: progress(told + done, gamma)
         )

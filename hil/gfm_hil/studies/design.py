@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
@@ -18,9 +20,12 @@ from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.law import Law, as_law
-from gfm_plant import Plant
+from gfm_hil.studies.loop import Loop
+from gfm_hil.studies.network_loop import loop_under
+from gfm_plant import NoEquilibrium, Plant
+from gfm_runtime import Law as BuiltLaw
 
 if TYPE_CHECKING:
     import pandas
@@ -87,8 +92,10 @@ class Tuning:
         Raises:
             UserError: python-control or slycot is not installed, or the law has an inner stage.
         """
-        if self.problem.has_stage:
-            raise UserError("the full-order bound is that of a law on the bridge, without a stage")
+        if self.problem.is_sampled:
+            raise UserError(
+                "the full-order bound is that of a law on the bridge of the paper's converter"
+            )
         try:
             return full_order(self.problem.linear, self.problem.weights)
         except ModuleNotFoundError as missing:
@@ -102,27 +109,43 @@ class NotTuned(ArithmeticError):
     """No gains within their bounds stabilise the loop; the message names the mode in the way."""
 
 
-def gamma(law: str | Path | Law, weights: Weights = None, T_s: float | None = None) -> Gamma:
-    """gamma of a law on the paper's converter at P_ref = 0.5 p.u.
+def gamma(
+    law: str | Path | Law,
+    weights: Weights = None,
+    T_s: float | None = None,
+    *,
+    on: str | Path | Scenario | None = None,
+    converter: str | None = None,
+) -> Gamma:
+    """gamma of a law on the paper's converter at P_ref = 0.5 p.u., or on a scenario.
 
-    With an inner stage it is that of the loop sampled at 10 kHz with u one sample late.
+    With an inner stage it is that of the loop sampled at 10 kHz with u one sample late. On a
+    scenario it is that of the sampled loop with the scenario's delay and sensors.
 
     Args:
         law: name, law file or ``Law``; ``Law.with_gains`` gives other gains.
         weights: file of weights or the weights; the paper's six if None.
         T_s: sampling time [s] of law and weights, by Tustin, without delay; None for the
-            continuous loop of the paper. Not with an inner stage.
+            continuous loop of the paper. Not with an inner stage, nor on a scenario.
+        on: a scenario: its name or file, or a checked one.
+        converter: of a scenario with a network the converter that gets this law, while the others
+            keep theirs.
 
     Raises:
         Unstable: the loop is not stable; it has no gamma.
-        UserError: a weight that cannot be, there is no operating point, or T_s with an inner stage.
+        UserError: a weight that cannot be, there is no operating point, T_s with an inner stage or
+            a scenario, or no such scenario or converter.
         LawError: the law is none.
     """
     law = as_law(law)
     staged = law.file.inner is not None
-    if staged and T_s is not None:
-        raise UserError("gamma: the loop of an inner stage is sampled at 10 kHz in any case")
-    loop = law.closed_loop(LATE) if staged else law.closed_loop(ideal=True)
+    if T_s is not None and (staged or on is not None):
+        of = "an inner stage is sampled at 10 kHz" if on is None else "a scenario is sampled"
+        raise UserError(f"gamma: the loop of {of} in any case")
+    if on is not None:
+        loop = law.closed_loop(on, converter=converter)
+    else:
+        loop = law.closed_loop(LATE) if staged else law.closed_loop(ideal=True)
     if T_s is not None:
         loop = loop.sampled(T_s)
     return Gamma(law.name, loop.channels(_weights(weights)))
@@ -135,6 +158,9 @@ def tune(
     start: Mapping[str, float] | None = None,
     only: Sequence[str] | None = None,
     weights: Weights = None,
+    on: str | Path | Scenario | None = None,
+    converter: str | None = None,
+    decay: float = 0.0,
     seed: int = 0,
     evaluations: int = EVALUATIONS,
     starts: int | None = None,
@@ -147,9 +173,13 @@ def tune(
     Args:
         law: name, law file or ``Law``; its parameters with ``free`` bounds may move.
         name: of the new law; ``<name>-tuned`` if None.
-        start: other values to start from; MIMO-GFM starts from the paper's initial K.
+        start: other values to start from; without a scenario MIMO-GFM starts from the paper's
+            initial K.
         only: the free gains to move; all if None.
         weights: file of weights or the weights; the paper's six if None.
+        on, converter: as for the function ``gamma``.
+        decay: how fast every mode of the loop, and so of the whole network, must decay at least,
+            1/s: the search then minimises the norm of W_ij(s) T_ij(s - decay).
         seed: of the search, >= 0; the same seed gives the same gains.
         evaluations: of each start, before its polish.
         starts: the given start and random ones; 6, and one more a gain, if None.
@@ -163,12 +193,25 @@ def tune(
     for what, value in (("evaluations", evaluations), ("starts", starts)):
         if value is not None and value < 1:
             raise UserError(f"{what} = {value}: must be at least 1")
-    if seed < 0:
-        raise UserError(f"seed = {seed}: must not be negative")
+    for what, number in (("seed", seed), ("decay", decay)):
+        if not 0 <= number < np.inf:
+            raise UserError(f"{what} = {number}: must be finite and not negative")
     law = as_law(law)
-    paper = PAPER_START.get(law.name, {})
+    file, among = law.file, None
+    if on is not None:
+        scenario = on if isinstance(on, Scenario) else load_scenario(on)
+        file = law.staged(scenario, converter)
+
+        def among(built: BuiltLaw) -> Loop:
+            return loop_under(built, scenario, converter)
+
+    paper = PAPER_START.get(law.name, {}) if among is None else dict[str, float]()
     at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
-    problem = PaperProblem(law.file, free_gains(law.file, at, only), weights=_weights(weights))
+    gains = free_gains(law.file, at, only)
+    try:
+        problem = PaperProblem(file, gains, weights=_weights(weights), among=among, decay=decay)
+    except NoEquilibrium as none:
+        raise UserError(str(none)) from None
     starts = starts or starts_for(len(problem.gains))
     try:
         found = tune_paper(
@@ -176,17 +219,21 @@ def tune(
             lambda done, best: progress(done, evaluations * starts, best),
         )  # fmt: skip
     except NotStabilised as none:
-        mode = culprit(problem.closed_loop(none.values)).words()
-        raise NotTuned(
-            f"{none}; in the way, on the paper's converter at "
-            f"P_ref = {problem.references[1]:g}: {mode}"
-        ) from None
+        loop = problem.closed_loop(none.values)
+        where = "on the scenario" if converter is None else f"in the network of {converter}"
+        mode = loop.modes()[0].words()
+        if on is None:
+            where = f"on the paper's converter at P_ref = {problem.references[1]:g}"
+            mode = culprit(loop).words()
+        wanted = f" against a decay of {decay:g} 1/s" if decay else ""
+        raise NotTuned(f"{none}{wanted}; in the way, {where}: {mode}") from None
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
-    gains = problem.law.named(found.values)
-    tuned = law.with_gains(name or f"{law.name}-tuned", **gains)
-    channels = Gamma(tuned.name, problem.channels(found.values))
-    return Tuning(tuned, channels, gains, found.evaluations, found.seconds, found.seed, problem)
+    named = problem.law.named(found.values)
+    tuned = law.with_gains(name or f"{law.name}-tuned", **named)
+    loop = problem.closed_loop(found.values)
+    channels = Gamma(tuned.name, loop.channels(problem.weights))
+    return Tuning(tuned, channels, named, found.evaluations, found.seconds, found.seed, problem)
 
 
 def margins(
@@ -203,9 +250,16 @@ def margins(
 
     Raises:
         UnstableLoop: the loop is unstable and has no margins.
-        UserError: no such scenario, or there is no operating point.
+        UserError: no such scenario, or there is no operating point; or the converter is one of a
+            network, whose loop has ``margins()`` without the ranges.
     """
-    return _margins(as_law(law).closed_loop(on, **more))
+    loop = as_law(law).closed_loop(on, **more)
+    if loop.around is not None:
+        raise UserError(
+            f"{loop.title}: ranges of elements and grids are those of one converter on its line;"
+            " Law.closed_loop(...).margins() has the other margins"
+        )
+    return _margins(loop)
 
 
 def _weights(given: Weights) -> tuple[Weight, ...]:

@@ -190,7 +190,12 @@ class Law:
         return control.tf(num, den, inputs=[f"error_{y}" for y in Y_NAMES], outputs=list(U_NAMES))
 
     def closed_loop(
-        self, on: str | Path | Scenario | Plant | None = None, *, ideal: bool = False, **more: Any
+        self,
+        on: str | Path | Scenario | Plant | None = None,
+        *,
+        converter: str | None = None,
+        ideal: bool = False,
+        **more: Any,
     ) -> Loop:
         """This law around a plant, linearised where both rest.
 
@@ -198,7 +203,9 @@ class Law:
             on: a scenario (name, file or ``Scenario``), of which plant, references, sampling time
                 and inner stage count, or a plant alone; the paper's converter without delay and
                 sensors if None.
-            ideal: the continuous loop, neither sampled nor delayed.
+            converter: of a scenario with a network the converter that gets this law, while the
+                others keep theirs.
+            ideal: the continuous loop, neither sampled nor delayed; not of a network.
             more: ``references`` (V_dcref, P_ref, omega_g, Q_ref, V_ref) in p.u. and ``T_s`` in s,
                 instead of those of the scenario.
 
@@ -208,19 +215,40 @@ class Law:
                 runs from tick to tick.
         """
         from gfm_hil.studies.loop import Loop
+        from gfm_hil.studies.network_loop import loop_under
 
-        file = self.file
         if isinstance(on, str | Path):
             on = load_scenario(on)
-        if isinstance(on, Scenario):
-            more = {"references": on.references.vector(), "T_s": on.T_s, **more}
-            if on.inner is not None:
-                file = self.file.model_copy(update={"inner": named_inner(on.inner)})
-            on = on.plant
         try:
-            return Loop.of(build_law(file), on, ideal=ideal, **more)
+            if not isinstance(on, Scenario):
+                return Loop.of(self.built(), on, ideal=ideal, **more)
+            law = build_law(self.staged(on, converter))
+            if converter is None:
+                more = {"references": on.references.vector(), "T_s": on.T_s, **more}
+                return Loop.of(law, on.plant, ideal=ideal, **more)
+            if ideal or more:
+                raise UserError(f"{', '.join(more) or 'ideal'}: not of a converter of a network")
+            return loop_under(law, on, converter)
         except NoEquilibrium as problem:
             raise UserError(str(problem)) from None
+
+    def staged(self, scenario: Scenario, converter: str | None = None) -> LawFile:
+        """Its law file with the inner stage that a scenario gives its laws, if it gives one.
+
+        Args:
+            converter: of a scenario with a network, which one has this law.
+
+        Raises:
+            UserError: no such converter; or none is named, and the scenario has a network.
+        """
+        names = scenario.converters
+        if converter not in names and (names or converter is not None):
+            allowed = f"one of {names}" if names else "left out: the scenario has no network"
+            raise UserError(f"converter = {converter!r}: must be {allowed}")
+        inner = (scenario if converter is None else scenario.of(converter)).inner
+        if inner is None:
+            return self.file
+        return self.file.model_copy(update={"inner": named_inner(inner)})
 
     def to_toml(self) -> str:
         """The text of its law file."""

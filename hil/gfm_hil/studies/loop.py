@@ -12,7 +12,7 @@ from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.closed_loop import frequencies_near as _near
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime import load_law
+from gfm_runtime import DiscreteLaw, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -55,7 +55,7 @@ class Loop(ClosedLoop):
         gain.axhline(0.0, color=_GREY, lw=0.8)
         gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
         phase.axhline(-180.0, color=_GREY, lw=0.8)
-        return _finish([gain, phase], f"{self._name()}: L, one loop cut", "|L| [dB]", "∠L [°]")
+        return _finish([gain, phase], f"{self.title}: L, one loop cut", "|L| [dB]", "∠L [°]")
 
     def nyquist(self, *at: str) -> Axes:
         """Draw L in the complex plane near -1, over positive frequencies; arguments as ``bode``.
@@ -76,7 +76,7 @@ class Loop(ClosedLoop):
         axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
         axes.set(xlim=(-_NYQUIST, _NYQUIST), ylim=(-_NYQUIST, _NYQUIST), aspect="equal")
         axes.set(xlabel="Re L", ylabel="Im L")
-        dress(axes, f"{self._name()}: L, one loop cut")
+        dress(axes, f"{self.title}: L, one loop cut")
         axes.legend(fontsize=8, frameon=False, loc="upper right")
         return axes
 
@@ -104,9 +104,7 @@ class Loop(ClosedLoop):
         for axes, name, column in zip(panels, Y_NAMES, y.T, strict=True):
             draw_panel(axes, f"{name} [p.u.]", [(t, column, COLOURS[0], name)])
         panels[-1].set_xlabel("t [s]", fontsize=9)
-        figure.suptitle(
-            f"{self._name()}: after a unit step of {of}", fontsize=11, x=0.01, ha="left"
-        )
+        figure.suptitle(f"{self.title}: after a unit step of {of}", fontsize=11, x=0.01, ha="left")
         return list(panels)
 
     def pole_map(self) -> Axes:
@@ -127,7 +125,7 @@ class Loop(ClosedLoop):
         axes.set_xscale("symlog", linthresh=1.0)
         axes.set_yscale("symlog", linthresh=1.0)
         axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-        dress(axes, f"{self._name()}: poles, stable where σ < 0")
+        dress(axes, f"{self.title}: poles, stable where σ < 0")
         return axes
 
     def impedance(self) -> list[Axes]:
@@ -144,10 +142,14 @@ class Loop(ClosedLoop):
             _curve(size, hz, np.abs(Z[:, i, j]), k, name)
             _curve(phase, hz, _degrees(Z[:, i, j]), k, name)
         size.set_yscale("log")
-        title = f"{self._name()}: output impedance at the capacitor, dq"
+        title = f"{self.title}: output impedance at the capacitor, dq"
         return _finish([size, phase], title, "|Z| [p.u.]", "∠Z [°]")
 
-    def _name(self) -> str:
+    @property
+    def title(self) -> str:
+        """The name of the law; of a converter of a network its own name too."""
+        if self.around is not None:
+            return self.around.name
         return self.origin.law.law.name if self.origin else "loop"
 
     def _acting(self) -> list[str]:
@@ -167,11 +169,36 @@ class Loop(ClosedLoop):
         return np.unique(np.concatenate([base, near[(near > _LOWEST_HZ) & (near < base[-1])]]))
 
 
-def scenario_loop(scenario: Scenario) -> tuple[Loop, str]:
-    """The scenario's first law at its start, of a scheduled law the stage in force; its label."""
+def initial_law(scenario: Scenario) -> tuple[DiscreteLaw, str]:
+    """The law of one converter at its start, of a scheduled law the stage in force; its label."""
     references = scenario.references.vector()
     controller = Controller([load_law(scenario.law, scenario.inner)], scenario.T_s, references)
-    return Loop.of(controller.active_law, scenario.plant, references), controller.active
+    return controller.active_law, controller.active
+
+
+def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[Loop, str]:
+    """The loop of the scenario's first law, and its label.
+
+    Args:
+        converter: of a network, which one; the folder of a converter knows it.
+
+    Raises:
+        NoEquilibrium, UserError: there is no operating point; or there is a network and no
+            converter is named, or one that it does not have.
+    """
+    if scenario.network is None:
+        law, label = initial_law(scenario)
+        return Loop.of(law, scenario.plant, scenario.references.vector()), label
+    from gfm_hil.studies.network_loop import network_loop
+
+    name = converter or scenario.converter
+    if name is None:
+        raise UserError(
+            f"network: this takes the loop of one converter; --converter names it, one of"
+            f" {scenario.converters}"
+        )
+    loop = network_loop(scenario).converter(name)
+    return loop, loop.title
 
 
 def _figure(rows: int) -> list[Axes]:

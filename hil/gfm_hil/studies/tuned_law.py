@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gfm_design.norms.performance import Channel
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_runtime.lawfile import LawFile
 
@@ -27,8 +28,11 @@ def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
     return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 
-def problem_name(file: LawFile) -> str:
-    """The problem whose gamma a synthesis gives."""
+def problem_name(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
+    """The problem whose gamma a synthesis gives: the paper's, or that of a scenario."""
+    if on is not None:
+        who = "" if converter is None else f"converter {converter} of "
+        return f"the paper's weights on {who}{on.title!r}, sampled"
     if file.inner is None:
         return "the paper's problem (Section III-B)"
     return f"the paper's weights, behind {file.inner.type}, sampled at 10 kHz, u one sample late"
@@ -60,6 +64,7 @@ def write_law(
     result: Mapping[str, Any],
     notes: Sequence[str] = (),
     by: str = "gfmhil design tune",
+    problem: str | None = None,
 ) -> None:
     """Write a law file with its tuned gains and, as comments, what they were tuned for.
 
@@ -71,12 +76,13 @@ def write_law(
         result: gamma, channels, evaluations, seconds and seed, as ``gfmhil design tune --json``.
         notes: more lines of comment.
         by: the command that found the gains.
+        problem: whose gamma it is; the paper's if None.
 
     Raises:
         OSError: the file cannot be written.
     """
     comments = [
-        f"gamma = {result['gamma']:.6g} of {problem_name(file)}, P_ref = 0.5",
+        f"gamma = {result['gamma']:.6g} of {problem or f'{problem_name(file)}, P_ref = 0.5'}",
         *(f"W_{c['i']}{c['j']}: {c['norm']:.6g}" for c in result["channels"]),
         f"{result['evaluations']} evaluations, {result['seconds']:.1f} s, seed {result['seed']}",
         *notes,

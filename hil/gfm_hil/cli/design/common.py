@@ -10,9 +10,11 @@ import numpy as np
 from rich.table import Table
 
 from gfm_design.norms.performance import Channel
+from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
+from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
 from gfm_hil.studies.tuned_law import problem_name
 from gfm_runtime import law_file
@@ -28,6 +30,39 @@ def add_inner_option(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_converter_option(command: argparse.ArgumentParser) -> None:
+    """The converter of a network."""
+    command.add_argument(
+        "--converter", metavar="NAME",
+        help="of a scenario with a network: the converter whose loop it is, and that gets --law and"
+        " --inner",
+    )  # fmt: skip
+
+
+def chosen_scenario(given: str, options: argparse.Namespace) -> Scenario:
+    """A scenario with the law and the inner stage of --law and --inner; in a network those of
+    --converter.
+
+    Raises:
+        UserError: as ``load_scenario``; --converter does not name a converter of the network.
+    """
+    changed = {"law": options.law, "inner": options.inner}
+    name = options.converter
+    scenario = load_scenario(given)
+    if name is not None and name not in scenario.converters:
+        known = f"use one of {scenario.converters}" if scenario.network else "it has no network"
+        raise UserError(f"--converter {name}: {given} has no such converter; {known}")
+    if scenario.network is None:
+        return load_scenario(given, OPTIONS, **changed)
+    name = name or scenario.converter
+    for key, value in changed.items():
+        if value is not None and name is None:
+            raise UserError(f"--{key} {value}: name the converter that gets it with --converter")
+    own = {f"network__converters__{name}__{key}": value for key, value in changed.items()}
+    names = {f"network__converters__{name}__{key}": f"--{key}" for key in changed}
+    return load_scenario(given, names, **own)
+
+
 def chosen_law(options: argparse.Namespace) -> LawFile:
     """The law file of --law, with the inner stage of --inner if it is given.
 
@@ -40,9 +75,35 @@ def chosen_law(options: argparse.Namespace) -> LawFile:
     return file.model_copy(update={"inner": named_inner(options.inner)})
 
 
-def judged(file: LawFile) -> str:
-    """The name of a law; with an inner stage also which problem its gamma is that of."""
-    return file.name if file.inner is None else f"{file.name}, {problem_name(file)}"
+def judged(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
+    """The name of a law, and which problem its gamma is that of if it is not the paper's."""
+    if on is None and file.inner is None:
+        return file.name
+    return f"{file.name}, {problem_name(file, on, converter)}"
+
+
+def add_judged_on(command: argparse.ArgumentParser) -> None:
+    """Where else than on the paper's converter gamma is judged."""
+    command.add_argument(
+        "--scenario",
+        help="scenario file or shipped name: its sampled loop in place of the paper's problem",
+    )
+    add_converter_option(command)
+
+
+def judged_on(options: argparse.Namespace) -> Scenario | None:
+    """The scenario of --scenario, under --law and --inner.
+
+    Raises:
+        UserError: as ``chosen_scenario``; --converter is missing, or without --scenario.
+    """
+    if options.scenario is None:
+        if options.converter is not None:
+            raise UserError(f"--converter {options.converter}: needs --scenario with a network")
+        return None
+    if options.converter is None and (names := load_scenario(options.scenario).converters):
+        raise UserError(f"--scenario {options.scenario}: --converter names the one of {names}")
+    return chosen_scenario(options.scenario, options)
 
 
 def add_law_options(command: argparse.ArgumentParser) -> None:

@@ -10,10 +10,12 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
+    add_judged_on,
     add_law_options,
     channels_as_json,
     chosen_law,
     judged,
+    judged_on,
     print_channels,
     read_gains,
     singular_is_users,
@@ -26,6 +28,7 @@ from gfm_hil.studies.law import Law
 def add(kinds: Any) -> None:
     command = kinds.add_parser("gamma", help="gamma of a law's gains, channel by channel")
     add_law_options(command)
+    add_judged_on(command)
     command.add_argument(
         "--discrete",
         action="store_true",
@@ -39,10 +42,12 @@ def add(kinds: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Report gamma of given gains; exit code 3 for an unstable loop, which has none."""
     law, given = Law(chosen_law(options)), read_gains(options.gains)
+    on, converter = judged_on(options), options.converter
     if given:
         law = law.with_gains(law.name, **given)
     try:
-        channels = gamma(law, options.weights, T_S if options.discrete else None).channels
+        T_s = T_S if options.discrete else None
+        channels = gamma(law, options.weights, T_s, on=on, converter=converter).channels
     except Unstable as found:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(found)}))
@@ -52,5 +57,5 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"law": law.name, **channels_as_json(channels)}, indent=2))
     else:
-        print_channels(judged(law.file), channels)
+        print_channels(judged(law.file, on, converter), channels)
     return 0

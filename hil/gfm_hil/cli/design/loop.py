@@ -12,14 +12,14 @@ import numpy as np
 from rich.table import Table
 
 from gfm_design.margins.all_margins import UnstableLoop
-from gfm_hil.cli.common import OPTIONS
-from gfm_hil.cli.design.common import add_inner_option
+from gfm_design.model.network import NetworkMode
+from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
 from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
+from gfm_hil.studies.network_loop import NetworkLoop, network_loop
 from gfm_runtime.signals import Y_NAMES
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: what a command found: as JSON, and as a table
 Found = tuple[dict[str, Any], Table]
+
+_LEAST = 0.01  # of a participation that the table shows
 
 
 def add(kinds: Any) -> None:
@@ -44,12 +46,15 @@ def add(kinds: Any) -> None:
             "--scenario", default="pref_step",
             help="scenario file or shipped name: plant, references, T_s; pref_step by default",
         )  # fmt: skip
+        add_converter_option(command)
         if find is _margins:
             command.add_argument(
                 "--at", help="channels of u or y, separated by commas; all of u by default"
             )
         if find is _step:
-            command.add_argument("--of", default="P_ref", help="the input that steps")
+            command.add_argument(
+                "--of", help="the input that steps; P_ref by default, in a network as A.P_ref"
+            )
             command.add_argument("--seconds", type=_seconds, default=1.0, help="how long, s")
         command.add_argument(
             "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
@@ -60,9 +65,14 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Print the table and draw the figure; exit code 3 where an unstable loop has no margins."""
-    changed = {"law": options.law, "inner": options.inner}
-    scenario = load_scenario(options.scenario, OPTIONS, **changed)
-    loop, label = scenario_loop(scenario)
+    scenario = chosen_scenario(options.scenario, options)
+    loop: Loop | NetworkLoop
+    of_all = options.find is _modes or (options.find is _step and options.converter is None)
+    if of_all and scenario.network is not None:
+        loop = network_loop(scenario)
+        label = ", ".join(member.title for member in loop.members)
+    else:
+        loop, label = scenario_loop(scenario, options.converter)
     if options.out:
         _save(options.out, lambda: options.draw(loop, options))
     console = terminal(highlight=False)
@@ -116,12 +126,17 @@ def _nyquist(loop: Loop, options: argparse.Namespace) -> Axes:
     return loop.nyquist(*_at(options))
 
 
-def _pole_map(loop: Loop, options: argparse.Namespace) -> Axes:
+def _pole_map(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Axes:
     return loop.pole_map()
 
 
-def _draw_step(loop: Loop, options: argparse.Namespace) -> Axes:
-    return loop.step(options.of, options.seconds)[0]
+def _draw_step(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Axes:
+    return loop.step(_input(loop, options), options.seconds)[0]
+
+
+def _input(loop: Loop | NetworkLoop, options: argparse.Namespace) -> str:
+    default = f"{loop.names[0]}.P_ref" if isinstance(loop, NetworkLoop) else "P_ref"
+    return options.of or default
 
 
 def _margins(loop: Loop, options: argparse.Namespace) -> Found:
@@ -134,25 +149,38 @@ def _margins(loop: Loop, options: argparse.Namespace) -> Found:
     return {"stable": True, "at": {c.name: channel_as_json(c) for c in some}}, loops_table(some)
 
 
-def _modes(loop: Loop, options: argparse.Namespace) -> Found:
+def _modes(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Found:
     modes = loop.modes()
     table = numbers("σ \\[1/s]", "frequency \\[Hz]", "damping ratio")
+    if isinstance(loop, NetworkLoop):
+        table.add_column("taking part")
     for mode in modes:
-        table.add_row(f"{mode.sigma:.4g}", f"{mode.frequency_hz:.4g}", f"{mode.ratio:.3g}")
+        cells = [f"{mode.sigma:.4g}", f"{mode.frequency_hz:.4g}", f"{mode.ratio:.3g}"]
+        if isinstance(mode, NetworkMode):
+            shares = [f"{part} {100 * x:.0f} %" for part, x in mode.participation.items()
+                      if x >= _LEAST]  # fmt: skip
+            cells.append(", ".join(shares))
+        table.add_row(*cells)
     return {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}, table
 
 
-def _step(loop: Loop, options: argparse.Namespace) -> Found:
+def _step(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Found:
+    of = _input(loop, options)
     try:
-        t, y = loop.step_response(options.of, options.seconds)
+        t, found = loop.step_response(of, options.seconds)
     except ValueError as problem:
         raise UserError(f"--of: {problem}") from None
     heads = "peak \\[p.u.]", "at \\[s]", "at the end \\[p.u.]"
-    table = numbers(f"after {options.of}", *heads)
-    content = {}
-    for name, column in zip(Y_NAMES, y.T, strict=True):
-        k = int(np.argmax(np.abs(column)))
-        row = {"peak": float(column[k]), "peak_s": float(t[k]), "end": float(column[-1])}
-        content[name] = row
-        table.add_row(name, *(cell(value) for value in row.values()))
-    return {"of": options.of, "seconds": options.seconds, "y": content}, table
+    table = numbers(f"after {of}", *heads)
+    each = found if isinstance(found, dict) else {"": found}
+    content: dict[str, Any] = {}
+    for converter, y in each.items():
+        own: dict[str, Any] = {}
+        for name, column in zip(Y_NAMES, y.T, strict=True):
+            k = int(np.argmax(np.abs(column)))
+            row = {"peak": float(column[k]), "peak_s": float(t[k]), "end": float(column[-1])}
+            own[name] = row
+            label = f"{converter}.{name}" if converter else name
+            table.add_row(label, *(cell(value) for value in row.values()))
+        content |= {converter: own} if converter else own
+    return {"of": of, "seconds": options.seconds, "y": content}, table

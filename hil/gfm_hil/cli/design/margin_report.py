@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gfm_design.margins.all_margins import ChannelMargins, Margins, UnstableLoop
+from gfm_design.margins.all_margins import ChannelMargins, LoopMargins, Margins, UnstableLoop
 from gfm_design.margins.disk import DiskMargin
 from gfm_design.margins.tolerance import End, GridStrength, Range
 from gfm_hil.cli.common import EXIT_OTHERWISE
@@ -20,9 +20,11 @@ from gfm_hil.results.loop_delay import LoopDelay
 from gfm_hil.results.report import finite
 
 
-def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, Any]:
-    """All margins; ``set_s`` is the loop delay that they are on top of, s."""
-    loop = m.loop
+def margins_as_json(
+    loop: LoopMargins, more: Margins | None, set_s: float, measured: LoopDelay | None
+) -> dict[str, Any]:
+    """The margins of a loop, and the ranges of ``more``; ``set_s`` is the loop delay that they are
+    on top of, s."""
     out: dict[str, Any] = {
         "mode": loop.worst.plain(),
         "loop_delay_us": round(1e6 * set_s, 6),
@@ -32,9 +34,10 @@ def as_json(m: Margins, set_s: float, measured: LoopDelay | None) -> dict[str, A
         "u": {c.name: channel_as_json(c) for c in loop.u},
         "y": {c.name: channel_as_json(c) for c in loop.y},
         "disk": {"u": _disk(loop.disk_u), "y": _disk(loop.disk_y)},
-        "elements": {name: _range(r) if r else None for name, r in m.elements.items()},
-        "grid": _grid(m.grid),
     }
+    if more is not None:
+        out["elements"] = {name: _range(r) if r else None for name, r in more.elements.items()}
+        out["grid"] = _grid(more.grid)
     if measured is not None:
         margin = 1e6 * loop.delay.seconds
         out["run"] = {
@@ -95,20 +98,25 @@ def _grid(g: GridStrength) -> dict[str, Any]:
 
 
 def print_margins(
-    console: Console, law: str, scenario: str, m: Margins, set_s: float, run: LoopDelay | None
+    console: Console,
+    law: str,
+    scenario: str,
+    loop: LoopMargins,
+    ranges: Margins | None,
+    set_s: float,
+    run: LoopDelay | None,
 ) -> None:
-    """Everything on a terminal."""
-    loop = m.loop
+    """Everything on a terminal; arguments as for ``margins_as_json``."""
     console.print(
         f"[bold]{law}[/] · {scenario}\n"
         f"least damped: sigma = {loop.worst.sigma:.4g} 1/s at {loop.worst.frequency_hz:.4g} Hz"
     )
-    more = (
+    delay = (
         f"more than {1e6 * loop.longest:g} µs"
         if math.isinf(loop.delay.seconds)
         else f"{1e6 * loop.delay.seconds:.4g} µs, then {loop.delay.frequency_hz:.4g} Hz is lost"
     )
-    console.print(f"[bold]delay margin[/] on top of {1e6 * set_s:g} µs: {more}\n")
+    console.print(f"[bold]delay margin[/] on top of {1e6 * set_s:g} µs: {delay}\n")
     console.print(loops_table((*loop.u, *loop.y)))
     for name, disk in (("u", loop.disk_u), ("y", loop.disk_y)):
         low, high = disk.gain
@@ -117,13 +125,12 @@ def print_margins(
             f"{disk.frequency_hz:.4g} Hz (gains {low:.3g} … {high:.3g}, ±{disk.phase_deg:.3g}°; "
             f"unstructured {disk.full:.3g})"
         )
-    console.print(_elements_table(m))
-    g = m.grid
-    strongest = f"{g.strongest:.4g}{_why(g.range.low)}"
-    weakest = f"{g.weakest:.4g}{_why(g.range.high)}"
-    console.print(
-        f"grid at X/R = {g.x_over_r:.3g}: SCR {g.now:.4g}; strongest {strongest}, weakest {weakest}"
-    )
+    if ranges is not None:
+        console.print(_elements_table(ranges))
+        g = ranges.grid
+        ends = f"strongest {g.strongest:.4g}{_why(g.range.low)}"
+        ends += f", weakest {g.weakest:.4g}{_why(g.range.high)}"
+        console.print(f"grid at X/R = {g.x_over_r:.3g}: SCR {g.now:.4g}; {ends}")
     if run is not None:
         console.print(f"\n[bold]this run[/] {run.words(1e6 * loop.delay.seconds)}")
         if run.round_trip_us:

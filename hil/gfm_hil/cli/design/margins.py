@@ -11,14 +11,14 @@ from rich.progress import BarColumn
 
 from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
-from gfm_hil.cli.common import OPTIONS, progress
-from gfm_hil.cli.design.common import add_inner_option
-from gfm_hil.cli.design.margin_report import as_json, no_margins, print_margins
+from gfm_hil.cli.common import progress
+from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
+from gfm_hil.cli.design.margin_report import margins_as_json, no_margins, print_margins
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.loop_delay import loop_delay
 from gfm_hil.results.report import finite
-from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.loop import Loop, scenario_loop
 from gfm_hil.studies.margin_figures import draw_delay, draw_region
 
@@ -29,6 +29,7 @@ def add(kinds: Any) -> None:
     )
     command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
     add_inner_option(command)
+    add_converter_option(command)
     where = command.add_mutually_exclusive_group(required=True)
     where.add_argument("--scenario", help="scenario file, or the name of a shipped one")
     where.add_argument("--run", type=Path, metavar="DIR", help="run folder: its scenario and delay")
@@ -41,31 +42,32 @@ def add(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Report the margins; exit code 3 for an unstable loop, which has none."""
-    run, changed = None, {"law": options.law, "inner": options.inner}
+    run, given = None, options.scenario
     if options.run is not None:
-        run = RecordedRun.load(options.run)
-        scenario = load_scenario(str(options.run / "scenario.toml"), OPTIONS, **changed)
-    else:
-        scenario = load_scenario(options.scenario, OPTIONS, **changed)
-    loop, label = scenario_loop(scenario)
+        run, given = RecordedRun.load(options.run), str(options.run / "scenario.toml")
+    scenario = chosen_scenario(given, options)
+    if options.figures and scenario.network is not None:
+        raise UserError("--figures: they are those of one converter on its line to the grid")
+    loop, label = scenario_loop(scenario, options.converter)
     console = terminal(highlight=False)
     try:
-        found = margins(loop)
+        ranges = margins(loop) if scenario.network is None else None
+        found = loop.margins() if ranges is None else ranges.loop
     except UnstableLoop as problem:
         return no_margins(label, scenario.title, problem, options.json)
-    margin = found.loop.delay.seconds
+    margin = found.delay.seconds
     set_s = float(loop.u_delay[0])
     measured = None if run is None else loop_delay(run, set_s, margin)
     region = _draw(options.figures, loop, label, margin) if options.figures else None
     if options.json:
         content = {"law": label, "scenario": scenario.title, "stable": True}
-        content |= as_json(found, set_s, measured)
+        content |= margins_as_json(found, ranges, set_s, measured)
         if region is not None:
             rows = {name: getattr(region, name).tolist() for name in ("L_g", "R_g", "sigma")}
             content["region"] = finite(rows)
         print(json.dumps(content, indent=2))
     else:
-        print_margins(console, label, scenario.title, found, set_s, measured)
+        print_margins(console, label, scenario.title, found, ranges, set_s, measured)
         if options.figures:
             console.print(f"figures: {options.figures}", soft_wrap=True)
     return 0

@@ -12,24 +12,28 @@ from rich.progress import BarColumn
 from gfm_design.tuning.paper_tune import EVALUATIONS
 from gfm_hil.cli.common import EXIT_OTHERWISE, progress
 from gfm_hil.cli.design.common import (
+    add_judged_on,
     add_law_options,
     channels_as_json,
     chosen_law,
     judged,
+    judged_on,
     print_channels,
     read_gains,
     singular_is_users,
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
+from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.design import NotTuned, Tuning, tune
 from gfm_hil.studies.law import Law
-from gfm_hil.studies.tuned_law import write_law
+from gfm_hil.studies.tuned_law import problem_name, write_law
 
 
 def add(kinds: Any) -> None:
     command = kinds.add_parser("tune", help="choose the free gains for the least gamma")
     add_law_options(command)
+    add_judged_on(command)
     command.add_argument("--seed", type=int, default=0, help="of the search")
     command.add_argument(
         "--evaluations", type=int, default=EVALUATIONS, help="of each start, before its polish"
@@ -40,6 +44,10 @@ def add(kinds: Any) -> None:
         help="the given start and random ones; 6, and one more a gain, if left out",
     )
     command.add_argument("--only", help="free gains to move, separated by commas; all by default")
+    command.add_argument(
+        "--decay", type=float, default=0.0, metavar="A",
+        help="every mode of the loop must decay at least this fast, 1/s",
+    )  # fmt: skip
     command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
     command.add_argument("-o", "--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -51,11 +59,13 @@ def call(options: argparse.Namespace) -> int:
     """Tune a law's free gains; exit code 3 if no stabilising ones are found."""
     if options.out and not Path(options.out).parent.is_dir():
         raise UserError(f"--out {options.out}: {Path(options.out).parent} is no folder")
-    law = Law(chosen_law(options))
+    law, on = Law(chosen_law(options)), judged_on(options)
+    if options.full_order and on is not None:
+        raise UserError("--full-order: the bound is that of the paper's problem; omit --scenario")
     if options.full_order and law.file.inner is not None:
         raise UserError("--full-order: the bound is that of a law on the bridge; use --inner none")
     try:
-        found = _searched(law, options)
+        found = _searched(law, on, options)
     except NotTuned as none:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
@@ -74,11 +84,12 @@ def call(options: argparse.Namespace) -> int:
     }
     said = _bound(found, result) if options.full_order else ""
     if options.out:
-        write_law(Path(options.out), law.file, named, result)
+        problem = None if on is None else problem_name(law.file, on, options.converter)
+        write_law(Path(options.out), law.file, named, result, problem=problem)
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
-    print_channels(judged(law.file), channels)
+    print_channels(judged(law.file, on, options.converter), channels)
     lines = [
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
@@ -89,7 +100,7 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _searched(law: Law, options: argparse.Namespace) -> Tuning:
+def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tuning:
     """The search, with a bar on stderr."""
     columns = "{task.description}", BarColumn(), "γ {task.fields[best]}"
     with progress(*columns, quiet=options.quiet) as bar:
@@ -103,6 +114,9 @@ def _searched(law: Law, options: argparse.Namespace) -> Tuning:
             start=read_gains(options.gains),
             only=None if options.only is None else options.only.split(","),
             weights=options.weights,
+            on=on,
+            converter=options.converter,
+            decay=options.decay,
             seed=options.seed,
             evaluations=options.evaluations,
             starts=options.starts,

@@ -1,0 +1,611 @@
+"""The closed loop of a network: all its converters, each under its law, around their common rest.
+
+The circuit is the one that the plant solves: ``gfm_plant.wiring`` gives its modes, and here each of
+them is two states, its real and its imaginary part. What a converter adds, its DC link, DC source
+and sensors, is that of ``linearise_plant``, since these see the currents and voltages in the
+converter's own frame, whatever the network is. Machines, a finite grid and loads of constant power
+have the states that the plant gives them.
+
+A turn of a whole island changes nothing in it. Its angles are therefore those against a reference:
+the grid, else the island's first converter, else its first machine. The angle of the reference
+itself acts on nothing and is no state of the loop.
+
+Each converter has its view of the network: a ``ClosedLoop`` whose plant is the network with all
+other converters under their laws. Its margins and its gamma are those of the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eig
+
+from gfm_design.model.closed_loop import INPUTS, ClosedLoop, Matrix, Response, response
+from gfm_design.model.inner import LinearStage, linearise_stage
+from gfm_design.model.linear import (
+    LinearLaw,
+    LinearPlant,
+    Mode,
+    delay_lines,
+    linearise_law,
+    linearise_plant,
+    sampled_plant,
+    swing_equation,
+)
+from gfm_design.model.operating_point import OperatingPoint, operating_points
+from gfm_design.norms.performance import StateSpace
+from gfm_plant import Network
+from gfm_plant.constant_power import PowerLoad
+from gfm_plant.model import V_DC
+from gfm_plant.records import N_OWN
+from gfm_plant.wiring import GRID_SOURCE
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
+from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw
+
+Complex = NDArray[np.complex128]
+
+GRID, LINES = "the grid", "lines and loads"
+"""The parts of a network that take part in modes besides converters, machines and loads of constant
+power."""
+
+_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
+_SAME = (
+    1e-6  # distance of poles that count as one, over 1 1/s + |s|: identical converters have such
+)
+_D = INPUTS[NY:]
+
+
+@dataclass(frozen=True)
+class NetworkMode(Mode):
+    """A mode of a network.
+
+    Attributes:
+        participation: of each part, largest first; they add up to 1. That of a part is
+            |sum of l_i r_i| over the states i of the part, with the mode's left and right
+            eigenvectors l and r, divided by the sum over all parts (Pérez-Arriaga, Verghese and
+            Schweppe, 1982). It does not depend on the coordinates that describe the part.
+    """
+
+    participation: Mapping[str, float] = field(default_factory=dict)
+
+    def plain(self) -> dict[str, Any]:
+        """As ``Mode.plain``, with the participation."""
+        return super().plain() | {"participation": dict(self.participation)}
+
+
+@dataclass(frozen=True)
+class Member:
+    """A converter of the network.
+
+    Attributes:
+        name: its own.
+        title: its name and that of its law.
+        law, stage: around the operating point.
+        op: the operating point.
+        ref: the references, shape (5,), p.u.
+        u, y: its places among the commands and the measurements of all.
+    """
+
+    name: str
+    title: str
+    law: LinearLaw
+    stage: LinearStage | None
+    op: OperatingPoint
+    ref: Matrix
+    u: slice
+    y: slice
+
+    @cached_property
+    def controller(self) -> LinearLaw:
+        """The law, and the inner stage if any, from the measurements to the commands."""
+        return self.law if self.stage is None else self.stage.around(self.law)
+
+    @property
+    def reads(self) -> list[tuple[int, int]]:
+        """Places of its omega_u among all commands and measurements, if a PLL reads it."""
+        pll = self.stage is not None and self.stage.has_pll
+        return [(self.u.start + OMEGA_ROW, self.y.start + OMEGA_COLUMN)] if pll else []
+
+
+@dataclass(frozen=True)
+class LinearNetwork:
+    """The network without its controllers: continuous, in deviations from its rest.
+
+    Attributes:
+        plant: with the commands and the measurements of all converters one after the other; C_true
+            is (5 N, n). Its last states are the angles of the islands' references.
+        turn: what a turn of each island by 1 rad does to the other states, (n - r, r) for r
+            islands.
+        parts: by the name of each part the matrix (n, n) that keeps the part's share of the states,
+            which are absolute angles here; the matrices add up to 1.
+    """
+
+    plant: LinearPlant
+    turn: Matrix
+    parts: dict[str, Matrix]
+
+    @property
+    def references(self) -> slice:
+        """Where the angles of the references are among the states."""
+        return slice(len(self.turn), sum(self.turn.shape))
+
+
+class NetworkLoop:
+    """All converters of a network under their laws, sampled, around their operating point.
+
+    Args:
+        network: without its controllers.
+        members: its converters.
+        T_s: sampling time, s.
+        u_delay: of each command, from the tick that samples y to the moment when it acts, s.
+    """
+
+    #: what a converter's view is
+    view: type[ClosedLoop] = ClosedLoop
+
+    def __init__(
+        self, network: LinearNetwork, members: Sequence[Member], T_s: float, u_delay: Matrix
+    ) -> None:
+        self.network, self.members, self.T_s = network, tuple(members), T_s
+        self.u_delay, self.y_delay = u_delay, np.zeros(len(network.plant.C))
+
+    @classmethod
+    def of(
+        cls,
+        plant: Network,
+        laws: Sequence[DiscreteLaw],
+        references: Sequence[Sequence[float] | Matrix],
+    ) -> Self:
+        """The loop of a network as it is when a run starts.
+
+        Args:
+            plant: fresh from ``gfm_plant.make_network``; it stays as it is.
+            laws: of each converter.
+            references: of each, (V_dcref, P_ref, omega_g, Q_ref, V_ref), p.u.
+
+        Raises:
+            NoEquilibrium: there is no operating point, or a limit of an inner stage acts there.
+        """
+        refs = [np.asarray(ref, float) for ref in references]
+        points, machines = operating_points(plant, laws, refs)
+        resting = plant.copy()
+        x, u = (np.array([getattr(op, name) for op in points]) for name in ("x", "commands"))
+        resting.start(x, u, machines)
+        T_s = float(plant.net[0]["T_s"])
+        members, delays, at_u, at_y = list[Member](), list[float](), 0, 0
+        each = zip(plant.wiring.units, plant.par, laws, refs, points, strict=True)
+        for unit, r, law, ref, op in each:
+            inner = law.law.inner
+            stage = linearise_stage(inner, T_s, float(r["omega_b"]), op) if inner else None
+            linear = linearise_law(law.law, law, op, ref, bool(r["i_u_gain"] != 0.0))
+            n_u, n_y = (NU, NY) if stage is None else (NU_INNER, NY_INNER)
+            places = slice(at_u, at_u + n_u), slice(at_y, at_y + n_y)
+            title = f"{unit.name} ({law.law.name})"
+            members.append(Member(unit.name, title, linear, stage, op, ref, *places))
+            delays += [float(r["delay"] + r["fraction"]) * T_s] * n_u
+            at_u, at_y = at_u + n_u, at_y + n_y
+        return cls(linearise_network(resting, members), members, T_s, np.array(delays))
+
+    def __repr__(self) -> str:
+        titles = ", ".join(member.title for member in self.members)
+        return f"<{type(self).__name__} {titles}, T_s = {self.T_s:g} s, A {self.A.shape}>"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the converters."""
+        return tuple(member.name for member in self.members)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs: the references of each converter, as A.P_ref, and the grid."""
+        return (*(f"{m.name}.{ref}" for m in self.members for ref in INPUTS[:NY]), *_D)
+
+    def converter(self, name: str) -> ClosedLoop:
+        """The loop of one converter, whose plant is the network with all others under their laws.
+
+        Raises:
+            ValueError: no such converter.
+        """
+        if name not in self.names:
+            raise ValueError(f"{name!r} is no converter of the network; use one of {self.names}")
+        place = self.names.index(name)
+        one, whole = self.members[place], self._steady(self.network.plant)
+        around = _Others(self, place)
+        delays = self.u_delay[one.u], self.y_delay[one.y]
+        plant = around.seen(whole)
+        return self.view(plant, one.law, self.T_s, *delays, stage=one.stage, around=around)
+
+    # matrices
+
+    def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
+        """The network from tick to tick with its delay lines, without controllers; the angles of
+        the references stay where they are.
+
+        Args:
+            u_delay, y_delay: of each command and each measurement, s.
+        """
+        reads = [pair for member in self.members for pair in member.reads]
+        return sampled_plant(self.network.plant, self.T_s, u_delay, y_delay, reads)
+
+    @cached_property
+    def _held(self) -> LinearPlant:
+        return self.held(self.u_delay, self.y_delay)
+
+    @cached_property
+    def A(self) -> Matrix:
+        """The loop's matrix, shape (n, n)."""
+        return _closed(self._steady(self._held), self.members)
+
+    @cached_property
+    def state_space(self) -> StateSpace:
+        """(A, B, C, D) from ``inputs`` to y = (v_dc, p, omega_u, q, V) of each converter, one after
+        the other, before the sensors."""
+        p, A = self._steady(self._held), self.A
+        n, N = len(p.A), len(self.members)
+        B, C = np.zeros((len(A), NY * N + len(_D))), np.zeros((NY * N, len(A)))
+        D = np.zeros((NY * N, B.shape[1]))
+        B[:n, NY * N :], C[:, :n] = p.B_d, p.C_true
+        for k, (m, own) in enumerate(zip(self.members, _states(n, self.members), strict=True)):
+            c, refs, speed = m.controller, slice(NY * k, NY * (k + 1)), NY * k + OMEGA_COLUMN
+            B[:n, refs], B[own, refs] = p.B[:, m.u] @ c.D_r, c.B_r
+            C[speed, :n], C[speed, own] = c.D[OMEGA_ROW] @ p.C[m.y], c.C[OMEGA_ROW]
+            D[speed, refs] = c.D_r[OMEGA_ROW]
+        return A, B, C, D
+
+    def _steady(self, plant: LinearPlant) -> LinearPlant:
+        """The plant without the angles of the references, on which nothing depends."""
+        kept = np.delete(np.arange(len(plant.A)), self.network.references)
+        A, B, B_d = plant.A[np.ix_(kept, kept)], plant.B[kept], plant.B_d[kept]
+        return LinearPlant(A, B, B_d, plant.C[:, kept], plant.C_true[:, kept])
+
+    # results
+
+    def sigma(self) -> float:
+        """Largest real part of any mode, 1/s."""
+        return float(np.log(np.abs(np.linalg.eigvals(self.A)).max()) / self.T_s)
+
+    def poles(self) -> Response:
+        """Poles as s = log(z)/T_s, 1/s, without those of the delay lines."""
+        values = np.linalg.eigvals(self.A).astype(complex)
+        return np.asarray(np.log(values[np.abs(values) > _GONE]) / self.T_s)
+
+    def modes(self) -> list[NetworkMode]:
+        """The modes and the parts that take part in each, the least damped (largest sigma) first.
+
+        The eigenvectors of equal poles are not determined: such modes get the mean of their
+        participations.
+        """
+        values, left, right = eig(self.A, left=True, right=True)
+        there = np.abs(values) > _GONE
+        values, left, right = values[there], left[:, there], right[:, there]
+        s = np.log(values) / self.T_s
+        found, done = list[NetworkMode](), s.imag < 0.0
+        for k in range(len(s)):
+            if done[k]:
+                continue
+            equal = np.abs(s - s[k]) <= _SAME * (1.0 + abs(s[k]))
+            r, rows = right[:, equal], left[:, equal].conj().T
+            shares = self._participation(values[k], np.linalg.solve(rows @ r, rows), r)
+            modes = [Mode.of(one) for one in s[equal & ~done]]
+            found += [NetworkMode(m.sigma, m.frequency_hz, shares) for m in modes]
+            done |= equal
+        return sorted(found, key=lambda mode: -mode.sigma)
+
+    def _participation(self, z: complex, left: Complex, right: Complex) -> dict[str, float]:
+        """The share of each part, from rows of left and columns of right eigenvectors of z."""
+        turning = self.network.references
+        drift = np.delete(self._drift, turning, axis=1)
+        by_turn = drift @ right / (z - 1.0) if abs(z - 1.0) > 1e-12 else 0.0 * (drift @ right)
+        n = turning.start
+        by_parts = dict.fromkeys(self.network.parts, 0j)
+        states = np.concatenate([right[:n] + self.network.turn @ by_turn, by_turn])
+        rows = np.hstack([left[:, :n], -left[:, :n] @ self.network.turn])
+        for name, part in self.network.parts.items():
+            by_parts[name] += np.trace(rows @ part @ states)
+        for k, name in enumerate(self._owners, n):
+            by_parts[name] += left[:, k] @ right[k]
+        sizes = {name: float(abs(share)) for name, share in by_parts.items()}
+        total = sum(sizes.values())
+        return {name: sizes[name] / total for name in sorted(sizes, key=lambda name: -sizes[name])}
+
+    @cached_property
+    def _drift(self) -> Matrix:
+        """How the angles of the references go on in a tick, by all states and themselves."""
+        return _closed(self._held, self.members)[self.network.references]
+
+    @cached_property
+    def _owners(self) -> list[str]:
+        """The converter that each state behind those of ``network`` belongs to."""
+        lines = delay_lines(self.network.plant, self.T_s, self.u_delay, self.y_delay)
+        of_u = [m.name for m in self.members for _ in range(m.u.start, m.u.stop)]
+        of_y = [m.name for m in self.members for _ in range(m.y.start, m.y.stop)]
+        owners = [n for n, count in zip([*of_u, *of_y], lines, strict=True) for _ in range(count)]
+        owners += [m.name for m in self.members for _ in m.reads]
+        return owners + [m.name for m in self.members for _ in m.controller.A]
+
+    def step_response(self, of: str, seconds: float = 1.0) -> tuple[Matrix, dict[str, Matrix]]:
+        """(t, y of each converter by its name) after a unit step of one of ``inputs``.
+
+        t (K,) is every tick, s; y (K, 5) = (v_dc, p, omega_u, q, V) are deviations in p.u. of the
+        converter, before its sensors, and exact.
+
+        Raises:
+            ValueError: no such input.
+        """
+        if of not in self.inputs:
+            raise ValueError(f"{of!r} is no input of the network; use one of {list(self.inputs)}")
+        A, B, C, D = self.state_space
+        k = self.inputs.index(of)
+        t = np.asarray(self.T_s * np.arange(round(seconds / self.T_s) + 1), np.float64)
+        x, y = np.zeros(len(A)), np.empty((len(t), len(C)))
+        for row in y:
+            row[:] = C @ x + D[:, k]
+            x = A @ x + B[:, k]
+        each = np.split(y, len(self.members), axis=1)
+        return t, dict(zip(self.names, each, strict=True))
+
+    def frequency_response(self, omega: ArrayLike) -> Response:
+        """From ``inputs`` to y of all converters at omega [rad/s] (K,), shape (K, 5 N, 5 N + 2)."""
+        return response(self.state_space, np.exp(1j * np.asarray(omega, float) * self.T_s))
+
+
+@dataclass(frozen=True)
+class _Others:
+    """The network around one converter; see ``closed_loop.Surroundings``."""
+
+    loop: NetworkLoop
+    place: int
+
+    @property
+    def name(self) -> str:
+        return self.loop.members[self.place].title
+
+    @property
+    def op(self) -> OperatingPoint:
+        return self.loop.members[self.place].op
+
+    @property
+    def ref(self) -> Matrix:
+        return self.loop.members[self.place].ref
+
+    def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
+        loop, one = self.loop, self.loop.members[self.place]
+        u, y = loop.u_delay.copy(), loop.y_delay.copy()
+        u[one.u], y[one.y] = u_delay, y_delay
+        p = loop._steady(loop.held(u, y))
+        A = _closed(p, [m for m in loop.members if m is not one])
+        more = ((0, len(A) - len(p.A)), (0, 0))
+        B, B_d = np.pad(p.B, more), np.pad(p.B_d, more)
+        C, C_true = (np.pad(m, more[::-1]) for m in (p.C, p.C_true))
+        return self.seen(LinearPlant(A, B, B_d, C, C_true))
+
+    def seen(self, p: LinearPlant) -> LinearPlant:
+        """A plant of all with the commands and measurements of this converter alone."""
+        one, own = self.loop.members[self.place], slice(NY * self.place, NY * (self.place + 1))
+        return LinearPlant(p.A, p.B[:, one.u], p.B_d, p.C[one.y], p.C_true[own])
+
+
+def _states(n: int, members: Sequence[Member]) -> list[slice]:
+    """Where the states of each controller are, behind n of the plant."""
+    ends = n + np.cumsum([0, *(len(m.controller.A) for m in members)])
+    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+
+def _closed(p: LinearPlant, members: Sequence[Member]) -> Matrix:
+    """The matrix of a sampled plant with the loops of some converters closed."""
+    n, places = len(p.A), _states(len(p.A), members)
+    A = np.zeros((places[-1].stop,) * 2) if places else np.zeros((n, n))
+    A[:n, :n] = p.A
+    for m, own in zip(members, places, strict=True):
+        c, B, C = m.controller, p.B[:, m.u], p.C[m.y]
+        A[:n, :n] += B @ c.D @ C
+        A[:n, own], A[own, :n], A[own, own] = B @ c.C, c.B @ C, c.A
+    return A
+
+
+def linearise_network(plant: Network, members: Sequence[Member]) -> LinearNetwork:
+    """A network at rest, as ``Network.start`` leaves it, around that rest."""
+    return _Writing(plant, members).written()
+
+
+class _Writing:
+    """The network's matrices while they are written, in absolute angles.
+
+    The states are the modes of the circuit, their real parts and then their imaginary parts; of
+    each converter its angle and what ``linearise_plant`` has from v_dc on; of each machine angle,
+    speed and power of the turbines; of a finite grid the same, of an ideal one the angle; of each
+    load of constant power the two parts of the voltage that it has measured. Each island is seen
+    from a frame that turns at its speed at rest.
+    """
+
+    def __init__(self, plant: Network, members: Sequence[Member]) -> None:
+        wiring, now, N = plant.wiring, plant.now[0], len(members)
+        self.plant, self.members, self.omega_b = plant, members, wiring.omega_b
+        self.modes, self.sources = wiring.modes(wiring.blocked, False)
+        self.loads = [load for load in plant.loads if load.name not in wiring.opened]
+        self.w = _complex(now["w"][: len(wiring.order)])
+        at_node = {m.name: unit.node for m, unit in zip(members, wiring.units, strict=True)}
+        at_node |= {machine.name: machine.node for machine in wiring.machines}
+        sizes = [1 + len(self._alone(k).A) - V_DC for k in range(N)] + [3] * len(wiring.machines)
+        speeds = [float(m.op.u[OMEGA_ROW]) for m in members]
+        speeds += [float(omega) for omega in now["omega"][1 : 1 + len(wiring.machines)]]
+        unit = [*now["unit"][:N], *now["unit"][N + 2 : N + 2 + len(wiring.machines)]]
+        if wiring.grid is not None and wiring.closed:
+            at_node[GRID] = wiring.grid
+            sizes.append(3 if plant.net[0]["H"][0] > 0.0 else 1)
+            speeds.append(float(now["omega_g"]))
+            unit.append(now["unit"][N])
+        #: of each part that turns: its island and its unit phasor; its angle is its first state
+        self.islands = wiring.islands()
+        self.island = {name: self._island(node) for name, node in at_node.items()}
+        self.unit = dict(zip(at_node, _complex(np.array(unit)), strict=True))
+        self.speed = np.ones(len(self.islands))  # p.u.; that of a dead one does not matter
+        self.speed[list(self.island.values())] = speeds
+        owners = [*at_node, *(load.name for load in self.loads)]
+        ends = 2 * len(self.modes.rates) + np.cumsum([0, *sizes, *[2] * len(self.loads)])
+        self.z = slice(0, int(ends[0]))
+        self.at = {
+            n: slice(int(a), int(b)) for n, (a, b) in zip(owners, pairwise(ends), strict=True)
+        }
+        of_w = {name: (u.name, u.node) for u in wiring.units for name in u.states}
+        of_w |= {branch.name: (LINES, branch.start) for branch in wiring.branches}
+        of_w |= {bank.name: (LINES, bank.node) for bank in wiring.capacitors}
+        of_w |= {machine.name: (machine.name, machine.node) for machine in wiring.machines}
+        self.owner_of_w = [of_w[name][0] for name in wiring.order]
+        self.island_of_w = np.array([self._island(of_w[name][1]) for name in wiring.order])
+        self.n = int(ends[-1])
+        self.A, self.B_d = np.zeros((self.n, self.n)), np.zeros((self.n, len(_D)))
+        self.B = np.zeros((self.n, members[-1].u.stop))
+        self.C, self.C_true = np.zeros((members[-1].y.stop, self.n)), np.zeros((NY * N, self.n))
+
+    def _island(self, node: str) -> int:
+        return next(k for k, nodes in enumerate(self.islands) if node in nodes)
+
+    def _alone(self, k: int) -> LinearPlant:
+        """Converter k on a line to a grid: its DC link, DC source and sensors are those here."""
+        op, inner = self.members[k].op, self.members[k].stage is not None
+        return linearise_plant(self.plant.par[k : k + 1], op, float(op.u[OMEGA_ROW]), inner=inner)
+
+    def written(self) -> LinearNetwork:
+        wiring, net, now = self.plant.wiring, self.plant.net[0], self.plant.now[0]
+        slip = self.omega_b * (self.speed[self.island_of_w] - 1.0)
+        turns = self.modes.modes @ (1j * slip[:, None] * self.modes.states)
+        self.A[self.z, self.z] = _real(np.diag(self.modes.rates) - turns)
+        for k, member in enumerate(self.members):
+            self._converter(k, member)
+        for j, machine in enumerate(wiring.machines, 1):
+            E, given = float(net["E"][j]), np.zeros(len(self.w))
+            given[wiring.order.index(machine.name)] = E
+            self._source(machine.emf, machine.name, E)
+            self._swing(j, machine.name, -given)
+        if GRID in self.at:
+            V_g, brought = float(now["V_g"]), net["to_grid"][: len(self.w)]
+            by_V = self._source(GRID_SOURCE, GRID, V_g)
+            self.B_d[self.z, 1] = _parts(by_V)
+            angle = self.at[GRID].start
+            if net["H"][0] > 0.0:
+                self._swing(0, GRID, V_g * brought)
+                power = (self.unit[GRID].conjugate() * (brought @ self.w)).real
+                self.B_d[angle + 1, 1] = power / (2 * net["H"][0] * net["S"][0])
+            else:
+                self.B_d[angle, 0] = self.omega_b
+        for j, load in enumerate(self.loads):
+            self._load(load, int(net["voltage_at"][j]), complex(*now["v_sink"][j]))
+        return self._against_references()
+
+    def _source(self, source: str, part: str, e: complex) -> Complex:
+        """Write what the angle of a source of voltage e in its own frame does to the circuit;
+        returns what a voltage along its d axis does to the modes."""
+        by_e = self.modes.drive[:, self.sources.index(source)] * self.unit[part]
+        self.A[self.z, self.at[part].start] = _parts(1j * e * by_e)
+        return np.asarray(by_e)
+
+    def _converter(self, k: int, member: Member) -> None:
+        alone, r, own = self._alone(k), self.plant.par[k], self.at[member.name]
+        by_e = self._source(self.plant.wiring.units[k].bridge, member.name, member.op.e)
+        for j, axis in enumerate((1.0, 1j)[: len(range(member.u.start + 2, member.u.stop))]):
+            self.B[self.z, member.u.start + 2 + j] = _parts(axis * by_e)
+        self.B[own.start, member.u.start + OMEGA_ROW] = self.omega_b
+        # the states that the converter alone has, by those here
+        seen = np.zeros((len(alone.A), self.n))
+        back = self.unit[member.name].conjugate()
+        for j, scale in enumerate((r["current"], 1.0, r["current"])):
+            rows = slice(2 * j, 2 * j + 2)
+            seen[rows, self.z] = _rows(scale * back * self.modes.states[N_OWN * k + j])
+            seen[rows, own.start] = _parts(-1j * np.array([complex(*member.op.x[rows])]))
+        rest = slice(own.start + 1, own.stop)
+        seen[V_DC:, rest] = np.eye(len(alone.A) - V_DC)
+        self.A[rest] = alone.A[V_DC:] @ seen
+        self.B[rest, member.u] = alone.B[V_DC:]
+        self.C[member.y], self.C_true[NY * k : NY * (k + 1)] = alone.C @ seen, alone.C_true @ seen
+
+    def _swing(self, j: int, part: str, comes: Matrix) -> None:
+        """Write swing equation j; ``comes`` @ w is the current whose power comes to the part, times
+        its voltage."""
+        net, angle = self.plant.net[0], self.at[part].start
+        own, per_power = swing_equation(
+            *(float(net[x][j]) for x in ("H", "D", "droop", "T_gov", "S"))
+        )
+        back = self.unit[part].conjugate()
+        self.A[angle, angle + 1] = self.omega_b
+        self.A[angle + 1, self.z] = per_power * _rows(back * (comes @ self.modes.states))[0]
+        self.A[angle + 1, angle] = per_power * (back * (comes @ self.w)).imag
+        self.A[angle + 1 : angle + 3, angle + 1 : angle + 3] = own
+
+    def _load(self, load: PowerLoad, at_w: int, f: complex) -> None:
+        """Write a load of constant power, which has measured the voltage f."""
+        own, V = self.at[load.name], abs(f)
+        slip = self.omega_b * (self.speed[self.island_of_w[at_w]] - 1.0)
+        self.A[own, self.z] = _rows(self.modes.states[at_w]) / load.tau
+        self.A[own, own] = _real(np.array([[-1.0 / load.tau - 1j * slip]]))
+        turn = _real(np.array([[f / V if V > 0.0 else 1.0]]))
+        by_f = turn @ load.admittance(V, 0.0).real @ turn.T
+        drive = self.modes.drive[:, [self.sources.index(load.name)]]
+        self.A[self.z, own] = _real(drive) @ by_f
+
+    def _against_references(self) -> LinearNetwork:
+        """Angles against those of the islands' references, which come last."""
+        references, turns = list[int](), list[Matrix]()
+        for k in range(len(self.islands)):
+            those = [name for name, island in self.island.items() if island == k]
+            if not those:
+                continue  # nothing turns in a dead part
+            reference = GRID if GRID in those else those[0]
+            references.append(self.at[reference].start)
+            r = np.zeros(self.n)
+            r[[self.at[name].start for name in those]] = 1.0
+            r[self.z] = _parts(1j * self.modes.modes @ (self.w * (self.island_of_w == k)))
+            for j, load in enumerate(self.loads):
+                if self.island_of_w[self.plant.net[0]["voltage_at"][j]] == k:
+                    f = complex(*self.plant.now[0]["v_sink"][j])
+                    r[self.at[load.name]] = _parts(np.array([1j * f]))
+            turns.append(r)
+        kept = np.delete(np.arange(self.n), references)
+        order, turn = np.concatenate([kept, references]), np.array(turns).T[kept]
+        A, B, B_d = (m[order] for m in (self.A, self.B, self.B_d))
+        A, last = A[:, order], slice(len(kept), self.n)
+        for m in (A, B, B_d):
+            m[: len(kept)] -= turn @ m[last]
+        C, C_true = self.C[:, order], self.C_true[:, order]
+        for m in (A, C, C_true):
+            m[:, last] = 0.0  # but for rounding
+        names = [*self.at, LINES]
+        if self.plant.net[0]["H"][0] == 0.0 and GRID in names:
+            names.remove(GRID)  # an ideal grid takes part in nothing
+        parts = {name: self._share(name)[np.ix_(order, order)] for name in names}
+        return LinearNetwork(LinearPlant(A, B, B_d, C, C_true), turn, parts)
+
+    def _share(self, part: str) -> Matrix:
+        """The matrix that keeps the part's own share of the states."""
+        share = np.zeros((self.n, self.n))
+        own = np.array([owner == part for owner in self.owner_of_w], float)
+        share[self.z, self.z] = _real(self.modes.modes @ (own[:, None] * self.modes.states))
+        if part in self.at:
+            share[self.at[part], self.at[part]] = np.eye(self.at[part].stop - self.at[part].start)
+        return share
+
+
+def _complex(pairs: Matrix) -> Complex:
+    """Complex numbers from pairs of reals."""
+    return np.asarray(pairs[:, 0] + 1j * pairs[:, 1])
+
+
+def _parts(v: Complex) -> Matrix:
+    """Real parts, then imaginary parts."""
+    return np.concatenate([v.real, v.imag])
+
+
+def _rows(v: Complex) -> Matrix:
+    """Real and imaginary part of v @ z as rows over the parts of z."""
+    return np.array([np.concatenate([v.real, -v.imag]), np.concatenate([v.imag, v.real])])
+
+
+def _real(M: Complex) -> Matrix:
+    """A complex matrix as one over the parts."""
+    return np.block([[M.real, -M.imag], [M.imag, M.real]])
