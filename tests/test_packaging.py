@@ -32,6 +32,7 @@ RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 BESIDE_THE_LOOP = {
     **{key: {"pydantic"} for key in ("lawfile.py", "mistakes.py", "inner_file.py")},
     "toml_file.py": {"pydantic", "pydantic_core"},
+    "elf.py": {"elftools"},  # the extra "calibration"
 }
 SOURCES = [
     *FOLDERS.values(),

@@ -59,7 +59,7 @@ def test_a_transformer_and_a_second_inductor_are_drawn(make: Make) -> None:
     assert "T\nS 2, X 0.12, R 0, $X_m$ 100" in shown and "$L_2$ 0.08\n$R_2$ 0.01" in shown
     assert breakers(scenario) == [True, False]
     outlines = [p for p in fill_diagram(Figure(), scenario).patches if isinstance(p, Circle)]
-    assert sum(p.get_radius() == 0.24 and not p.fill for p in outlines) == 2
+    assert sum(p.get_radius() == 0.24 and p.get_facecolor()[3] == 0.0 for p in outlines) == 2
     alone = make(plant={"lcl": {"L": 0.08}, "grid": {"scr": 4.0, "x_over_r": 3.0}}, events=[FAULT])
     assert "$L_2$ 0.08\n$R_2$ 0\n$L_g$ 0.237\n$R_g$ 0.079\nSCR 4" in texts(alone)
     lg = {**FAULT, "kind": "LG", "phases": "c"}
