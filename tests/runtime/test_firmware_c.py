@@ -15,6 +15,7 @@ from gfm_hil.cli import main
 from gfm_runtime import get_law, load_law
 from gfm_runtime.firmware import (
     CHECKED,
+    FIXED,
     REALS,
     STYLES,
     check,
@@ -143,13 +144,17 @@ def test_no_rule_of_misra_is_broken_but_those_of_the_page(tmp_path: Path) -> Non
         ("unrolled", "float64", staged),
         ("records", "float64", {name: LAWS[name] for name in SOME}),
         ("records", "float32", staged),
+        ("unrolled", FIXED, {name: LAWS[name] for name in SOME}),
     ):
         folder = tmp_path / f"{style}-{real}"
         folder.mkdir()
         exported(folder, real, style, of=laws)
-        scheduled = ["firmware", "export", "mimo-gfm-scheduled", "--style", style, "--real", real]
-        assert main([*scheduled, "-o", str(folder / "scheduled")]) == 0
-        for at in (folder, folder / "scheduled"):
+        folders = [folder]
+        if real != FIXED:
+            scheduled = ["mimo-gfm-scheduled", "--style", style, "--real", real]
+            folders.append(folder / "scheduled")
+            assert main(["firmware", "export", *scheduled, "-o", str(folders[-1])]) == 0
+        for at in folders:
             files = sorted(p.name for p in at.glob("gfm*.c"))
             done = cc(at, *check_it, *files, compiler="cppcheck")
             assert done.returncode == 0 and "noValidConfiguration" not in done.stderr
@@ -214,7 +219,11 @@ def test_what_would_change_bits_does_not_compile(folders: Any, flag: str, why: s
 
 def test_the_pages_examples_compile(tmp_path: Path) -> None:
     page = (PAGES / "firmware.md").read_text(encoding="utf-8")
-    plain, with_stage = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    plain, in_integers, with_stage = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    exported(tmp_path, FIXED, "unrolled", "vsg-1")
+    (tmp_path / "integers.txt").write_text(in_integers)
+    done = cc(tmp_path, *STRICT, "-fsyntax-only", "-x", "c", "integers.txt")
+    assert (done.returncode, done.stderr) == (0, "")
     exported(tmp_path, "float32", "unrolled", "vsg-1")
     law = load_law("vsg-2", "cascaded").laws[0]
     exported(tmp_path, "float32", "unrolled", of={"vsg-2": law})

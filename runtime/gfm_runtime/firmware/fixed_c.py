@@ -79,7 +79,7 @@ def _keys(m: Module) -> dict[str, str]:
                 ",\n".join(f"    {guard}_Q_{name} = {q}" for name, q in qs),
                 "};",
                 "",
-                f"enum {{ {guard}_NREST = 2 * {guard}_NU + {law.n} }};",
+                f"enum {{ {guard}_NREST = {2 * NU + law.n} }};",
             ]
         ),
         "TICK": _tick(law),
