@@ -29,10 +29,10 @@ from gfm_hil.studies.conformity.diff import Results, compare_results, read_resul
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test
 from gfm_hil.telemetry.follow import Follower
 from gfm_runtime import LawError, discretise, get_law, load_law
-from gfm_runtime.firmware import STYLES, golden, make_modules
+from gfm_runtime.firmware import STYLES, elf_a2l, golden, make_modules
 from gfm_runtime.firmware.report import read_report, reports
 
-from .conftest import Parser, Take
+from .conftest import CORPUS, Parser, Take
 from .mutations import blobs, texts
 
 CATALOGUE = Path(load_law.__code__.co_filename).parent / "laws"
@@ -414,11 +414,26 @@ def _profile(folder: Path) -> Iterator[Take]:
     yield take
 
 
+@contextlib.contextmanager
+def _elf(place: Path) -> Iterator[Take]:
+    file = place / "program.elf"
+
+    def take(content: bytes) -> None:
+        file.write_bytes(content)
+        with contextlib.suppress(LawError):
+            text, measured, calibrated = elf_a2l(file)
+            assert text.count("/begin MEASUREMENT") == measured
+            assert text.count("/begin CHARACTERISTIC") == calibrated
+
+    yield take
+
+
 FILES = (
     Parser("profile", _profile, lambda: texts([PROFILE])),
     Parser("scenario", _scenario, lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS])),
     Parser("law", _law, lambda: texts(_shipped(CATALOGUE))),
     Parser("firmware", _firmware, lambda: texts(_reports())),
+    Parser("elf", _elf, lambda: blobs([(CORPUS / "elf" / "vsg_2_records").read_bytes()])),
     Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
     Parser("conformity", _conformity, _conformity_files),
     Parser("conformity_results", _conformity_results, lambda: texts([RESULTS])),

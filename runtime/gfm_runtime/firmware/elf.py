@@ -25,6 +25,7 @@ _INSTANCE = re.compile(r"gfm(_\w+)?_t")
 _RECORD = "gfm_law_t"
 _REAL = re.compile(r"gfm(_\w+)?_real")
 _MOST_ELEMENTS = 64  # of an array of instances
+_MOST_LINKS = 64  # from a variable to its type: more of them go in a circle
 _FLOATS = {4: "FLOAT32_IEEE", 8: "FLOAT64_IEEE"}
 _SIGNED = {1: "SBYTE", 2: "SWORD", 4: "SLONG", 8: "A_INT64"}
 _UNSIGNED = {1: "UBYTE", 2: "UWORD", 4: "ULONG", 8: "A_UINT64"}
@@ -133,7 +134,7 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
     Raises:
         LawError: as ``elf_a2l``.
     """
-    from elftools.common.exceptions import DWARFError, ELFError
+    from elftools.common.exceptions import ELFError
     from elftools.elf.elffile import ELFFile
 
     where = str(path)
@@ -149,12 +150,12 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
                 for entry in _entries(place, kind):
                     found.setdefault(entry.name, entry)
             big_endian = not elf.little_endian
-    except (ELFError, DWARFError) as problem:
+    except (LawError, OSError):
+        raise
+    except ELFError as problem:
         raise LawError(where, f"is no readable ELF file: {problem}") from None
-    except (KeyError, ValueError, IndexError, AttributeError, TypeError, RecursionError) as problem:
-        if isinstance(problem, LawError):
-            raise
-        raise LawError(where, f"its debug information is damaged: {problem!r}") from None
+    except Exception as problem:  # pyelftools raises anything for what is damaged
+        raise LawError(where, f"is damaged: {problem!r}") from None
     if not found:
         raise LawError(where, "has no variable of an exported law (gfm_..._t, gfm_law_t)")
     return sorted(found.values(), key=lambda entry: entry.address), big_endian
@@ -167,20 +168,22 @@ def _variables(dwarf: Any) -> Iterator[tuple[_Place, _Type]]:
             if die.tag != "DW_TAG_variable" or "DW_AT_location" not in die.attributes:
                 continue
             address = _address(dwarf, unit, die.attributes["DW_AT_location"])
-            said = die
-            while "DW_AT_name" not in said.attributes:
-                link = next(
-                    (a for a in ("DW_AT_specification", "DW_AT_abstract_origin")
-                     if a in said.attributes), None,
-                )  # fmt: skip
-                if link is None:
-                    break
-                said = said.get_DIE_from_attribute(link)
+            said = _declared(die)
             if address is None or "DW_AT_name" not in said.attributes:
                 continue
             name, kind = _name(said), _type(said)
             if kind is not None:
                 yield _Place(name, name, address, kind.fixed), kind
+
+
+def _declared(die: Any) -> Any:
+    """The DIE that has a variable's name: itself, or that of its declaration."""
+    for _ in range(_MOST_LINKS):
+        links = [a for a in ("DW_AT_specification", "DW_AT_abstract_origin") if a in die.attributes]
+        if "DW_AT_name" in die.attributes or not links:
+            break
+        die = die.get_DIE_from_attribute(links[0])
+    return die
 
 
 def _address(dwarf: Any, unit: Any, location: Any) -> int | None:
@@ -207,7 +210,9 @@ def _type(die: Any) -> _Type | None:
     """The type of a variable, member or array, or None for one without (void)."""
     names: list[str] = []
     fixed, shape = False, tuple[int, ...]()
-    while "DW_AT_type" in die.attributes:
+    for _ in range(_MOST_LINKS):
+        if "DW_AT_type" not in die.attributes:
+            break
         die = die.get_DIE_from_attribute("DW_AT_type")
         if die.tag == "DW_TAG_typedef":
             names.append(_name(die))
