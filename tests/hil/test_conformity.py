@@ -577,6 +577,22 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(
     assert "has no function Model_GetInfo" in refused.failures[0]
 
 
+@pytest.mark.compilers
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("target", ["host", pytest.param("m4f", marks=pytest.mark.apt)])
+def test_the_firmware_of_a_law_gets_the_verdicts_of_the_law(lab: Path, target: str) -> None:
+    name = f"pil:{target}"
+    found = gfmhil.conform("vsg-2", lab, inner="virtual-stator", controller=name)
+    assert found.laws == ["vsg-2", name] and found.passed
+    (law,), (firmware,) = (found.of(of, "lab/jump") for of in ("vsg-2", name))
+    for one, other in zip(law.verdicts, firmware.verdicts, strict=True):
+        assert other.value == pytest.approx(one.value, abs=1e-3)
+    with pytest.raises(UserError, match="takes no map"):
+        gfmhil.conform("vsg-2", lab, controller=name, ports="map.toml")
+    with pytest.raises(UserError, match="controller pil:z80: must be pil: and one of"):
+        gfmhil.conform("vsg-2", lab, controller="pil:z80")
+
+
 def nfp_of(**more: Any) -> Nfp:
     found = one("nfp", from_hz=0.1, to_hz=50.0, **more)
     assert isinstance(found, Nfp)

@@ -68,7 +68,8 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--controller", metavar="KIND:FILE",
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: a controller to test, with or without "
-        "laws beside it; it begins at the operating point of the first law",
+        "laws beside it; it begins at the operating point of the first law; or pil:TARGET, the "
+        "first law as firmware on a processor in QEMU",
     )  # fmt: skip
     add_map(command, "--controller")
     command.add_argument(

@@ -209,7 +209,8 @@ def conform(
         inner: inner stage of every law; each law's own if None.
         converter: file of the converter under test; the shipped one if None.
         controller: a model to test beside the laws, ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``. It
-            begins at the operating point of the first law, or of ``mimo-gfm`` without any.
+            begins at the operating point of the first law, or of ``mimo-gfm`` without any. Or
+            ``pil:TARGET``: that law as firmware on a processor.
         ports: file of the map of the model's ports.
         workers: as for ``campaign``.
 

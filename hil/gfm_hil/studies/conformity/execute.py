@@ -13,7 +13,7 @@ from pathlib import Path
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
-from gfm_hil.models import model_file, read_map
+from gfm_hil.models import FORMS, PIL, model_file, precision, read_map
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import (
     model_command,
@@ -41,7 +41,8 @@ class Foreign:
     """A model as the controller, in place of a law.
 
     Attributes:
-        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``.
+        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, or ``pil:TARGET`` for the law itself as
+            firmware on a processor.
         ports: file of the map of its ports.
     """
 
@@ -50,11 +51,13 @@ class Foreign:
 
     @property
     def name(self) -> str:
-        """What reports call it: its kind and the name of its file.
+        """What reports call it: its kind and the name of its file, or of its target.
 
         Raises:
             UserError: there is no such file.
         """
+        if self.model.startswith(PIL):
+            return self.model
         kind, path = model_file(self.model)
         return f"{kind}:{path.name}"
 
@@ -144,7 +147,12 @@ def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign |
         if ports is not None:
             raise UserError(f"map {ports}: is of a controller; name it too")
         return None
-    kind, path = model_file(model)
+    if model.startswith(PIL):
+        if ports is not None:
+            raise UserError(f"map {ports}: {model} has our signals, and takes no map")
+        precision(model)
+        return Foreign(model)
+    kind, path = model_file(model, FORMS)
     file = None if ports is None else Path(ports).absolute()
     read_map(file)
     return Foreign(f"{kind}:{path}", file)
