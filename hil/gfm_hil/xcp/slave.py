@@ -1,4 +1,4 @@
-"""The XCP slave: commands in, responses out (ASAM MCD-1 XCP 1.x, parts 2 and 3, UDP/IP).
+"""The XCP slave: commands in, responses out (ASAM MCD-1 XCP 1.x, part 2; UDP/IP of part 3).
 
 It has the commands with which a tool measures by polling and calibrates; DAQ lists, seed and key,
 pages and programming are not there, and are answered by ERR_CMD_UNKNOWN. One master at a time.
@@ -20,7 +20,7 @@ from gfm_hil.xcp.memory import (
     Refused,
 )
 
-MOST = 255  # bytes of a command and of a response: MAX_CTO
+MOST = 255  # bytes of a command and of a response, at most: MAX_CTO
 _HEADER = struct.Struct("<HH")  # LEN and CTR of XCP on Ethernet
 _IDLE_S = 30.0  # after so long without a command another master may connect
 
@@ -50,6 +50,7 @@ class Slave:
         writes: whether the master may write.
         notice: gets a line for each refused write.
         clock: monotonic time, s.
+        most: bytes of a command and of a response on its line.
     """
 
     def __init__(
@@ -60,9 +61,10 @@ class Slave:
         writes: bool,
         notice: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
+        most: int = MOST,
     ) -> None:
         self._memory, self._name, self._a2l = memory, name, a2l.encode()
-        self._writes, self._notice, self._clock = writes, notice, clock
+        self._writes, self._notice, self._clock, self._most = writes, notice, clock, most
         self._master: Any = None
         self._heard = 0.0
         self._counter = 0
@@ -75,8 +77,8 @@ class Slave:
             length, _ = _HEADER.unpack_from(rest)
             packet = rest[_HEADER.size : _HEADER.size + length]
             rest = rest[_HEADER.size + length :]
-            whole = 1 <= length <= MOST and len(packet) == length
-            response = self._response(packet if whole else b"", peer)
+            whole = 1 <= length <= self._most and len(packet) == length
+            response = self.packet(packet if whole else b"", peer)
             if response:
                 out += _HEADER.pack(len(response), self._counter) + response
                 self._counter = (self._counter + 1) % 2**16
@@ -84,7 +86,8 @@ class Slave:
                 break  # nobody knows where the next packet begins
         return out
 
-    def _response(self, packet: bytes, peer: Any) -> bytes:
+    def packet(self, packet: bytes, peer: Any) -> bytes:
+        """The answer to a packet from a peer; empty for none."""
         now = self._clock()
         if self._master is not None and now - self._heard > _IDLE_S:
             self._master = None
@@ -114,7 +117,7 @@ class Slave:
         if command == CONNECT:
             self._at = (0, 0)
             resource = _CAL if self._writes else 0
-            sizes = struct.pack("<BH", MOST, MOST)
+            sizes = struct.pack("<BH", self._most, self._most)
             return bytes([resource, _GET_COMM_MODE_INFO_IS_THERE]) + sizes + bytes([_VERSION] * 2)
         if command == DISCONNECT:
             self._master = None
@@ -150,8 +153,8 @@ class Slave:
 
     def _read(self, count: int) -> bytes:
         extension, at = self._at
-        if not 1 <= count < MOST:
-            raise Refused(OUT_OF_RANGE, f"{count} bytes must be 1 to {MOST - 1}")
+        if not 1 <= count < self._most:
+            raise Refused(OUT_OF_RANGE, f"{count} bytes must be 1 to {self._most - 1}")
         if extension == _A2L:
             found = self._a2l[at : at + count]
         elif extension == 0:
