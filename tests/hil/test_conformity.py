@@ -525,7 +525,7 @@ def test_wrong_test_files_are_told_in_one_line(
         (["--law", "droop-3", "--workers", "0"], "--workers 0"),
         (["--law", "droop-3", "--converter", "nowhere.toml"], "nowhere.toml"),
         ([], "--law"),
-        (["--controller", "vsg-2.so"], "must be dll:FILE, fmu:FILE or c:FILE"),
+        (["--controller", "vsg-2.so"], "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
         (["--controller", "dll:nowhere.so"], "nowhere.so: there is no such file"),
         (["--law", "droop-3", "--map", "map.toml"], "map.toml: is of a controller"),
     ],
