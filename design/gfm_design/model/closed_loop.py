@@ -134,8 +134,8 @@ class ClosedLoop:
             (..., 11).
         origin: what it was made of, if known.
         stage: the inner stage between the law and the bridge, one or several on a leading axis.
-        around: the rest of the network, if the converter is one of several; ``plant`` is then the
-            network without any controller, of which the other ones are in ``around``.
+        around: the other converters' controllers, if the converter is one of several; ``plant`` is
+            then the network without any controller.
 
     Raises:
         ValueError: a continuous loop with a delay or an inner stage.
