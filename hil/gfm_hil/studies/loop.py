@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,22 +90,13 @@ class Loop(ClosedLoop):
         Raises:
             UserError: no such input.
         """
-        from matplotlib import pyplot
-
-        from gfm_hil.results.figures import COLOURS, draw_panel
+        from gfm_hil.results.figures import COLOURS
 
         try:
             t, y = self.step_response(of, seconds)
         except ValueError as problem:
             raise UserError(f"step: {problem}") from None
-        figure, panels = pyplot.subplots(
-            len(Y_NAMES), 1, sharex=True, figsize=(8.6, 8.2), layout="constrained"
-        )
-        for axes, name, column in zip(panels, Y_NAMES, y.T, strict=True):
-            draw_panel(axes, f"{name} [p.u.]", [(t, column, COLOURS[0], name)])
-        panels[-1].set_xlabel("t [s]", fontsize=9)
-        figure.suptitle(f"{self.title}: after a unit step of {of}", fontsize=11, x=0.01, ha="left")
-        return list(panels)
+        return draw_step(t, [(y, COLOURS[0], "")], f"{self.title}: after a unit step of {of}")
 
     def pole_map(self) -> Axes:
         """Draw the poles: sigma [1/s] and frequency [Hz], over symmetric logarithms."""
@@ -229,4 +220,29 @@ def _finish(panels: Sequence[Axes], title: str, *labels: str) -> list[Axes]:
     panels[0].set_title(title, loc="left", fontsize=9.5, color="#222222")
     panels[-1].set_xlabel("frequency [Hz]", fontsize=9.5)
     panels[0].legend(fontsize=8, frameon=False, loc="best")
+    return list(panels)
+
+
+def draw_step(t: Any, curves: Sequence[tuple[Any, str, str]], title: str) -> list[Axes]:
+    """Draw y = (v_dc, p, omega_u, q, V) [p.u.] over t [s], a panel each.
+
+    Args:
+        t: shape (K,).
+        curves: y (K, 5), its colour and its name; a legend tells names that are not empty.
+        title: of the figure.
+    """
+    from matplotlib import pyplot
+
+    from gfm_hil.results.figures import draw_panel
+
+    figure, panels = pyplot.subplots(
+        len(Y_NAMES), 1, sharex=True, figsize=(8.6, 8.2), layout="constrained"
+    )
+    for k, (axes, signal) in enumerate(zip(panels, Y_NAMES, strict=True)):
+        lines = [(t, y[:, k], colour, name or signal) for y, colour, name in curves]
+        draw_panel(axes, f"{signal} [p.u.]", lines)
+    panels[-1].set_xlabel("t [s]", fontsize=9)
+    if any(name for _, _, name in curves):
+        panels[0].legend(fontsize=8, frameon=False, loc="best", ncols=4)
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     return list(panels)

@@ -13,11 +13,10 @@ from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop as _NetworkLoop
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.model import Scenario, load_scenario, plant_of
-from gfm_hil.studies.loop import Loop, initial_law
+from gfm_hil.studies.loop import Loop, draw_step, initial_law
 from gfm_plant import NoEquilibrium
 from gfm_runtime import Law as BuiltLaw
 from gfm_runtime import discretise
-from gfm_runtime.signals import Y_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,25 +118,13 @@ class NetworkLoop(_NetworkLoop):
         Raises:
             UserError: no such input.
         """
-        from matplotlib import pyplot
-
-        from gfm_hil.results.figures import draw_panel
-
         try:
             t, y = self.step_response(of, seconds)
         except ValueError as problem:
             raise UserError(f"step: {problem}") from None
-        figure, panels = pyplot.subplots(
-            len(Y_NAMES), 1, sharex=True, figsize=(8.6, 8.2), layout="constrained"
-        )
         colours = self._colours()
-        for k, (axes, name) in enumerate(zip(panels, Y_NAMES, strict=True)):
-            curves = [(t, y[one][:, k], colours[one], one) for one in self.names]
-            draw_panel(axes, f"{name} [p.u.]", curves)
-        panels[-1].set_xlabel("t [s]", fontsize=9)
-        panels[0].legend(fontsize=8, frameon=False, loc="best", ncols=4)
-        figure.suptitle(f"after a unit step of {of}", fontsize=11, x=0.01, ha="left")
-        return list(panels)
+        curves = [(y[one], colours[one], one) for one in self.names]
+        return draw_step(t, curves, f"after a unit step of {of}")
 
     def _colours(self) -> dict[str, str]:
         from gfm_hil.results.figures import COLOURS
