@@ -62,6 +62,8 @@ def _table(results: list[dict[str, Checked]]) -> str:
     for (target, real, style), _ in zip(MEASURED, results, strict=True):
         heads += [f"{target} {real}, {style}: instructions", "code [B]"]
         units += ["---:", "---:"]
+    heads.insert(3, "instructions without the checks of inputs")
+    units.insert(3, "---:")
     lines = ["| " + " | ".join(cells) + " |" for cells in (heads, units)]
     for name in results[0]:
         cells = [name]
@@ -69,6 +71,7 @@ def _table(results: list[dict[str, Checked]]) -> str:
             law = found[name]
             assert law.instructions is not None and law.differ == 0
             cells += ["{}…{}".format(*law.instructions), str(law.code)]
+        cells.insert(3, "{}…{}".format(*results[0][name].law_and_limits))
         lines.append("| " + " | ".join(cells) + " |")
     versions = {_version(target) for target, *_ in MEASURED}
     rows = {found.rows for result in results for found in result.values()}

@@ -245,14 +245,14 @@ def _print_proofs(proofs: Sequence[Proved]) -> None:
 
 
 def _print(results: Sequence[Checked]) -> None:
-    heads = ("rows", "words that differ", "instructions", "code [B]", "constants [B]", "state [B]",
-             "stack [B]")  # fmt: skip
+    heads = ("rows", "words that differ", "instructions", "of these checks", "code [B]",
+             "constants [B]", "state [B]", "stack [B]")  # fmt: skip
     table = numbers("law", *heads)
     for r in results:
         counted = "–" if r.instructions is None else f"{r.instructions[0]}…{r.instructions[1]}"
-        stack = "–" if r.stack is None else str(r.stack)
+        checks, stack = ("–" if n is None else str(n) for n in (r.checks, r.stack))
         table.add_row(
-            r.name, str(r.rows), str(r.differ), counted, str(r.code), str(r.constants),
+            r.name, str(r.rows), str(r.differ), counted, checks, str(r.code), str(r.constants),
             str(r.state), stack,
         )  # fmt: skip
     terminal().print(table, highlight=False)

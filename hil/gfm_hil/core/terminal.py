@@ -42,7 +42,7 @@ def fitting(
 
 def numbers(first: str, *others: str, title: str = "") -> Table:
     """An empty table without lines: the first column is text, the others are numbers."""
-    columns = (Column(head, justify="right") for head in others)
+    columns = (Column(head, justify="right", no_wrap=" " not in head) for head in others)
     return Table(first, *columns, title=title, title_justify="left", box=None, pad_edge=False)
 
 

@@ -111,6 +111,7 @@ class Checked:
         rows: golden rows that it was stepped through.
         differ: words of outputs and state, over all rows, that are not the kernel's.
         instructions: fewest and most of a step, or None where they are not counted.
+        checks: instructions of these that check whether y and ref are in range, or None.
         code, constants: bytes of the law's object file.
         state: bytes of one instance.
         stack: bytes that a step needs at most, or None where the compiler does not say.
@@ -120,10 +121,23 @@ class Checked:
     rows: int
     differ: int
     instructions: tuple[int, int] | None
+    checks: int | None
     code: int
     constants: int
     state: int
     stack: int | None
+
+    @property
+    def law_and_limits(self) -> tuple[int, int]:
+        """Fewest and most instructions of a step without the checks of its inputs.
+
+        Raises:
+            ValueError: the target counts no instructions.
+        """
+        if self.instructions is None or self.checks is None:
+            raise ValueError(f"{self.name}: no instructions were counted")
+        least, most = self.instructions
+        return least - self.checks, most - self.checks
 
 
 def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKED) -> list[Checked]:
@@ -154,10 +168,10 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
         said = called(where.run, at)
         out = []
         for k, m in enumerate(found.modules):
-            line = re.search(rf"^law {k} (\d+) (\d+) (\d+) (\d+) (\d+)$", said, re.MULTILINE)
+            line = re.search(rf"^law {k} (\d+) (\d+) (\d+) (\d+) (\d+) (\d+)$", said, re.MULTILINE)
             if line is None:
                 raise LawError(f"target {target}", f"the program said no result of {m.name}")
-            counted, differ, least, most, state = map(int, line.groups())
+            counted, differ, least, most, checks, state = map(int, line.groups())
             instructions = None
             if where.tick_ns:
                 instructions = where.instructions(least), where.instructions(most)
@@ -169,6 +183,7 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
                     counted,
                     differ,
                     instructions,
+                    where.instructions(checks) if where.tick_ns else None,
                     code,
                     constants,
                     state,

@@ -1,6 +1,6 @@
 /* The program of gfmhil firmware check: steps the laws through golden.bin, and prints one line a law:
- * its number, rows, words that differ, fewest and most ticks of the clock in a step, bytes of an
- * instance. */
+ * its number, rows, words that differ, fewest and most ticks of the clock in a step, those of the
+ * checks of its inputs, bytes of an instance. */
 #include "board.h"
 #include "selftest.h"
 
@@ -25,7 +25,7 @@ int main(void)
 {
     static const char name[] = "golden.bin";
     static unsigned long counted[GOLDEN_LAWS], differ[GOLDEN_LAWS];
-    static unsigned long least[GOLDEN_LAWS], most[GOLDEN_LAWS];
+    static unsigned long least[GOLDEN_LAWS], most[GOLDEN_LAWS], checks[GOLDEN_LAWS];
     const long file = board_open(name, sizeof name - 1, BOARD_READ);
     unsigned long n, i, law, none = clock_now();
     none = ELAPSED(clock_now() - none);
@@ -36,6 +36,11 @@ int main(void)
             counted[law]++;
             if (counted[law] <= TIMED && rows[i][2] == 0) {
                 unsigned long ticks = ELAPSED(golden_elapsed) - none;
+                if (counted[law] == 1) {
+                    unsigned long refused[2];
+                    golden_refusals(rows[i], refused);
+                    checks[law] = ELAPSED(refused[0]) - ELAPSED(refused[1]);
+                }
                 if (least[law] == 0 || ticks < least[law])
                     least[law] = ticks;
                 if (ticks > most[law])
@@ -50,6 +55,7 @@ int main(void)
         say_number(differ[law]);
         say_number(least[law]);
         say_number(most[law]);
+        say_number(checks[law]);
         say_number(golden_sizes[law]);
         board_say("\n");
     }

@@ -1,4 +1,4 @@
-static @T@_t @P@_of[2];
+static @T@_t @P@_of[3];
 
 static void @P@_do_init(int k)
 {

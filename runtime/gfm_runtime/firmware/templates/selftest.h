@@ -16,6 +16,11 @@ enum { GOLDEN_WORDS = @WORDS@ };
 /* One row: the numbers of words that differ. Rows go in their order; the first row starts anew. */
 unsigned golden_row(const golden_word row[]);
 
+/* With a row that a law steps through: what a step takes that refuses the last reference after all other
+ * inputs have passed, and a step that refuses because that one did. The difference is what the checks
+ * of the inputs take. Returns the law's BAD_REF. */
+int golden_refusals(const golden_word row[], unsigned long elapsed[2]);
+
 /* Names and sizes of the laws, and what GOLDEN_CLOCK counted during the last step. */
 extern const char *const golden_names[GOLDEN_LAWS];
 extern const unsigned golden_sizes[GOLDEN_LAWS];
