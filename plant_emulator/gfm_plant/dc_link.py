@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from gfm_plant.model import V_DC
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 
 
-@compiled
+@inlined
 def advance_dc_link(r: Any, s: Any, half_h: float) -> tuple[float, float]:
     """Take v_dc and the DC source on by one piece of the period.
 

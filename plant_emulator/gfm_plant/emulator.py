@@ -36,7 +36,7 @@ from gfm_plant.solution import (
     state,
 )
 from gfm_plant.synchro_check import WATCHING, watch
-from gfm_runtime.compiled import cached, compiled
+from gfm_runtime.compiled import cached, compiled, inlined
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 
@@ -315,7 +315,7 @@ def _within_peak(plant: PlantRecords, k: int, part: int) -> tuple[float, float]:
     return E_d, E_q
 
 
-@compiled
+@inlined
 def _piece(plant: PlantRecords, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the commands that act."""
     n, now = plant.net[0], plant.now[0]
@@ -388,7 +388,7 @@ def _bring(n: Any, now: Any, unit: Any, weight: float) -> None:
         now.brought[j] -= weight * given(n, now, j, unit)
 
 
-@compiled
+@inlined
 def _look(plant: PlantRecords, k: int, which: int, unit: Any) -> None:
     """Keep the power that bridge k draws, p.u., and what its sensors see at the beginning (0), the
     middle (1) or the end (2) of a piece, when its frame is at ``unit``."""
@@ -410,7 +410,7 @@ def _larger(size: float, other: float) -> float:
     return max(size, other) if other == other else math.inf
 
 
-@compiled
+@inlined
 def _sense(n: Any, s: Any, k: int, j: int, part: int, f_0: float, f_1: float, f_2: float) -> None:
     """Pass a quantity through the low-pass of sensor j of converter k."""
     s.sensed[j] = (

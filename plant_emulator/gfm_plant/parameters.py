@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -106,7 +107,10 @@ def load_converter(name_or_path: str | Path) -> ConverterParameters:
                 f"converter = {name_or_path!r}: must be one of {', '.join(shipped)},"
                 " or the path of a .toml file"
             )
-        text = (folder / f"{name_or_path}.toml").read_text(encoding="utf-8")
-    else:
-        text = Path(name_or_path).read_text(encoding="utf-8")
+        return _parsed((folder / f"{name_or_path}.toml").read_text(encoding="utf-8"))
+    return _parsed(Path(name_or_path).read_text(encoding="utf-8"))
+
+
+@lru_cache(maxsize=16)
+def _parsed(text: str) -> ConverterParameters:
     return ConverterParameters.model_validate(tomllib.loads(text))

@@ -249,11 +249,11 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             # stretch (in its first and its second half), states, and the sources' unit phasors
             ("z", "f8", (n_z, 2)),
             ("forced", "f8", (n_z, 4)),
-            # each source's gain on the modes, for which speed and stretch, and turn in half a piece
-            ("gain", "f8", (2 * n_s, n_z, 2)),
-            ("gain_omega", "f8", (2 * n_s,)),
-            ("gain_part", "i8", (2 * n_s,)),
-            ("turn", "f8", (2 * n_s, 2)),
+            # for each cut, each source's gain on the modes at the speed that it had last (inf: not
+            # known yet), and its turn in half a piece
+            ("gain", "f8", (2 * n_parts, 2 * n_s, n_z, 2)),
+            ("gain_omega", "f8", (2 * n_parts, 2 * n_s)),
+            ("turn", "f8", (2 * n_parts, 2 * n_s, 2)),
             ("w", "f8", (n_w, 2)),
             ("unit", "f8", (2 * n_s, 2)),
             ("halfway", "f8", (2 * n_s, 2)),  # the unit phasors in the middle of a piece

@@ -21,7 +21,7 @@ import math
 from typing import Any
 
 from gfm_plant.records import N_OWN
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 
 I_F, V, I_O = 0, 1, 2
 """Places of a converter's states in w, from ``own(k)`` on: currents of filter and line, and the
@@ -101,30 +101,30 @@ def drive(
         _drive(n, now, c, part, len(now.unit) // 2 + k, k, E_r, -E_i, -omega)
 
 
-@compiled
+@inlined
 def _drive(
     n: Any, now: Any, c: int, part: int, k: int, source: int, E_r: float, E_i: float, omega: float
 ) -> None:
     """Drive by the phasor at place k: that of a source, or its mirror image."""
-    if now.gain_omega[k] != omega or now.gain_part[k] != part:
+    if now.gain_omega[part, k] != omega:
         _find_gains(n, now, c, part, k, source, omega)
-    cos, sin = now.turn[k, 0], now.turn[k, 1]
+    cos, sin = now.turn[part, k, 0], now.turn[part, k, 1]
     s_r = E_r * now.unit[k, 0] - E_i * now.unit[k, 1]
     s_i = E_r * now.unit[k, 1] + E_i * now.unit[k, 0]
     for m in range(n.n_modes[c]):
-        g_r, g_i = now.gain[k, m, 0], now.gain[k, m, 1]
+        g_r, g_i = now.gain[part, k, m, 0], now.gain[part, k, m, 1]
         f_r, f_i = g_r * s_r - g_i * s_i, g_r * s_i + g_i * s_r
         now.forced[m, 0] += f_r
         now.forced[m, 1] += f_i
         now.forced[m, 2] += f_r * cos - f_i * sin
         now.forced[m, 3] += f_r * sin + f_i * cos
-    _turn_on(now, k)
+    _turn_on(now, part, k)
 
 
 @compiled
-def _turn_on(now: Any, k: int) -> None:
+def _turn_on(now: Any, part: int, k: int) -> None:
     """Take the phasor at place k on by a piece."""
-    cos, sin = now.turn[k, 0], now.turn[k, 1]
+    cos, sin = now.turn[part, k, 0], now.turn[part, k, 1]
     u_r, u_i = now.unit[k, 0], now.unit[k, 1]
     h_r, h_i = u_r * cos - u_i * sin, u_r * sin + u_i * cos
     now.halfway[k, 0], now.halfway[k, 1] = h_r, h_i
@@ -140,30 +140,30 @@ def draw(
 ) -> None:  # fmt: skip
     """Add to the forcing of every mode what source k does to it, which is held at one value in the
     first half of a piece and at another in the second, in the common frame."""
-    if now.gain_omega[k] != 1.0 or now.gain_part[k] != part:
+    if now.gain_omega[part, k] != 1.0:
         _find_gains(n, now, c, part, k, k, 1.0)
-    _draw(n, now, c, k, first_r, first_i, second_r, second_i)
+    _draw(n, now, c, part, k, first_r, first_i, second_r, second_i)
     if n.unbalanced[c]:
         j = len(now.unit) // 2 + k
-        if now.gain_omega[j] != -1.0 or now.gain_part[j] != part:
+        if now.gain_omega[part, j] != -1.0:
             _find_gains(n, now, c, part, j, k, -1.0)
         u_r, u_i = now.unit[j, 0], now.unit[j, 1]
-        _turn_on(now, j)
+        _turn_on(now, part, j)
         h_r, h_i = now.halfway[j, 0], now.halfway[j, 1]
         _draw(
-            n, now, c, j, first_r * u_r + first_i * u_i, first_r * u_i - first_i * u_r,
+            n, now, c, part, j, first_r * u_r + first_i * u_i, first_r * u_i - first_i * u_r,
             second_r * h_r + second_i * h_i, second_r * h_i - second_i * h_r,
         )  # fmt: skip
 
 
 @compiled
 def _draw(
-    n: Any, now: Any, c: int, k: int,
+    n: Any, now: Any, c: int, part: int, k: int,
     first_r: float, first_i: float, second_r: float, second_i: float,
 ) -> None:  # fmt: skip
     """Drive by two values of the source, or the mirror image, at place k."""
     for m in range(n.n_modes[c]):
-        g_r, g_i = now.gain[k, m, 0], now.gain[k, m, 1]
+        g_r, g_i = now.gain[part, k, m, 0], now.gain[part, k, m, 1]
         now.forced[m, 0] += g_r * first_r - g_i * first_i
         now.forced[m, 1] += g_r * first_i + g_i * first_r
         now.forced[m, 2] += g_r * second_r - g_i * second_i
@@ -194,12 +194,13 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega:
         if k != source:
             x_r, x_i = n.mirror[c, m, 0], n.mirror[c, m, 1]
             b_r, b_i = b_r * x_r - b_i * x_i, b_r * x_i + b_i * x_r
-        now.gain[k, m, 0], now.gain[k, m, 1] = g_r * b_r - g_i * b_i, g_r * b_i + g_i * b_r
-    now.turn[k, 0], now.turn[k, 1] = cos, sin
-    now.gain_omega[k], now.gain_part[k] = omega, part
+        now.gain[part, k, m, 0] = g_r * b_r - g_i * b_i
+        now.gain[part, k, m, 1] = g_r * b_i + g_i * b_r
+    now.turn[part, k, 0], now.turn[part, k, 1] = cos, sin
+    now.gain_omega[part, k] = omega
 
 
-@compiled
+@inlined
 def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
     """Take the modes on by half a piece: ``which`` is 0 for its first half, 2 for its second."""
     for m in range(n.n_modes[c]):
@@ -209,7 +210,7 @@ def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
         now.z[m, 1] = a_r * z_i + a_i * z_r + now.forced[m, which + 1]
 
 
-@compiled
+@inlined
 def state(n: Any, now: Any, c: int, i: int) -> tuple[float, float]:
     """Return state i of w, by the modes."""
     w_r = w_i = 0.0
@@ -236,8 +237,9 @@ def circuit(n: Any, now: Any) -> int:
 def enter(n: Any, now: Any, tick: int, c: int) -> None:
     """Start the modes of circuit c at a tick from w, which is projected onto what that circuit can
     hold."""
-    for k in range(len(now.gain_part)):
-        now.gain_part[k] = -1
+    for part in range(len(now.gain_omega)):
+        for k in range(len(now.unit)):
+            now.gain_omega[part, k] = math.inf
     for m in range(n.n_modes[c]):
         z_r = z_i = 0.0
         for i in range(n.n_states):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,17 @@ class Controller:
         self.select(sets[0].name)
         self.ctl["active"], self.ctl["request"] = self.ctl["request"], -1
         self.ctl["state"] = READY
+
+    def anew(self, references: Sequence[float]) -> Controller:
+        """Another controller with the same laws, which starts from other references, shape (5,),
+        p.u.; it shares with this one what neither changes."""
+        other = copy(self)
+        other.labels, other.names = list(self.labels), list(self.names)
+        other.discrete, other.changed = list(self.discrete), [dict(one) for one in self.changed]
+        other.laws, other.states = self.laws.copy(), self.states.copy()
+        other.ctl, other.est = self.ctl.copy(), self.est.copy()
+        other.ctl["ref"] = other.ctl["ref_target"] = np.asarray(references, dtype=float)
+        return other
 
     @property
     def active(self) -> str:

@@ -28,8 +28,8 @@ from typing import Any
 from numba import njit, types
 from numba.core.caching import IndexDataCacheFile, _SourceFileBackedLocatorMixin
 
-#: options of njit and cfunc
-FREE: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
+#: options of njit and cfunc; a division by 0 gives infinity or NaN as in C, and no branch
+FREE: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False, "error_model": "numpy"}
 
 #: decorator for such a function
 compiled: Any = njit(**FREE)
@@ -39,7 +39,7 @@ compiled: Any = njit(**FREE)
 inlined: Any = njit(**FREE, forceinline=True)
 
 #: decorator for a function of a tick that needs numba's runtime, as slices of arrays do
-cached: Any = njit(cache=True, nogil=True)
+cached: Any = njit(cache=True, nogil=True, error_model="numpy")
 
 #: where compiled functions, and constants that they contain, come from
 _PLACES = {

@@ -10,7 +10,7 @@ import pytest
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
-from gfm_hil.engine.inproc import run_inproc
+from gfm_hil.engine.inproc import CHUNK, run_inproc
 from gfm_hil.engine.retune import ready_gains
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -254,14 +254,14 @@ def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
     parts = {role: Part.create(tmp_path, role, scenario.ticks) for role in ROLES}
     timeline = Timeline(bench, tmp_path / "events_both.jsonl", ROLES)
     run_inproc(
-        [bench], [parts["plant"]], [parts["controller"]], [timeline], lambda ticks: ticks < 4000
+        [bench], [parts["plant"]], [parts["controller"]], [timeline], lambda ticks: ticks < CHUNK
     )
     timeline.close()
     (tmp_path / "scenario.toml").write_text("")
     done = finish(scenario, tmp_path, bench.controller.labels, 0.0)
     assert done.summary["status"] == "interrupted"
     assert done.summary["reason"] == "stopped by the operator"
-    assert len(done.signals["t"]) == done.summary["ticks"] == 4000
+    assert len(done.signals["t"]) == done.summary["ticks"] == CHUNK
     assert not np.isnan(done.signals["true_p"]).any()
 
 

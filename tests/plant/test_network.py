@@ -308,8 +308,11 @@ def test_a_fault_in_two_axes_is_one_in_three_phases() -> None:
             take_out(plant)
         found.append((plant.st["x"].copy(), plant.now["omega"].copy(), plant.st["trip"].copy()))
     assert found[0][2].tolist() == found[1][2].tolist() == [0, 1]
+    # rounding decides how many pieces each DC link takes: v_dc is as accurate as it is elsewhere
     for one, other in zip(found[0][:2], found[1][:2], strict=True):
-        assert one == pytest.approx(other, abs=1e-9)
+        assert one == pytest.approx(other, abs=1e-8)
+    (one, other) = (np.delete(x, V_DC, axis=1) for x, *_ in found)
+    assert one == pytest.approx(other, abs=1e-9)
 
 
 def test_a_transformer_is_its_leakage_and_its_magnetising_inductance() -> None:

@@ -227,6 +227,14 @@ class _Side:
             [i for i, row in enumerate(law.rows) if self.controlled or row != 0], dtype=int
         )
         self.size = N_X + 2 + len(self.kept)
+        self._rests = np.delete(np.arange(N_X), DELTA)  # delta rests by omega_u = omega_g
+        self._measured = np.array(SENSED)
+        self._gain, self._offset = (
+            par[0][name][: len(SENSED)].copy() for name in ("gain", "offset")
+        )
+        impedance = np.zeros(2)
+        impedance[: len(law.law.error_parameters)] = law.law.error_parameters
+        self._impedance = impedance
 
     def first(self, V_g: float, omega_g: float) -> Vector:
         """Where to begin: at the references, with the law's states at zero.
@@ -242,21 +250,37 @@ class _Side:
         law, ref = self.law, self.ref
         if law.law.inner is not None and law.law.inner.f_pll > 0.0:
             ref = np.array([*ref[:2], omega_g, *ref[3:]])  # the law sees what its PLL measures
-        x, u, y, x_law = _unpack(z, self.par, law, omega_g, self.kept)
+        x, u, y, x_law = self._unpack(z, omega_g)
         x[DELTA] -= theta
-        u_law, x_next = _law(law, x_law, ref, y)
+        u_law, x_next = self._law(x_law, ref, y)
         dx = f(x, u, np.array([omega_g, V_g]), self.par)
         dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
-        ac = np.delete(dx, DELTA)  # delta rests by omega_u = omega_g
+        ac = dx[self._rests]
         u[2] = abs(_internal(law, x, u, limited=False))
         rest = (x_next - x_law)[self.kept] / law.T_s
         return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], rest])
 
     def found(self, z: Vector, omega_g: float) -> OperatingPoint:
         """The operating point at the unknowns z."""
-        x, u, y, x_law = _unpack(z, self.par, self.law, omega_g, self.kept)
+        x, u, y, x_law = self._unpack(z, omega_g)
         x, u, e = _in_frame_of_law(self.law, x, u)
         return OperatingPoint(x, u, y, x_law, e)
+
+    def _unpack(self, z: Vector, omega_g: float) -> tuple[Vector, Vector, Vector, Vector]:
+        """The plant's state, its inputs, what the sensors report, and the law's state."""
+        x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
+        y = g(x, u)
+        y[self._measured] = self._gain * y[self._measured] + self._offset
+        x_law = np.zeros(self.law.order)
+        x_law[self.kept] = z[N_X + 2 :]
+        return x, u, y, x_law
+
+    def _law(self, x: Vector, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
+        """The law's u (3,) and next state at held inputs; column 3 sees the plant's omega_u."""
+        law, r, measured = self.law, ref.copy(), y.copy()
+        map_errors(ERROR_MAPS[law.law.error_map], self._impedance, r, measured)
+        u = law.u_0 + law.D_u0 @ ref + law.C @ x + law.D_r @ r + law.D_y @ measured
+        return u, law.A @ x + law.B_r @ r + law.B_y @ measured
 
     def no_rest(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""
@@ -269,22 +293,32 @@ class _Side:
 
 
 def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
-    """A zero of ``residual`` near z, or None."""
+    """A zero of ``residual`` near z, or None.
+
+    The slopes are found anew only when a step was not much shorter than the one before it.
+    """
+    before, largest, jacobian = 0.0, math.inf, np.empty((0, 0))
     for _ in range(_ROUNDS):
         now = residual(z)
-        jacobian = np.empty((len(now), len(z)))
-        for j in range(len(z)):
-            nudge = np.zeros(len(z))
-            nudge[j] = _NUDGE
-            jacobian[:, j] = (residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE)
+        if not largest < 0.1 * before:
+            jacobian = _slopes(residual, z)
         step = np.linalg.lstsq(jacobian, now, rcond=1e-12)[0]
-        largest = np.abs(step).max()
+        before, largest = largest, float(np.abs(step).max())
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
         if not np.isfinite(z).all():
             return None
         if largest < 1e-10:
             return z if np.abs(residual(z)).max() <= 1e-5 else None
     return None
+
+
+def _slopes(residual: Callable[[Vector], Vector], z: Vector) -> Vector:
+    columns = []
+    for j in range(len(z)):
+        nudge = np.zeros(len(z))
+        nudge[j] = _NUDGE
+        columns.append((residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE))
+    return np.stack(columns, axis=1)
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> complex:
@@ -311,26 +345,3 @@ def _in_frame_of_law(law: DiscreteLaw, x: Vector, u: Vector) -> tuple[Vector, Ve
         turned[k : k + 2] = w.real, w.imag
     turned[DELTA] += cmath.phase(E)
     return turned, np.array([u[0], u[1], abs(E)]), u[2] * turn
-
-
-def _unpack(
-    z: Vector, par: Record, law: DiscreteLaw, omega_g: float, kept: NDArray[np.intp]
-) -> tuple[Vector, Vector, Vector, Vector]:
-    x, u = z[:N_X].copy(), np.array([z[N_X], omega_g, z[N_X + 1]])
-    y = g(x, u)
-    measured = np.array(SENSED)
-    gain, offset = (par[0][name][: len(measured)] for name in ("gain", "offset"))
-    y[measured] = gain * y[measured] + offset
-    x_law = np.zeros(law.order)
-    x_law[kept] = z[N_X + 2 :]
-    return x, u, y, x_law
-
-
-def _law(law: DiscreteLaw, x: Vector, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
-    """u (3,) of the law and its next state at held inputs; column 3 sees the plant's omega_u."""
-    r, measured = ref.copy(), y.copy()
-    impedance = np.zeros(2)
-    impedance[: len(law.law.error_parameters)] = law.law.error_parameters
-    map_errors(ERROR_MAPS[law.law.error_map], impedance, r, measured)
-    u = law.u_0 + law.D_u0 @ ref + law.C @ x + law.D_r @ r + law.D_y @ measured
-    return u, law.A @ x + law.B_r @ r + law.B_y @ measured

@@ -28,7 +28,7 @@ from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
 
-CHUNK = 2000  # ticks between two looks at the stop flag and the progress bar
+CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
 
 
 class Stack(NamedTuple):
@@ -139,12 +139,14 @@ def run_inproc(
     timeline. ``go_on`` gets the ticks done and returns whether to go on."""
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
     goes_on, single = bench.scenario.survives_trips, len(benches) == 1
+    chunk = max(1, CHUNK // len(benches))
     controllers = stack(benches)
-    plant_rows, controller_rows = _rows(plant_parts, ticks), _rows(controller_parts, ticks)
+    most = min(chunk, ticks)
+    plant_rows, controller_rows = _rows(plant_parts, most), _rows(controller_parts, most)
     while k < ticks and any(timeline.running for timeline in timelines):
         for timeline in timelines:
             timeline.carry_out(k)
-        stop = min(k + CHUNK, ticks, *(timeline.next_tick() for timeline in timelines))
+        stop = min(k + chunk, ticks, *(timeline.next_tick() for timeline in timelines))
         begin = 0 if single else k
         done = run_ticks(
             bench.plant.records, controllers, plant_rows, controller_rows, k, stop, begin, goes_on
@@ -169,10 +171,10 @@ def run_inproc(
 
 
 def _rows(parts: Sequence[Part], ticks: int) -> NDArray[np.float64]:
-    """Where the loop records: of one converter its part itself, of several a piece at a time."""
+    """Where the loop records: of one converter its part itself, of several pieces of ``ticks``."""
     if len(parts) == 1:
         return parts[0].signals[None]
-    return np.empty((len(parts), min(CHUNK, ticks), parts[0].signals.shape[1]))
+    return np.empty((len(parts), ticks, parts[0].signals.shape[1]))
 
 
 def buffers(ticks: int, inner: bool = False) -> tuple[Part, Part]:

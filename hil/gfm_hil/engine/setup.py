@@ -7,6 +7,8 @@ frames have to cross the link.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,7 @@ from gfm_plant import Network, NoEquilibrium, start_again, take_out
 from gfm_plant.names import MAY_START
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.signals import NY, NY_INNER, carried
+from gfm_runtime.signals import NY, NY_INNER, REF_NAMES, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
 
@@ -161,16 +163,40 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
 
 
 def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:
+    names, inner = tuple(scenario.laws()), scenario.inner
+    files = [name for name in (*names, inner or "") if name.endswith(".toml")]
+    made = _ready(
+        names, inner, scenario.T_s, scenario.late_policy.hold, real, plant.wiring.omega_b,
+        tuple(map(_text, files)),
+    )  # fmt: skip
+    return made.anew(scenario.references.vector())
+
+
+@lru_cache(maxsize=16)
+def _ready(
+    names: tuple[str, ...],
+    inner: str | None,
+    T_s: float,
+    hold: int,
+    real: str,
+    omega_b: float,
+    contents: tuple[str, ...],
+) -> Controller:
+    """A controller with these laws; runs that differ in something else need not make it again.
+
+    Args:
+        contents: of the files among names and inner stage.
+    """
     # under the name that events use: the name inside a law file may differ
-    sets = [replace(load_law(name, scenario.inner), name=name) for name in scenario.laws()]
-    return Controller(
-        sets,
-        scenario.T_s,
-        scenario.references.vector(),
-        hold=scenario.late_policy.hold,
-        real=real,
-        omega_b=plant.wiring.omega_b,
-    )
+    sets = [replace(load_law(name, inner), name=name) for name in names]
+    return Controller(sets, T_s, [0.0] * len(REF_NAMES), hold, real, omega_b)
+
+
+def _text(file: str) -> str:
+    try:
+        return Path(file).read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return ""  # load_law says what is wrong with it
 
 
 def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:

@@ -1,8 +1,10 @@
-"""Means over one cycle of the nominal frequency, which take a column piece by piece."""
+"""Means over one cycle of the nominal frequency, which take a column piece by piece, and the window
+of a spectrum."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,14 @@ def cycle_ticks(T_s: float, f_n: float) -> float:
 def whole_ticks(width: float) -> int:
     """Ticks that a mean over ``width`` ticks reads."""
     return int(np.ceil(width - 1e-6))
+
+
+@lru_cache(maxsize=8)
+def hann(n: int) -> Vector:
+    """Hann's window of n ticks; a campaign asks for the same ones in every run."""
+    window = np.hanning(n)
+    window.flags.writeable = False
+    return window
 
 
 def cycle_means(column: Rows, first: int, last: int, width: float) -> Iterator[Vector]:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
 from numpy.typing import NDArray
 
-from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.results.cycles import cycle_means, cycle_ticks, hann, whole_ticks
 
 Vector = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ def fast_mode(x: Vector, T_s: float, f_n: float) -> Mode | None:
     rest = _without_means(_without_means(window, width), width)  # a swing leaves 1e-4 of itself
     if len(rest) < _FEW:
         return None
-    spectrum = np.abs(np.fft.rfft(rest * np.hanning(len(rest))))
+    spectrum = np.abs(np.fft.rfft(rest * hann(len(rest))))
     lines = np.fft.rfftfreq(len(rest), T_s)
     spectrum[lines < 0.5 * f_n] = 0.0
     hertz = max(float(lines[np.argmax(spectrum)]), 0.5 * f_n)
@@ -103,17 +103,23 @@ def _thinned(x: Vector, stride: int) -> Vector:
     """
     if stride == 1 or len(x) <= _TAPS * stride:
         return x
-    return scipy.signal.oaconvolve(x, _filter(stride), "valid")[::stride]
+    weights = _filter(stride)
+    windows = (len(x) - _TAPS * stride - 1) // stride + 1
+    blocks = np.zeros((windows + _TAPS, stride))
+    kept = min(blocks.size, len(x))
+    blocks.ravel()[:kept] = x[:kept]
+    parts = blocks @ weights.T  # of each block, what it adds as the k-th of a window
+    return np.asarray(sum(parts[k : k + windows, k] for k in range(_TAPS + 1)))
 
 
 @cache
 def _filter(stride: int) -> Vector:
-    """Coefficients, latest tick of a window first as a convolution takes them."""
+    """Weights of a window's ticks in order, in rows of ``stride``; zeros fill the last one."""
     taps = _TAPS * stride + 1
     least = scipy.signal.minimum_phase(
         scipy.signal.firwin(taps, 0.8 / stride), n_fft=32 * taps, half=False
     )
-    return np.asarray(least[::-1] / least.sum())
+    return np.pad(least / least.sum(), (0, stride - 1)).reshape(_TAPS + 1, stride)
 
 
 def _strongest(
@@ -130,9 +136,12 @@ def _strongest(
     if not np.max(np.abs(x)) >= least:
         return None
     hankel = np.lib.stride_tricks.sliding_window_view(x, len(x) // 3 + 1)
-    _, weight, modes = np.linalg.svd(hankel, full_matrices=False)
-    rank = min(_RANK, int(np.sum(weight > 1e-3 * weight[0])))
-    subspace = modes[:rank].T
+    width = hankel.shape[1]
+    # the few largest singular values and vectors: far above rounding, so that squares do
+    power, modes = scipy.linalg.eigh(
+        hankel.T @ hankel, subset_by_index=[max(0, width - _RANK), width - 1], check_finite=False
+    )
+    subspace = modes[:, power > 1e-6 * power[-1]]
     z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
     z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
     s = np.log(z.astype(complex)) / h

@@ -21,6 +21,7 @@ from scipy.fft import next_fast_len
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.results.cycles import hann
 from gfm_hil.scenario.events import Fault, GridUnbalance
 from gfm_hil.scenario.model import Scenario
 
@@ -82,17 +83,20 @@ def remaining_ripple(
         scenario.expect_ripple,
         _NOISE * max(scenario.plant.sensors.noise_std.values(), default=0.0),
     )
-    size, hertz, worst = {}, {}, ""
-    for name in _SIGNALS:
-        column = signals[f"true_{name}"]
-        size[name], hertz[name] = _sinusoid(np.asarray(column[done - n : done]), T_s, explained)
+    columns = {name: signals[f"true_{name}"] for name in _SIGNALS}
+    last = np.array([column[done - n : done] for column in columns.values()])
+    sizes, lines = _sinusoids(last, T_s, explained)
+    size = dict(zip(columns, sizes.tolist(), strict=True))
+    hertz = dict(zip(columns, lines.tolist(), strict=True))
+    worst = ""
+    for name, column in columns.items():
         if size[name] <= max(limit, size.get(worst, 0.0)):
             continue
         if np.ptp(scipy.signal.detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
             continue
         if done >= 2 * n:
-            before, _ = _sinusoid(np.asarray(column[done - 2 * n : done - n]), T_s, explained)
-            if size[name] <= 0.5 * before:
+            before, _ = _sinusoids(column[done - 2 * n : done - n][None], T_s, explained)
+            if size[name] <= 0.5 * before[0]:
                 continue
         worst = name
     return Ripple(size, hertz, n * T_s, limit, worst)
@@ -135,17 +139,19 @@ def _last(log: Sequence[dict[str, Any]], *kinds: str) -> dict[str, Any] | None:
     return next((e for e in reversed(log) if e["event"] in kinds), None)
 
 
-def _sinusoid(x: NDArray[Any], T_s: float, explained: Sequence[float]) -> tuple[float, float]:
-    """Peak-to-peak value and frequency [Hz] of the strongest sinusoid in x, beside those of the
-    ``explained`` frequencies."""
-    n = len(x)
-    window = np.hanning(n)
+def _sinusoids(
+    x: NDArray[Any], T_s: float, explained: Sequence[float]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Peak-to-peak values and frequencies [Hz], shape (signals,), of the strongest sinusoid in each
+    row of x (signals, ticks), beside those of the ``explained`` frequencies."""
+    n = x.shape[1]
+    window = hann(n)
     length = next_fast_len(2 * n, real=True)  # lines half as far apart: it falls on none by 4 %
-    spectrum = np.abs(np.fft.rfft(scipy.signal.detrend(x) * window, length))
+    spectra = np.abs(np.fft.rfft(scipy.signal.detrend(x) * window, length))
     lines = np.fft.rfftfreq(length, T_s)
     apart = 1.0 / (n * T_s)
-    spectrum[lines < _SLOWEST * apart] = 0.0
+    spectra[:, lines < _SLOWEST * apart] = 0.0
     for f in explained:
-        spectrum[np.abs(lines - f) < _NEAR * apart] = 0.0
-    k = int(np.argmax(spectrum))
-    return float(4.0 * spectrum[k] / window.sum()), float(lines[k])
+        spectra[:, np.abs(lines - f) < _NEAR * apart] = 0.0
+    k = np.argmax(spectra, axis=1)
+    return 4.0 * spectra[np.arange(len(x)), k] / window.sum(), lines[k]

@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.inproc import buffers, run_inproc
@@ -175,19 +175,25 @@ def _run_here(
     return began
 
 
-def run_in_memory(scenario: Scenario, parts: tuple[Part, Part] | None = None) -> Run:
+def run_in_memory(
+    scenario: Scenario,
+    parts: tuple[Part, Part] | None = None,
+    only: Collection[str] | None = None,
+) -> Run:
     """Run a scenario in this process and leave nothing on the disk.
 
     Args:
         scenario: checked; its link and mode do not matter.
         parts: from ``buffers``, to record into; the run's columns are copies.
+        only: the columns that the run keeps beside ticks and times, which must be at least
+            ``summary.READ``; None: all.
 
     Raises:
         UserError: the scenario has no operating point.
     """
     bench = make_bench(scenario)
     plant, controller = parts or buffers(scenario.ticks, bench.inner)
-    (run,) = _in_memory([bench], [plant], [controller])
+    (run,) = _in_memory([bench], [plant], [controller], only)
     return run
 
 
@@ -203,20 +209,28 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
 
 
-def _by_column(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A copy whose columns are contiguous, made in pieces that stay in the processor's cache."""
+def _columns(
+    role: Role, rows: NDArray[np.float64], only: Collection[str] | None
+) -> dict[str, Rows]:
+    """A side's columns by name as contiguous copies."""
+    if only is not None:
+        views = named(role, rows)
+        return {name: np.ascontiguousarray(views[name]) for name in views if name in only}
     out = np.empty(rows.shape, order="F")
-    for k in range(0, len(rows), _PIECE):
+    for k in range(0, len(rows), _PIECE):  # pieces that stay in the processor's cache
         out[k : k + _PIECE] = rows[k : k + _PIECE]
-    return out
+    return dict(named(role, out))
 
 
 def _in_memory(
-    benches: Sequence[Bench], plants: Sequence[Part], controllers: Sequence[Part]
+    benches: Sequence[Bench],
+    plants: Sequence[Part],
+    controllers: Sequence[Part],
+    only: Collection[str] | None = None,
 ) -> list[Run]:
     """Run benches; the runs' columns are copies of the parts."""
     for plant in plants:
-        plant.signals[:] = np.nan
+        plant.signals[:, 0] = np.nan  # tells below which ticks were recorded
     timelines = [TimelineInMemory(bench) for bench in benches]
     began, date = time.monotonic(), time.time()
     with np.errstate(all="ignore"):  # a diverging run is a result
@@ -231,8 +245,8 @@ def _in_memory(
         recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
         done = int(recorded[-1]) + 1 if len(recorded) else 0
         columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
-        columns |= named("plant", _by_column(plant.signals[:done]))
-        columns |= named("controller", _by_column(controller.signals[:done]))
+        columns |= _columns("plant", plant.signals[:done], only)
+        columns |= _columns("controller", controller.signals[:done], only)
         outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
         summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
         summary |= stages(scenario) | origin(scenario, date)

@@ -30,6 +30,8 @@ _BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
 _FAULTS = ("tripped", "safe")
 #: metrics of where a response ends, which a response that a trip cuts short does not have
 END_METRICS = ("p_final", "settling_s", "overshoot_pct")
+#: the recorded columns that the summary of a run in memory reads
+READ = frozenset({"true_p", "true_omega_u", "true_V", "true_i", "true_omega_g", "law", "ref_P_ref"})
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
 
 

@@ -15,6 +15,7 @@ from gfm_hil.engine.inproc import buffers
 from gfm_hil.recording.parts import Part
 from gfm_hil.results.report import finite
 from gfm_hil.results.runner import run_in_memory
+from gfm_hil.results.summary import READ
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
 
@@ -64,7 +65,7 @@ def simulate(
 ) -> tuple[dict[str, Any], NDArray[np.float64]]:
     """The summary of a run, as ``run_scenario`` would write it, and p at every tick, p.u."""
     try:
-        run = run_in_memory(scenario, (plant, controller))
+        run = run_in_memory(scenario, (plant, controller), READ)
     except UserError as problem:
         return {"status": "no-steady-state", "reason": str(problem), "events": []}, np.empty(0)
     return run.summary, np.asarray(run.columns["true_p"])
