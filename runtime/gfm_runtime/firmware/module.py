@@ -153,7 +153,8 @@ def make_modules(
     if real == FIXED:
         for name, law in laws.items():
             if law.inner is not None:
-                raise LawError(f"law {name!r}", "has an inner stage, which fixed point has not")
+                why = "has an inner stage, which fixed point has not; use float32 or --inner none"
+                raise LawError(f"law {name!r}", why)
         plain_ones = make_modules(laws, T_s, np.float64, omega_b)
         return [replace(m, fixed=make_fixed(m.name, m.record)) for m in plain_ones]
     stages = any(law.inner is not None for law in laws.values())
