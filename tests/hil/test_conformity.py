@@ -528,12 +528,21 @@ def test_wrong_test_files_are_told_in_one_line(
         (["--controller", "vsg-2.so"], "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
         (["--controller", "dll:nowhere.so"], "nowhere.so: there is no such file"),
         (["--law", "droop-3", "--map", "map.toml"], "map.toml: is of a controller"),
+        (["--controller", "c:own.so"], "measures currents, which only a run with an inner stage"),
+        (["--controller", "c:own.so", "--inner", "none"], "choose --inner virtual-stator"),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    says: str,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.so").touch()
     assert main(["conform", *arguments]) == 2
+    assert not (tmp_path / "runs").exists()
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
 

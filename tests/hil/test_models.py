@@ -239,7 +239,11 @@ def test_ports_are_found_by_name_and_by_map() -> None:
     [
         ({}, ["i_u", "E_u"], "omega_u comes from no output; name its port in the map file"),
         ({"fixed": {"E_u": 1.0}}, ["i_u", "omega_u", "E_u"], "E_u comes twice"),
-        ({"fixed": {"E_q": 1.0}}, ["i_u", "omega_u", "E_u"], "fixed: signal 'E_q' must be one of"),
+        (
+            {"fixed": {"E_q": 1.0}},
+            ["i_u", "omega_u", "E_u"],
+            "fixed: only a run with an inner stage",
+        ),
         ({"outputs": {"x": "E_u"}}, ["i_u", "omega_u"], "outputs.x: must be one of i_u, omega_u"),
         ({"inputs": {"p": "P"}}, ["i_u", "omega_u", "E_u"], "input p: signal 'P' must be one of"),
         (

@@ -302,6 +302,20 @@ def mastered(folder: Path, *options: str) -> Iterator[Any]:
             served.terminate()
 
 
+def test_it_waits_for_the_command_server_not_for_the_recording_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "parts").mkdir()
+    for file in ("scenario.toml", "parts/controller_progress.npy"):
+        (tmp_path / file).touch()
+
+    def stop(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gfm_hil.cli.xcp.time.sleep", stop)
+    assert main(["xcp", str(tmp_path), "--wait", "--port", "0"]) == 130
+
+
 @pytest.mark.processes
 def test_pyxcp_measures_and_calibrates_a_run(tmp_path: Path) -> None:
     folder = tmp_path / "run"

@@ -370,10 +370,10 @@ def test_limits_that_are_not_finite_are_refused() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "why"),
     [("priority", 4, "priority = 4 is not possible"), ("k_c", "0x0p+0", "k_c = 0.0 is not"),
-     ("row", [0, 1], "is not as"), ("I_max", "inf", "I_max must be finite"),
+     ("row", [0, 1], "record.row: must be 12 integers"), ("I_max", "inf", "I_max must be finite"),
      ("n", 13, "13 states"), ("n", -1, "-1 states"), ("error_map", 7, "error map 7"),
-     ("A", "nan", "is not as"), ("loop", "inf", "loop must be finite"),
-     ("decay", "0x1p+9999", "is not as")],
+     ("A", "nan", "record.A: must be 144 hexadecimal"), ("loop", "inf", "loop must be finite"),
+     ("decay", "0x1p+9999", "decay: must be 1 hexadecimal number")],
 )  # fmt: skip
 def test_a_record_that_the_kernel_cannot_hold_is_refused(
     key: str, value: Any, why: str, tmp_path: Path
@@ -393,7 +393,10 @@ def test_a_record_that_the_kernel_cannot_hold_is_refused(
         ('{"format": 9}', "format: 9 must be 1"),
         ('{"format": 1, "real": "int8"}', "real: 'int8' must be float32 or float64"),
         ('{"format": 1, "real": "float32", "style": "records", "laws": []}', "laws: there must"),
-        ('{"format": 1, "real": "float32", "style": "records", "laws": [{}]}', "is not as"),
+        (
+            '{"format": 1, "real": "float32", "style": "records", "laws": [{}]}',
+            "is not as gfmhil firmware export writes it ('name' is missing); export the folder",
+        ),
         ("[]", "is not as gfmhil firmware export writes it"),
     ],
 )
@@ -472,7 +475,8 @@ def test_the_command_exports_an_inner_stage(tmp_path: Path) -> None:
 
 def test_what_the_command_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, why in (
-        (["golden", "vsg-1", "--ticks", "0"], "--ticks 0: must be at least 1"),
+        (["export", "all", "vsg-1", "-o", str(tmp_path)], "law 'vsg-1': is named twice"),
+        (["golden", "vsg-1", "--ticks", "0"], "--ticks 0: must lie in [1, 1000000]"),
         (["export", "vsg-1", "vsg-1", "-o", str(tmp_path)], "law 'vsg-1': is named twice"),
         (["export", "vsg", "-o", str(tmp_path)], "law 'vsg': unknown"),
         (["export", "vsg-1", "--inner", "cascade", "-o", str(tmp_path)], "did you mean 'cascaded'"),

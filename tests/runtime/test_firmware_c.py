@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_runtime import get_law, load_law
+from gfm_runtime import LawError, get_law, load_law
 from gfm_runtime.firmware import (
     CHECKED,
     FIXED,
@@ -103,12 +103,27 @@ def test_every_stage_has_the_kernels_bits(
         pytest.param("host", "float64", "-O3 -march=haswell", marks=FUSES),
     ],
 )
-def test_fused_multiply_add_is_found(tmp_path: Path, target: str, real: str, flags: str) -> None:
+def test_fused_multiply_add_is_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], target: str, real: str, flags: str
+) -> None:
     """The negative control: with it the bits differ, and the command says so by its exit code."""
     folder = str(exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle"))
     command = ["firmware", "check", folder, "--target", target]
     assert main(command) == 0
     assert main([*command, f"--flags={flags} -ffp-contract=fast"]) == 3
+    assert "look for a fused multiply-add" in capsys.readouterr().err
+
+
+def test_a_folder_that_lacks_a_source_or_crashes_is_told(tmp_path: Path) -> None:
+    folder = exported(tmp_path, "float32", "unrolled", "vsg-1")
+    source = folder / "gfm_vsg_1.c"
+    text = source.read_text(encoding="utf-8")
+    source.write_text(text.replace("s->channel = -1;", "__builtin_trap();"), encoding="utf-8")
+    with pytest.raises(LawError, match="ended by SIG"):
+        check(folder, "host")
+    source.unlink()
+    with pytest.raises(LawError, match=r"gfm_vsg_1\.c: is not there; gfmhil firmware export"):
+        check(folder, "host")
 
 
 @pytest.mark.parametrize("style", STYLES)

@@ -41,6 +41,7 @@ from gfm_runtime.firmware import (
 )
 
 ALL = "all"
+_MOST = 1_000_000  # golden rows of a law, which fill some hundred megabytes
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -106,7 +107,9 @@ def _add_laws(command: argparse.ArgumentParser, reals: Sequence[str]) -> None:
 
 def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> None:
     command.add_argument("--real", choices=reals, default=reals[0], help="precision (float32)")
-    command.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
+    command.add_argument(
+        "--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s (1e-4)"
+    )
     command.add_argument(
         "--inner", metavar="NAME",
         help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
@@ -206,12 +209,19 @@ def call_check(options: argparse.Namespace) -> int:
         print(json.dumps([asdict(result) for result in results], indent=2))
     else:
         _print(results)
+        if any(result.differ for result in results):
+            print(
+                "gfmhil: words differ from the kernel's: look for a fused multiply-add, sums in a "
+                "wider type, numbers flushed to zero, or a changed source",
+                file=sys.stderr,
+            )
     return EXIT_OTHERWISE if any(result.differ for result in results) else 0
 
 
 def _sets(names: Sequence[str], inner: str | None) -> list[LawSet]:
     """The laws of these names, with an inner stage in place of their own."""
-    return [load_law(name, inner) for name in (law_names() if list(names) == [ALL] else names)]
+    given = (name for one in names for name in (law_names() if one == ALL else [one]))
+    return [load_law(name, inner) for name in given]
 
 
 def _laws(sets: Sequence[LawSet]) -> dict[str, Law]:
@@ -232,8 +242,8 @@ def _omega_b(f_n: float) -> float:
 
 
 def _ticks(ticks: int) -> int:
-    if ticks < 1:
-        raise UserError(f"--ticks {ticks}: must be at least 1")
+    if not 1 <= ticks <= _MOST:
+        raise UserError(f"--ticks {ticks}: must lie in [1, {_MOST}]")
     return ticks
 
 

@@ -25,7 +25,7 @@ from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model
-from gfm_hil.models import PIL, precision
+from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
 from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
@@ -99,7 +99,8 @@ def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Noti
     """The program that steps the model of --controller; empty without one.
 
     Raises:
-        UserError: the run is in process, or has no operating point.
+        UserError: there is no such model or map, the run is in process, has no operating point, or
+            does not carry what the model measures.
     """
     if options.controller is None:
         if options.map is not None:
@@ -107,7 +108,12 @@ def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Noti
         return []
     if scenario.link.type == INPROC:
         raise UserError("--controller: is a process, and a run in process has none; choose --link")
-    compile_for_model(scenario, notice, precision(options.controller))
+    real = precision(options.controller)
+    if not options.controller.startswith(PIL):
+        model_file(options.controller, FORMS)
+    read_map(options.map)
+    check_currents(options.controller, scenario.has_inner)
+    compile_for_model(scenario, notice, real)
     return model_command(options.controller, options.map)
 
 

@@ -44,6 +44,7 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
+    from gfm_hil.engine.announcement import present
     from gfm_hil.recording.live import begun
     from gfm_hil.xcp.lines import CanFd, Line, Udp
     from gfm_hil.xcp.serve import live_a2l, serve
@@ -51,7 +52,8 @@ def call(options: argparse.Namespace) -> int:
     line: Line = Udp(options.host, options.port, options.plain)
     if options.can is not None:
         line = CanFd(options.interface, options.can, *_identifiers(options.ids))
-    while options.wait and not begun(options.folder):
+    # a role records a moment before it announces its command server
+    while options.wait and not (begun(options.folder) and present(options.folder)):
         time.sleep(_LOOK_S)
     if options.a2l is not None:
         write_text(options.a2l, live_a2l(options.folder, line))

@@ -1,4 +1,14 @@
-from .model import FORMS, PIL, Model, ModelError, Rig, model_file, open_model, precision
+from .model import (
+    FORMS,
+    PIL,
+    Model,
+    ModelError,
+    Rig,
+    check_currents,
+    model_file,
+    open_model,
+    precision,
+)
 from .pil import PilModel
 from .ports import PortMap, read_map
 
@@ -10,6 +20,7 @@ __all__ = [
     "PilModel",
     "PortMap",
     "Rig",
+    "check_currents",
     "model_file",
     "open_model",
     "precision",

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.model import ModelError, Rig, run_name, ticks_a_step
+from gfm_hil.models.model import ModelError, Rig, check_currents, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap
 from gfm_runtime.signals import carried, names
 
@@ -64,11 +64,7 @@ class LibraryModel:
     def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
         if ports != PortMap(step_s=ports.step_s):
             raise UserError(f"{path.name}: of a map it takes step_s only; its ports are fixed")
-        if not rig.inner:
-            raise UserError(
-                f"{path.name}: measures currents, which only a run with an inner stage carries: "
-                "choose --inner virtual-stator"
-            )
+        check_currents(f"c:{path.name}", rig.inner)
         self._of = _loaded(path)
         said = self._of.gfmhil_name()
         self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)

@@ -122,6 +122,19 @@ def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
     return kind, path
 
 
+def check_currents(text: str, inner: bool) -> None:
+    """Check that a run, with an inner stage or without, carries what a library in C measures.
+
+    Raises:
+        UserError: ``text`` is ``c:FILE``, and the run has no inner stage.
+    """
+    if text.startswith("c:") and not inner:
+        raise UserError(
+            f"controller {text}: measures currents, which only a run with an inner stage carries: "
+            "choose --inner virtual-stator"
+        )
+
+
 def precision(text: str) -> str:
     """The precision, float64 or float32, of the laws beside the model that ``text`` names.
 

@@ -177,6 +177,11 @@ def _columns(rows: list[tuple[int, int, float]]) -> tuple[_Column, _Column, NDAr
 
 def _place(where: str, wanted: Scaled, known: Sequence[str]) -> int:
     if wanted.signal not in known:
+        if wanted.signal in (*carried("y", True), *carried("u", True)):
+            raise UserError(
+                f"{where}: only a run with an inner stage carries {wanted.signal!r}: choose one "
+                "by --inner"
+            )
         raise UserError(
             f"{where}: signal {wanted.signal!r} must be one of {', '.join(known)}; "
             "name it in the map file"

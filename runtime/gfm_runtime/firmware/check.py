@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -154,14 +155,17 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
             a program that does not end as it should.
     """
     found, where = read_report(folder), need_tools(target)
+    names = [m.prefix for m in found.modules]
+    names += ["gfm"] * (found.style == "records")
+    for file in (folder / f"{name}.c" for name in (*names, "selftest")):
+        if not file.is_file():
+            raise LawError(str(file), "is not there; gfmhil firmware export writes it")
     rows = golden(found.modules, ticks)
     with tempfile.TemporaryDirectory(prefix="gfmhil-firmware-") as work:
         at = Path(work)
         (at / "golden.bin").write_bytes(
             rows.words.astype(rows.words.dtype.newbyteorder("<")).tobytes()
         )
-        names = [m.prefix for m in found.modules]
-        names += ["gfm"] * (found.style == "records")
         rest = [folder.resolve() / "selftest.c", Path(str(HARNESS.joinpath("harness.c")))]
         hooks = ["-DGOLDEN_NO_MAIN", "-DGOLDEN_CLOCK=clock_now"]
         build(folder.resolve(), at, where, names, [*hooks, *map(str, rest)], flags)
@@ -253,7 +257,9 @@ def called(command: Sequence[str], at: Path) -> str:
     said = done.stdout + done.stderr
     if done.returncode:
         errors = [line for line in said.splitlines() if "error" in line] or said.splitlines()
-        raise LawError(command[0], f"failed: {next(iter(errors), f'code {done.returncode}')}")
+        code = done.returncode
+        ended = f"code {code}" if code > 0 else f"ended by {signal.Signals(-code).name}"
+        raise LawError(command[0], f"failed: {next(iter(errors), ended)}")
     return said
 
 

@@ -157,7 +157,8 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
     except Exception as problem:  # pyelftools raises anything for what is damaged
         raise LawError(where, f"is damaged: {problem!r}") from None
     if not found:
-        raise LawError(where, "has no variable of an exported law (gfm_..._t, gfm_law_t)")
+        why = "has no variable of an exported law (gfm_..._t, gfm_law_t); compile its file with -g"
+        raise LawError(where, why)
     return sorted(found.values(), key=lambda entry: entry.address), big_endian
 
 

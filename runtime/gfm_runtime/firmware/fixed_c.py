@@ -26,7 +26,7 @@ from gfm_runtime.firmware.fixed import (
 )
 from gfm_runtime.firmware.module import FIXED_CHOICES, MADE, Module, about, keys_of
 from gfm_runtime.firmware.unrolled import body
-from gfm_runtime.signals import NU, group
+from gfm_runtime.signals import NU, U_NAMES, group
 
 ROWS = (1, 0, 2)  # of u: omega_u first, since column 3 feeds it back
 
@@ -176,11 +176,12 @@ def text_of(total: Sum, law: FixedLaw, first: str = "") -> str:
 
 def _checks(guard: str) -> list[str]:
     lines = []
-    for letter, many in (("Y", YS), ("REF", REFS)):
-        for j, one in enumerate(many):
+    for letter, many, signals in (("Y", YS, group("y")), ("REF", REFS, group("ref"))):
+        for j, (one, s) in enumerate(zip(many, signals, strict=True)):
             value = one.text.removeprefix("t->")
             lines += [
-                f"    if ({value} < {one.low} || {value} > {one.high}) {{",
+                f"    if ({value} < {one.low} || {value} > {one.high}) {{ "
+                f"/* {s.name}, {s.low:g} to {s.high:g} p.u. */",
                 f"        *channel = {j};",
                 f"        return {guard}_BAD_{letter};",
                 "    }",
@@ -194,7 +195,9 @@ def _output(law: FixedLaw) -> list[str]:
         total, to_excess = law.output[i], law.shift(law.output[i], EXCESS + i)
         shift = law.shift(total, U + i)
         low, high = (_wide(limit << shift) for limit in (law.low[i], law.high[i]))
+        ends = (f"{limit / 2 ** US[i].q:g}" for limit in (law.low[i], law.high[i]))
         lines += [
+            f"/* {U_NAMES[i]}, {' to '.join(ends)} p.u. */",
             f"t->raw[{i}] = {text_of(total, law)};",
             f"if (t->raw[{i}] > {high}) {{",
             f"    t->u[{i}] = {law.high[i]};",

@@ -50,9 +50,12 @@ def export(
     """
     fixed = real == FIXED
     if fixed and style != "unrolled":
-        raise LawError("--style records", "fixed point has its constants in the code")
+        raise LawError("--style records", "fixed point has its constants in the code; leave it out")
     for one in scheduled if fixed else ():
-        raise LawError(f"law {one.name!r}", "is scheduled, which fixed point does not cover")
+        raise LawError(
+            f"law {one.name!r}",
+            "is scheduled, which fixed point does not cover; export its stages as laws",
+        )
     modules = make_modules(laws, T_s, real, omega_b)
     by_name = {m.name: m for m in modules}
     choosing: dict[str, str] = {}

@@ -153,7 +153,8 @@ def make_modules(
     if real == FIXED:
         for name, law in laws.items():
             if law.inner is not None:
-                raise LawError(f"law {name!r}", "has an inner stage, which fixed point has not")
+                why = "has an inner stage, which fixed point has not; use float32 or --inner none"
+                raise LawError(f"law {name!r}", why)
         plain_ones = make_modules(laws, T_s, np.float64, omega_b)
         return [replace(m, fixed=make_fixed(m.name, m.record)) for m in plain_ones]
     stages = any(law.inner is not None for law in laws.values())
@@ -295,12 +296,16 @@ def about(m: Module, T_s: float) -> str:
             numbers = ", ".join(f"{name} = {value}" for name, value in acting(m.law.inner).items())
             lines += [f"Inner stage at f_n = {f_n:g} Hz: {m.law.inner.kind}, {numbers}"]
     lines += [
-        f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.precision}.",
-        "Integers only: every compiler gives the same bits."
-        if m.fixed
-        else "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
+        f"Discretised by Tustin; call step every T_s = {T_s:g} s. {m.n} states, {m.precision}."
     ]
-    return "/* " + "\n * ".join(_wrapped(lines)) + "\n */"
+    if m.fixed:
+        lines += ["Integers only: every compiler gives the same bits."]
+    else:
+        lines += [
+            "Constants are hexadecimal, exact to the bit: 0x1.8p+1 is 1.5 * 2^1, which is 3.",
+            "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
+        ]
+    return "/* " + "\n".join(f" * {line}".rstrip() for line in _wrapped(lines))[3:] + "\n */"
 
 
 def _wrapped(lines: Sequence[str], width: int = 96) -> list[str]:
@@ -329,12 +334,12 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
     of_phi = f", {phi[0]} = {NU}, {phi[1]} = {NY}" * stages
     rows.append(f"enum {{ {guard}_NX = {max(1, n)}{of_phi} }};")
     root = "sqrtf" if real == np.float32 else "sqrt"
-    where = f"/* The signal table of gfmhil, version {TABLE_VERSION} ({table_hash()}): the order of"
+    where = f"/* The order of ref, y and u: gfmhil's signal table, version {TABLE_VERSION}"
     return {
         "P": prefix,
         "GUARD": guard,
         **C_TYPES[str(real)],
-        "SIGNALS": "\n".join([where, " * ref, y and u. */", *rows]),
+        "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
         "REASONS": _enumerators(guard),
         "Y_CHECKS": _checks("y", y, real),
         "REF_CHECKS": _checks("ref", ref, real),
@@ -381,7 +386,7 @@ def _checks(vector: str, signals: Sequence[Signal], real: np.dtype[Any]) -> str:
         inside = f"{value} >= {low} && {value} <= {high}"
         if s.low == -s.high:
             inside = f"{'fabsf' if real == np.float32 else 'fabs'}({value}) <= {high}"
-        lines.append(f"!({inside}) ? {j}")
+        lines.append(f"!({inside}) ? {j} /* {s.name}, {s.low:g} to {s.high:g} p.u. */")
     return "\n             : ".join(lines)
 
 

@@ -104,8 +104,10 @@ def read_report(folder: Path) -> Exported:
         return _exported(whole)
     except LawError as problem:
         raise problem.within(str(path)) from None
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, IndexError):
-        raise LawError(str(path), "is not as gfmhil firmware export writes it") from None
+    except (KeyError, TypeError, ValueError, AttributeError) as problem:
+        lacks = f" ({problem} is missing)" if isinstance(problem, KeyError) else ""
+        why = f"is not as gfmhil firmware export writes it{lacks}; export the folder again"
+        raise LawError(str(path), why) from None
 
 
 @np.errstate(over="ignore")  # what overflows is refused
@@ -141,12 +143,16 @@ def _record(
     out = np.zeros(1, dtype)
     integers, numbers_of = named
     for name in (*integers, *numbers_of):
-        text = given[name]
-        if name in integers:
-            out[0][name] = text
-        else:
-            numbers = [float.fromhex(word) for word in text.split()]
-            out[0][name] = np.reshape(numbers, dtype[name].shape)
+        text, shape = given[name], dtype[name].shape
+        try:
+            if name in integers:
+                out[0][name] = text
+            else:
+                out[0][name] = np.reshape([float.fromhex(word) for word in text.split()], shape)
+        except (TypeError, ValueError, OverflowError, AttributeError):
+            kind = "integer" if name in integers else "hexadecimal number"
+            wanted = f"{math.prod(shape)} {kind}{'s' * (math.prod(shape) > 1)}"
+            raise LawError(f"record.{name}", f"must be {wanted}; export the folder again") from None
     return out[0]
 
 

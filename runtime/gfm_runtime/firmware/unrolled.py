@@ -16,7 +16,7 @@ import numpy as np
 from gfm_runtime.error_maps import DC_ENERGY, DVOC, HYBRID_ANGLE
 from gfm_runtime.firmware.c_text import literal
 from gfm_runtime.inner import NONE
-from gfm_runtime.signals import NU, NY
+from gfm_runtime.signals import NU, NY, U_NAMES
 
 _MAPS = {DC_ENERGY: "dc_energy", DVOC: "dvoc", HYBRID_ANGLE: "hybrid_angle"}
 
@@ -139,6 +139,8 @@ class Unrolled:
             else:
                 total = _sum([total, *self._products([law["D_y"][i, 2]], "t->u[1]")])
             low, high = self._number(law["low"][i]), self._number(law["high"][i])
+            ends = (f"{float(law[end][i]):g}" for end in ("low", "high"))
+            lines.append(f"/* {U_NAMES[i]}, {' to '.join(ends)} p.u. */")
             lines.append(f"t->raw[{i}] = {total};")
             lines.append(f"t->u[{i}] = limited(t->raw[{i}], {low}, {high});")
         return lines

@@ -13,7 +13,7 @@ from pathlib import Path
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
-from gfm_hil.models import FORMS, PIL, model_file, precision, read_map
+from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import (
     model_command,
@@ -29,6 +29,8 @@ from gfm_hil.studies.conformity.model import Criterion, Declared, InEnvelope, Nf
 from gfm_hil.studies.conformity.sets import Case, scenario_of
 from gfm_hil.studies.envelopes import measure_unit
 from gfm_hil.studies.identification import identify
+from gfm_runtime import law_file
+from gfm_runtime.inner_file import named_inner
 
 _POLL_S = 0.2
 
@@ -179,10 +181,15 @@ def make_jobs(
         laws: files by name. The model begins at the operating point of the first one, or, without
             laws, of the law that a scenario has by default.
         cases, inner, under, converters, folder, figures, foreign: as for ``Job``.
+
+    Raises:
+        UserError: the model measures currents, and its runs have no inner stage.
     """
     each: list[tuple[str, str, Foreign | None]] = [(*law, None) for law in laws.items()]
     if foreign is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
+        stage = law_file(start).inner if inner is None else named_inner(inner)
+        check_currents(foreign.name, stage is not None)
         each.append((foreign.name, start, foreign))
     return [
         Job(law, file, case, part, inner, under, converters, folder, figures, model)

@@ -55,8 +55,8 @@ void @P@_init(@P@_t *s);
 /* @end@ */
 void @P@_reset(@P@_t *s);
 
-/* One tick: from the references and measurements at tick k to u[k], and the state to k + 1.
- * u stays as it is when the result is not OK. */
+/* One tick: from the references and measurements sampled at tick k to u[k], and the state to k + 1.
+ * Let u[k] act from tick k + 1 on, as the bench does. u stays as it is when the result is not OK. */
 int @P@_step(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
     @P@_real u[]);
 

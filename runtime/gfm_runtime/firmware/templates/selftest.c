@@ -1,6 +1,6 @@
 /* @MADE@
  *
- * On any machine: cc -std=c99 -O2 -ffp-contract=off *.c && ./a.out
+ * On any machine: cc -std=c99 -O2 -ffp-contract=off *.c -lm && ./a.out
  * It returns 0 when every bit of every output and state is that of golden.h. A board without a screen
  * calls golden_row for the rows of golden.h, and looks at the result. */
 #include "selftest.h"
