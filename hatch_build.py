@@ -12,6 +12,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 FILES = (
     "scenarios/**/*.csv",
     "scenarios/**/LICENSE.txt",
+    "scenarios/**/*.py",
     "scenarios/**/*.toml",
     "deploy/can/*",
     "deploy/container/Containerfile",

@@ -207,7 +207,8 @@ def test_wheel_holds_packages_and_scenarios(tmp_path: Path) -> None:
     }
     wanted |= {
         f"gfm_hil/{path.relative_to(ROOT).as_posix()}"
-        for path in (ROOT / "scenarios").rglob("*.toml")
+        for suffix in ("toml", "py")
+        for path in (ROOT / "scenarios").rglob(f"*.{suffix}")
     }
     wanted |= {f"gfm_hil/{name}" for name in committed("deploy")}
     assert {name for name in held if name.startswith("gfm_hil/deploy/")} <= wanted  # and no key

@@ -13,7 +13,7 @@ import pytest
 
 from gfm_design.margins.all_margins import loop_margins
 from gfm_design.margins.classical import gain_phase
-from gfm_design.margins.delays import delay_at_u, delay_at_y, first_loss, longest, overall_delay
+from gfm_design.margins.delays import DelayMargins, first_loss, longest, overall_delay
 from gfm_design.margins.disk import disk_margin, mu_bound
 from gfm_design.margins.locus import locus_at_u, locus_at_y
 from gfm_design.margins.tolerance import (
@@ -36,6 +36,7 @@ from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.loop_delay import loop_delay
 from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
 from gfm_plant import load_converter, phase_jump
+from gfm_runtime import Law, load_law
 
 from ..support.loops import reference_loop
 
@@ -58,7 +59,7 @@ def chain(num: list[float], den: list[float], gain: float, samples: float = 0.0)
     return ClosedLoop(plant, law, T, samples * T)
 
 
-def loop_of(law: str, scenario: str, **plant: Any) -> ClosedLoop:
+def loop_of(law: str | Law, scenario: str, **plant: Any) -> ClosedLoop:
     s = load_scenario(scenario)
     changed = type(s.plant).model_validate({**s.plant.model_dump(exclude_unset=True), **plant})
     return ClosedLoop.of(law, changed, s.references.vector())
@@ -116,8 +117,10 @@ def test_agrees_with_python_control() -> None:
     omega = np.linspace(0.01, np.pi / T, 20_000)
     assert m.disk == pytest.approx(control.disk_margins(L, omega, 0.0)[0], rel=1e-4)
     # far below the sampling rate, the exact held delay equals that from the phase margin
-    assert delay_at_u(loop, 2).seconds == pytest.approx(np.radians(pm) / w_p, rel=0.01)
-    assert delay_at_y(loop, 4).seconds == pytest.approx(delay_at_u(loop, 2).seconds, rel=1e-5)
+    assert DelayMargins(loop).at_u(2).seconds == pytest.approx(np.radians(pm) / w_p, rel=0.01)
+    assert DelayMargins(loop).at_y(4).seconds == pytest.approx(
+        DelayMargins(loop).at_u(2).seconds, rel=1e-5
+    )
 
 
 def test_scan_stops_at_the_first_loss() -> None:
@@ -189,6 +192,31 @@ def test_margins_are_where_eigenvalues_cross(
             f = (1 + 0.999 * disk.alpha / 2 * turn) / (1 - 0.999 * disk.alpha / 2 * turn)
             changed = loop.scaled(u=f[:3]) if channels is m.u else loop.scaled(y=f)
             assert changed.sigma() < 0.0
+
+
+@pytest.mark.parametrize(
+    ("law", "inner", "plant"),
+    [
+        ("mimo-gfm", None, {}),
+        ("droop-5", None, {"delay": {"samples": 2, "fraction": 0.37}}),
+        ("vsg-2", "cascaded", {"delay": {"samples": 1}}),
+    ],
+)
+def test_turns_count_the_unstable_poles(law: str, inner: str | None, plant: dict[str, Any]) -> None:
+    """The first unstable value of each scan by the argument principle is that by eigenvalues."""
+    given = load_law(law, inner).laws[0]
+    loop = loop_of(given, "rig_pref_step", **plant)
+    found, ends = DelayMargins(loop), set()
+    cuts = [(True, [j]) for j in loop.commands] + [(False, [i]) for i in loop.measurements]
+    for at_u, channels in [(True, list(range(len(loop.u_delay)))), *cuts]:
+        late = np.zeros(len(loop.u_delay if at_u else loop.y_delay))
+        late[channels] = 1.0
+        each = [(late * s, 0.0) if at_u else (0.0, late * s) for s in found.scan]
+        lost = (k for k, by in enumerate(each) if loop.later(*by).sigma() >= 0.0)
+        expected = next(lost, len(each))
+        assert found._first_unstable(at_u, channels) == expected
+        ends.add(expected)
+    assert len(ends) > 1  # some are lost, at different values
 
 
 def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gfm_design.margins.classical import GainPhase, gain_phase
-from gfm_design.margins.delays import DelayMargin, delay_at_u, delay_at_y, longest, overall_delay
+from gfm_design.margins.delays import DelayMargin, DelayMargins, longest
 from gfm_design.margins.disk import DiskMargin, disk_margin
 from gfm_design.margins.locus import Locus, locus_at_u, locus_at_y
 from gfm_design.margins.tolerance import GridStrength, Range, element_ranges, grid_strength
@@ -95,26 +95,26 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     mode = loop.modes()[0]
     if mode.sigma > -_AT_REST:
         raise UnstableLoop(mode)
-    at_u, at_y = locus_at_u(loop), locus_at_y(loop)
+    at_u, at_y, delays = locus_at_u(loop), locus_at_y(loop), DelayMargins(loop)
     return LoopMargins(
         mode,
-        _channels(loop, at_u, True),
-        _channels(loop, at_y, False),
+        _channels(delays, at_u, True),
+        _channels(delays, at_y, False),
         disk_margin(at_u),
         disk_margin(at_y),
-        overall_delay(loop),
+        delays.overall(),
         longest(loop.T_s),
     )
 
 
-def _channels(loop: ClosedLoop, locus: Locus, at_u: bool) -> tuple[ChannelMargins, ...]:
+def _channels(delays: DelayMargins, locus: Locus, at_u: bool) -> tuple[ChannelMargins, ...]:
     names = U_CARRIED if at_u else Y_CARRIED
     omega, H = locus.sampled()
     found = []
     for k, channel in enumerate(locus.channels):
         classical = gain_phase(locus, omega, H, k)
-        delay = (delay_at_u if at_u else delay_at_y)(loop, channel)
-        confirmed = _confirmed(loop, channel, at_u, classical)
+        delay = (delays.at_u if at_u else delays.at_y)(channel)
+        confirmed = _confirmed(delays.loop, channel, at_u, classical)
         found.append(ChannelMargins(names[channel], classical, delay, confirmed))
     return tuple(found)
 

@@ -17,7 +17,8 @@ from gfm_design.margins.locus import Locus
 
 Vector = NDArray[np.float64]
 
-_BISECTIONS = 60
+_ROUNDS = 60
+_SAME = 1e-15  # relative distance of two values of a crossing
 _NO_LIMIT = 1e6  # a larger gain factor is due to rounding
 
 
@@ -45,8 +46,10 @@ class GainPhase:
 def gain_phase(locus: Locus, omega: Vector, H: NDArray[np.complex128], k: int) -> GainPhase:
     """Margins of the locus' k-th channel; omega and H from ``locus.sampled()``."""
 
+    alone = locus.of(k)
+
     def at(w: Vector) -> NDArray[np.complex128]:
-        return locus(w)[:, k, k]
+        return alone(w)[:, 0, 0]
 
     h = H[:, k, k]
     # at rest and at the Nyquist frequency H is real: a mode on the real axis crosses there
@@ -87,16 +90,21 @@ def _nearest(
 
 
 def _crossings(f: Callable[[Vector], Vector], omega: Vector, values: Vector) -> Vector:
-    """Where f changes its sign between two of omega, all bisected at once, rad/s."""
+    """Where f changes its sign between two of omega, all at once by the Illinois method, rad/s."""
     k = np.flatnonzero(np.sign(values[1:]) * np.sign(values[:-1]) < 0)
-    low, high, sign = omega[k].copy(), omega[k + 1].copy(), np.sign(values[k])
-    if not len(k):
-        return low
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        same = np.sign(f(middle)) == sign
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return 0.5 * (low + high)
+    (far, last), (f_far, f_last) = (np.array([of[k], of[k + 1]]) for of in (omega, values))
+    for _ in range(_ROUNDS):
+        if not len(k):
+            break
+        found = last - f_last * (last - far) / (f_last - f_far)
+        f_found = f(found)
+        crossed = np.sign(f_found) != np.sign(f_last)
+        far, f_far = np.where(crossed, last, far), np.where(crossed, f_last, f_far / 2)
+        steady = np.abs(found - last) <= _SAME * found
+        last, f_last = found, f_found
+        if steady.all():
+            break
+    return last
 
 
 def _peak(at: Callable[[Vector], NDArray[np.complex128]], omega: Vector, size: Vector) -> float:

@@ -61,7 +61,7 @@ def disk_margin(locus: Locus) -> DiskMargin:
     full = hinf_norm(locus.A, locus.B, locus.C, 0.5 * np.eye(m), locus.T_s).gain
     omega, H = locus.sampled()
     rough = mu_bound(H, _ROUGH)
-    top, at = _largest(locus, omega, rough, 0.0)
+    top, at = _largest(omega, H, rough, 0.0)
     # the maximum may lie between two frequencies: refine around every one that comes near it
     around = np.concatenate([[0.0], rough, [0.0]])
     summits = (rough >= around[:-2]) & (rough >= around[2:]) & (rough > _NEAR * top)
@@ -69,7 +69,8 @@ def disk_margin(locus: Locus) -> DiskMargin:
         low, high = omega[max(k - 1, 0)], omega[min(k + 1, len(omega) - 1)]
         for _ in range(_LOOKS):
             w = np.linspace(low, high, 9)
-            found, best = _largest(locus, w, mu_bound(locus(w), _ROUGH), top)
+            there = locus(w)
+            found, best = _largest(w, there, mu_bound(there, _ROUGH), top)
             if found <= top:
                 break
             top, at = found, best
@@ -77,19 +78,21 @@ def disk_margin(locus: Locus) -> DiskMargin:
     return DiskMargin(1.0 / top, at / (2 * np.pi), 1.0 / full)
 
 
-def _largest(locus: Locus, omega: Matrix, rough: Matrix, top: float) -> tuple[float, float]:
+def _largest(omega: Matrix, H: Response, rough: Matrix, top: float) -> tuple[float, float]:
     """The largest bound above ``top`` and its frequency; (top, nan) if there is none.
 
-    A rough bound is a bound too: a frequency with a rough bound below the largest one found needs
-    no refinement.
+    A rough bound is a bound too, and so is that by the scaling of another frequency: one that is
+    below the largest one found needs no refinement.
     """
-    at = np.nan
-    for k in np.argsort(-rough):
-        if rough[k] <= top:
-            break
-        bound = float(mu_bound(locus(omega[[k]]))[0])
-        if bound > top:
-            top, at = bound, float(omega[k])
+    at, rough = np.nan, rough.copy()
+    while rough[k := int(np.argmax(rough))] > top:
+        bounds, scalings = _scaled(H[[k]], _POWERS)
+        if bounds[0] > top:
+            top, at = float(bounds[0]), float(omega[k])
+        rough[k], d = 0.0, scalings[0]
+        left = rough > top
+        others = np.linalg.norm(H[left] * d[:, None] / d, 2, axis=(1, 2))
+        rough[left] = np.minimum(rough[left], others)
     return top, at
 
 
@@ -100,19 +103,25 @@ def mu_bound(H: Response, powers: tuple[tuple[int, int], ...] = _POWERS) -> Matr
     that minimises a norm which tends to sigma_max as the power grows. Any D gives a bound; the
     smallest one met is returned.
     """
-    log_d = np.zeros(H.shape[:2])
+    return _scaled(H, powers)[0]
+
+
+def _scaled(H: Response, powers: tuple[tuple[int, int], ...]) -> tuple[Matrix, Matrix]:
+    """The bounds (k,) of ``mu_bound`` and the D (k,m) of each."""
+    log_d, best = np.zeros(H.shape[:2]), np.ones(H.shape[:2])
     bound = np.linalg.norm(H, 2, axis=(1, 2))
     if H.shape[1] == 1:
-        return bound
+        return bound, best
     tiny = 1e-300
     for power, rounds in powers:
         for _ in range(rounds):
             d = np.exp(log_d)
             u, s, vh = np.linalg.svd(H * d[:, :, None] / d[:, None, :])
-            bound = np.minimum(bound, s[:, 0])
+            better = s[:, 0] < bound
+            bound, best[better] = np.minimum(bound, s[:, 0]), d[better]
             share = (s / np.maximum(s[:, :1], tiny)) ** (2 * power)
             rows = (np.abs(u) ** 2 * share[:, None, :]).sum(axis=2)
             columns = (np.abs(vh) ** 2 * share[:, :, None]).sum(axis=1)
             log_d += np.log((columns + tiny) / (rows + tiny)) / (4 * power)
             log_d = np.clip(log_d - log_d[:, :1], -40.0, 40.0)
-    return bound
+    return bound, best

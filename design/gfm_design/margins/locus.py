@@ -9,12 +9,13 @@ poles up to the Nyquist frequency.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import ClosedLoop, frequencies_near, response
+from gfm_design.model.closed_loop import ClosedLoop, Responses, frequencies_near
 
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -22,6 +23,7 @@ Response = NDArray[np.complex128]
 _LOWEST = 1e-3  # rad/s; below it H hardly changes, unless the loop has a pole there
 _STRAIGHT = 0.01
 _ROUNDS = 12
+_APART = 1e-9  # relative distance of two frequencies
 _GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 
 
@@ -39,10 +41,17 @@ class Locus:
     T_s: float
     channels: tuple[int, ...]
 
+    @cached_property
+    def _responses(self) -> Responses:
+        return Responses(self.A, self.B, self.C, 0.5 * np.eye(len(self.channels)))
+
     def __call__(self, omega: Matrix) -> Response:
         """H at omega [rad/s], shape (len(omega), m, m)."""
-        z = np.exp(1j * omega * self.T_s)
-        return response((self.A, self.B, self.C, 0.5 * np.eye(len(self.channels))), z)
+        return self._responses(np.exp(1j * omega * self.T_s))
+
+    def of(self, k: int) -> Locus:
+        """That of the k-th channel alone, shape (len(omega), 1, 1), all others closed."""
+        return replace(self, B=self.B[:, [k]], C=self.C[[k]], channels=self.channels[k : k + 1])
 
     def sampled(self) -> tuple[Matrix, Response]:
         """(omega, H(omega)) from 0 to the Nyquist frequency, as fine as the locus needs."""
@@ -51,6 +60,7 @@ class Locus:
         s = np.log(poles[np.abs(poles) > _GONE].astype(complex)) / self.T_s
         near, base = frequencies_near(s), np.geomspace(_LOWEST, top, 200)
         omega = np.unique(np.concatenate([[0.0, top], base, near[near < top]]))
+        omega = omega[np.diff(omega, prepend=-1.0) > _APART * omega]  # modes may be equal
         H = self(omega)
         for _ in range(_ROUNDS):
             # halves by ratio, as poles lie; the first interval begins at 0

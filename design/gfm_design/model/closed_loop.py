@@ -20,18 +20,21 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import schur
 
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import (
     LinearLaw,
     LinearPlant,
     Mode,
+    delay_lines,
     hold,
     linearise_law,
     linearise_plant,
     sampled_plant,
 )
 from gfm_design.model.operating_point import OperatingPoint, operating_point
+from gfm_design.norms.hinf import balance
 from gfm_design.norms.performance import (
     D_Q,
     PAPER_WEIGHTS,
@@ -119,6 +122,9 @@ class Surroundings(Protocol):
         Args:
             u_delay, y_delay: of the converter, as for ``ClosedLoop``.
         """
+
+    def lines(self, u_delay: Matrix, y_delay: Matrix) -> list[slice]:
+        """Where the delay line of each u, then of each y, of the converter is there."""
 
 
 class ClosedLoop:
@@ -334,6 +340,17 @@ class ClosedLoop:
         single = [LinearPlant(*m) for m in zip(p.A, p.B, p.B_d, p.C, p.C_true, strict=True)]
         each = zip(single, self.u_delay, self.y_delay, strict=True)
         return LinearPlant.stacked([sampled_plant(of, T_s, u, y, reads) for of, u, y in each])
+
+    @property
+    def lines(self) -> list[slice]:
+        """Where the delay line of each u, then of each y, is among the states of ``held``, for a
+        single sampled loop."""
+        if self.T_s is None:
+            raise ValueError("a continuous loop has no delay lines; sample it first")
+        delays = self.u_delay, self.y_delay
+        if self.around is not None:
+            return self.around.lines(*delays)
+        return delay_lines(self.plant, self.T_s, *delays)
 
     @cached_property
     def A(self) -> Matrix:
@@ -558,8 +575,26 @@ def frequencies_near(poles: Response) -> Matrix:
     return np.asarray(np.abs(poles.imag[:, None] + _ACROSS * poles.real[:, None]).ravel())
 
 
+class Responses:
+    """C (s I - A)^-1 B + D at many s, from one Schur form of A.
+
+    A, B and C are balanced first: without that, the largest elements would decide all rounding.
+    """
+
+    def __init__(self, A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:
+        A, B, C = balance(A, B, C)
+        self._T, Q = schur(A, output="complex")
+        self._B, self._C, self._D = Q.conj().T @ B, C @ Q, D
+
+    def __call__(self, s: Response) -> Response:
+        """One a row of s."""
+        T, (n, m) = self._T, self._B.shape
+        x, at = np.tile(self._B, len(s)), np.repeat(s, m)
+        for i in reversed(range(n)):
+            x[i] = (x[i] + T[i, i + 1 :] @ x[i + 1 :]) / (at - T[i, i])
+        return (self._C @ x).reshape(len(self._C), len(s), m).swapaxes(0, 1) + self._D
+
+
 def response(of: StateSpace, s: Response) -> Response:
     """C (s I - A)^-1 B + D, one a row of s."""
-    A, B, C, D = of
-    states = np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
-    return np.asarray(C @ states + D)
+    return Responses(*of)(s)

@@ -289,10 +289,12 @@ def hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return out[:n, :n], out[:n, n:]
 
 
-def delay_lines(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix) -> list[int]:
-    """How many states the delay line of each u, then of each y, has; see ``sampled_plant``."""
-    u_split, y_split = _splits(plant, T_s, u_delay, y_delay)
-    return [whole + (part > 0.0) for whole, part in (*u_split, *y_split)]
+def delay_lines(plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix) -> list[slice]:
+    """Where the delay line of each u, then of each y, is among the states of ``sampled_plant``."""
+    splits = _splits(plant, T_s, u_delay, y_delay)
+    counts = [whole + (part > 0.0) for of in splits for whole, part in of]
+    ends = len(plant.A) + np.cumsum([0, *counts])
+    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
 
 def sampled_plant(
@@ -315,33 +317,31 @@ def sampled_plant(
         reads: pairs of a command and a measurement that is the one that acts at its tick, as a PLL
             needs omega_u.
     """
-    n, n_u, n_y = len(plant.A), plant.B.shape[1], len(plant.C)
+    n, n_u = len(plant.A), plant.B.shape[1]
     u_split, y_split = _splits(plant, T_s, u_delay, y_delay)
     lines = delay_lines(plant, T_s, u_delay, y_delay)
-    at = n + np.concatenate([[0], np.cumsum(lines)]).astype(int)  # where each line begins
-    size = int(at[-1]) + len(reads)
+    size = lines[-1].stop + len(reads)
     now = np.eye(size + n_u + plant.B_d.shape[1])  # (state, u[k], d[k]) by rows
-    aged = [np.vstack([now[size + j], now[at[j] : at[j + 1]]]) for j in range(n_u)]  # u_j[k], ...
+    aged = [np.vstack([now[size + j], now[lines[j]]]) for j in range(n_u)]  # u_j[k], ...
     step = np.zeros((size, len(now)))
-    for j, count in enumerate(lines[:n_u]):
-        step[at[j] : at[j + 1]] = aged[j][:count]
+    for line, values in zip(lines, aged, strict=False):
+        step[line] = values[:-1]
     # through the tick, from one switching of a command or reading of an output to the next
     switches = [part * T_s for _, part in u_split]
     readings = [(1.0 - part) * T_s if part else 0.0 for _, part in y_split]
     x, inputs = now[:n], np.hstack([plant.B, plant.B_d])
     for t, then in pairwise(sorted({0.0, T_s, *switches, *readings})):
-        for i in range(n_y):
-            if lines[n_u + i] and t == readings[i]:
-                line = slice(at[n_u + i], at[n_u + i + 1])
+        for i, line in enumerate(lines[n_u:]):
+            if line.stop > line.start and t == readings[i]:
                 step[line] = np.vstack([plant.C[i] @ x, now[line][:-1]])
         u = [aged[j][whole + (t < switches[j])] for j, (whole, _) in enumerate(u_split)]
         A, B = hold(plant.A, inputs, then - t)
         x = A @ x + B @ np.vstack([*u, now[size + n_u :]])
     step[:n] = x
-    read = [now[at[n_u + i + 1] - 1, :size] for i in range(n_y)]  # the oldest of each line
+    read = [now[line.stop - 1, :size] for line in lines[n_u:]]  # the oldest of each line
     C_true = np.pad(plant.C_true, ((0, 0), (0, size - n)))
     prompt = np.pad(plant.C, ((0, 0), (0, size - n)))
-    C = np.where(np.array(lines[n_u:])[:, None] > 0, read, prompt)
+    C = np.where([[line.stop > line.start] for line in lines[n_u:]], read, prompt)
     for place, (command, measurement) in enumerate(reads, size - len(reads)):
         step[place], C[measurement] = u[command], now[place, :size]
     A, B, B_d = np.split(step, [size, size + n_u], axis=1)

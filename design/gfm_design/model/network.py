@@ -325,7 +325,8 @@ class NetworkLoop:
         lines = delay_lines(self.network.plant, self.T_s, self.u_delay, self.y_delay)
         of_u = [m.name for m in self.members for _ in range(m.u.start, m.u.stop)]
         of_y = [m.name for m in self.members for _ in range(m.y.start, m.y.stop)]
-        owners = [n for n, count in zip([*of_u, *of_y], lines, strict=True) for _ in range(count)]
+        each = zip([*of_u, *of_y], lines, strict=True)
+        owners = [name for name, line in each for _ in range(line.start, line.stop)]
         owners += [m.name for m in self.members for _ in m.reads]
         return owners + [m.name for m in self.members for _ in m.controller.A]
 
@@ -376,14 +377,26 @@ class _Others:
 
     def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
         loop, one = self.loop, self.loop.members[self.place]
-        u, y = loop.u_delay.copy(), loop.y_delay.copy()
-        u[one.u], y[one.y] = u_delay, y_delay
-        p = loop._steady(loop.held(u, y))
+        p = loop._steady(loop.held(*self._of_all(u_delay, y_delay)))
         A = _closed(p, [m for m in loop.members if m is not one])
         more = ((0, len(A) - len(p.A)), (0, 0))
         B, B_d = np.pad(p.B, more), np.pad(p.B_d, more)
         C, C_true = (np.pad(m, more[::-1]) for m in (p.C, p.C_true))
         return self.seen(LinearPlant(A, B, B_d, C, C_true))
+
+    def lines(self, u_delay: Matrix, y_delay: Matrix) -> list[slice]:
+        loop, one = self.loop, self.loop.members[self.place]
+        gone = len(loop.network.plant.A) - len(loop.network.turn)
+        lines = delay_lines(loop.network.plant, loop.T_s, *self._of_all(u_delay, y_delay))
+        own = lines[one.u] + lines[len(loop.u_delay) :][one.y]
+        return [slice(line.start - gone, line.stop - gone) for line in own]
+
+    def _of_all(self, u_delay: Matrix, y_delay: Matrix) -> tuple[Matrix, Matrix]:
+        """The delays of all converters, of this one as given."""
+        loop, one = self.loop, self.loop.members[self.place]
+        u, y = loop.u_delay.copy(), loop.y_delay.copy()
+        u[one.u], y[one.y] = u_delay, y_delay
+        return u, y
 
     def seen(self, p: LinearPlant) -> LinearPlant:
         """A plant of all with the commands and measurements of this converter alone."""

@@ -146,11 +146,13 @@ def balance(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     Poles from 1e-4 to 1e5 rad/s stand side by side in a weighted loop.
     """
     A, B, C = A.copy(), B.copy(), C.copy()
+    own = A.diagonal().copy()  # no scaling changes it
+    np.fill_diagonal(A, 0.0)
     for _ in range(20):
         steady = True
         for i in range(len(A)):
-            row = np.linalg.norm(np.delete(A[i], i)) + np.linalg.norm(B[i])
-            column = np.linalg.norm(np.delete(A[:, i], i)) + np.linalg.norm(C[:, i])
+            row = np.sqrt(A[i] @ A[i]) + np.sqrt(B[i] @ B[i])
+            column = np.sqrt(A[:, i] @ A[:, i]) + np.sqrt(C[:, i] @ C[:, i])
             if row == 0.0 or column == 0.0:
                 continue
             factor = 2.0 ** round(0.5 * np.log2(row / column))
@@ -162,4 +164,5 @@ def balance(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
                 C[:, i] *= factor
         if steady:
             break
+    np.fill_diagonal(A, own)
     return A, B, C
