@@ -15,7 +15,9 @@ The mark ``alone`` is for tests of the last two that fail beside another one on 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -35,6 +37,17 @@ settings.load_profile("gfmhil")
 settings.register_profile("fuzz", deadline=60_000, max_examples=20_000)
 
 _MOST_WORKERS = 8  # more would compile the same functions once more each
+#: Files that take longest in the other tiers, the longest first. Workers begin with them, and then
+#: with those of most tests: one that begins last leaves all processors but one idle.
+_LONGEST = (
+    "hil/test_network_links.py", "hil/test_scope_crowd.py", "hil/test_faults.py",
+    "hil/test_recover.py", "hil/test_identification.py", "hil/test_testing.py",
+    "hil/test_telemetry.py", "hil/test_e2e_loops.py", "hil/test_scope_browser.py",
+    "hil/test_campaign.py", "runtime/test_firmware_c.py", "hil/test_pil.py",
+    "runtime/test_firmware_targets.py", "runtime/test_firmware_fixed.py", "hil/test_models.py",
+    "hil/test_network.py", "runtime/test_firmware.py", "hil/test_conformity.py",
+    "hil/test_inner_links.py", "plant/test_network.py", "hil/test_network_design.py",
+)  # fmt: skip
 _TIER_OF = {**dict.fromkeys(("apt", "soak", "uml"), "systems"), "compilers": "full"}
 FAST, TIERS = "fast", ("full", "processes", "systems")
 
@@ -63,6 +76,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     """Run the fast tier on all processors, a file at a time, unless told how many (``-n``)."""
     if hasattr(config, "workerinput"):  # a worker, which must not start workers
         return
+    config.option.loadscopereorder = chosen(config) == {FAST}  # else see longest_first
     if chosen(config) <= {FAST, "full"} and getattr(config.option, "numprocesses", 0) is None:
         workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
         config.option.numprocesses, config.option.dist = workers, "loadfile"
@@ -74,6 +88,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left:
         config.hook.pytest_deselected(items=left)
         items[:] = [item for item in items if tier(item.iter_markers()) in tiers]
+    if hasattr(config, "workerinput") and tiers != {FAST}:
+        longest_first(items)
+
+
+def longest_first(items: list[pytest.Item]) -> None:
+    """Put the files of ``_LONGEST`` first, and the others by their number of tests."""
+    here = Path(__file__).parent
+    rank = {here / name: k for k, name in enumerate(_LONGEST)}
+    count = Counter(item.path for item in items)
+    items.sort(key=lambda item: (rank.get(item.path, len(rank)), -count[item.path], item.path))
 
 
 def tier(markers: Iterable[pytest.Mark]) -> str:

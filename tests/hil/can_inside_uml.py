@@ -56,7 +56,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 
 def run_while(scenario: str, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
     """``gfmhil run``; calls ``meanwhile`` after that many ticks; returns the summary."""
-    process = start("run", scenario, "--out", "out", "--quiet")
+    process = start("run", scenario, "--out", "out", "--quiet", "--no-figures")
     while True:
         part = Part.open(Path("out"), "plant")
         if part is not None and int(part.progress[0]) >= ticks:

@@ -40,7 +40,9 @@ class Kernel:
         )
         settings = {
             "PATH": os.environ["PATH"],
-            "PYTHONPATH": os.pathsep.join(str(source / name) for name in PACKAGES),
+            "PYTHONPATH": os.pathsep.join(
+                [*(str(source / name) for name in PACKAGES), str(_without_asammdf(folder))]
+            ),
             "HOME": str(folder),
             "NUMBA_CACHE_DIR": str(kept / "cache"),
             "MPLBACKEND": "Agg",
@@ -96,6 +98,17 @@ class Kernel:
         """End it and remove its files."""
         self.end()
         self._place.cleanup()
+
+
+def _without_asammdf(folder: Path) -> Path:
+    """A place for PYTHONPATH in which asammdf cannot be imported; no run needs it.
+
+    With it, python-can would load pandas and sympy in each process: a third of its start.
+    """
+    place = folder / "without"
+    place.mkdir()
+    (place / "asammdf.py").write_text('raise ImportError("asammdf is left out here")\n')
+    return place
 
 
 def _copy(target: Path) -> Path:
