@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import numpy as np
 
 from gfm_runtime.compiled import compiled
 
@@ -15,5 +15,5 @@ def quantise(value: float, lo: float, hi: float, lsb: float) -> float:
     """
     value = min(max(value, lo), hi)
     if lsb > 0.0:
-        value = lo + lsb * math.floor((value - lo) / lsb + 0.5)
+        value = lo + lsb * np.floor((value - lo) / lsb + 0.5)
     return value

@@ -8,6 +8,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from typing import Any
 
 from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
@@ -50,23 +51,31 @@ def call(options: argparse.Namespace) -> int:
         raise UserError("--workers, --dask: the cluster knows its workers; give one of them")
     if options.resume and (not options.out or options.only is not None):
         raise UserError("--resume: goes with --out, the folder to go on with, and without --only")
-    with _checking(options.quiet) as tell_checks:
-        campaign = load_campaign(options.file, tell_checks)
-    axes = find_axes(campaign, options.x, options.y)
-    if options.only is not None:
-        return _only(options, campaign)
-    store_at = new_folder(options.out, campaign.name)
     with contextlib.ExitStack() as stack:
-        executor, workers = None, options.workers or processors()
+        executor: Executor | None = None
+        workers = options.workers or processors()
+        own = options.only is None and not options.dask
+        with _checking(options.quiet) as tell_checks:
+
+            def check(done: int, of: int) -> None:
+                nonlocal executor
+                if own and executor is None:  # the file is good: workers start meanwhile
+                    executor = stack.enter_context(processes(workers))
+                tell_checks(done, of)
+
+            campaign = load_campaign(options.file, check)
+        axes = find_axes(campaign, options.x, options.y)
+        if options.only is not None:
+            return _only(options, campaign)
+        store_at = new_folder(options.out, campaign.name)
         if options.dask:  # before anything is written
             executor, workers = stack.enter_context(cluster(options.dask, campaign))
         store = Store(store_at, campaign, options.resume)
         jobs = store.missing(campaign)
         began, lost = time.monotonic(), None
         with Interrupt() as interrupt, _bar(campaign, store, options.quiet) as (tell, notice):
-            if jobs and executor is None:
+            if jobs and own:
                 compile_once(campaign, notice)
-                executor = stack.enter_context(processes(workers))
 
             def keep(records: list[Record]) -> None:
                 store.append(records)

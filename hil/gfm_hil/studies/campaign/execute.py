@@ -19,9 +19,9 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.studies.campaign.spec import Campaign
-from gfm_hil.studies.campaign.worker import Job, Record, record, run_chunk
+from gfm_hil.studies.campaign.worker import Job, Record, ready, record, run_chunk
 
-CHUNK = 8  # runs a task: about a second, so that little is lost and little is waited for
+CHUNK = 8  # runs a task: a quarter of a second, so that little is lost and little is waited for
 _AHEAD = 2  # tasks in hand a worker
 _POLL_S = 0.2
 
@@ -86,12 +86,17 @@ def _keep(done: set[Future[list[Record]]], keep: Callable[[list[Record]], None])
 
 @contextlib.contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of fresh processes, each with one thread."""
+    """A pool of fresh processes, each with one thread, which start at once."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
     try:
+        # they start with SIGINT blocked: Ctrl-C is the parent's to handle, also while they import
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        for _ in range(workers):
+            pool.submit(ready)
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
