@@ -29,6 +29,7 @@ from gfm_runtime.tustin import DiscreteLaw
 Vector = NDArray[np.float64]
 
 _ROUNDS = 40
+_ROUNDING = 1e-12  # p.u.; a residual that is smaller is none
 _NUDGE = 1e-7  # central differences; the error map is compiled for real numbers only
 
 
@@ -300,6 +301,8 @@ def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
     before, largest, jacobian = 0.0, math.inf, np.empty((0, 0))
     for _ in range(_ROUNDS):
         now = residual(z)
+        if np.abs(now).max() < _ROUNDING:  # near a dead network steps do not get shorter
+            return z
         if not largest < 0.1 * before:
             jacobian = _slopes(residual, z)
         step = np.linalg.lstsq(jacobian, now, rcond=1e-12)[0]
