@@ -25,6 +25,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import our_controller_on
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.models.model import ModelError
+from gfm_hil.realtime.priority import one_processor
 from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
 from gfm_runtime.firmware.check import TARGETS, need_tools
@@ -115,6 +116,7 @@ class PilModel:
         self._from = os.open(folder / FROM, os.O_RDONLY | os.O_NONBLOCK)
         self._ends.callback(os.close, self._from)
         self._log = self._ends.enter_context((folder / "log").open("w+b"))
+        self._ends.enter_context(one_processor())  # QEMU inherits it
         try:
             self._process = subprocess.Popen(
                 program.target.run, cwd=folder, stdin=subprocess.DEVNULL, stdout=self._log,
