@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.engine.inproc import CHUNK, buffers, run_ticks, stack
+from gfm_hil.engine.inproc import CHUNK, rows, run_ticks, stack
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.scenario.model import load_scenario
 
@@ -35,8 +35,7 @@ class Case:
             },
         }  # fmt: skip
         benches = make_benches(load_scenario(content))
-        parts = [buffers(CHUNK) for _ in benches]
-        self.rows = [np.stack([pair[side].signals for pair in parts]) for side in (0, 1)]
+        self.rows = rows(n, CHUNK, False)
         self.stack, self.plant = stack(benches), benches[0].plant
         self.kept = self.plant.copy()
         self.arrays = [*self.stack.controllers, self.stack.y, self.stack.u]

@@ -17,7 +17,7 @@ from gfm_plant.model import DELTA
 from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords, Record
 from gfm_plant.wiring import GRID_SOURCE, Wiring
 
-_DC_STEP = 0.1  # largest rate of the DC source's control times a step of the DC link's RK4
+_DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
 _ROUNDS = 100  # of the search for the currents of loads of constant power
@@ -250,12 +250,12 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
         rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
         if r["tau_dc"] > 0.0:
             rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
-        if rate * longest > 2 * _DC_STEP * _MOST:
+        if rate * longest > _DC_STEP * _MOST:
             raise ValueError(
                 f"plant.dc_source k_p, k_i, tau_s: with C_dc they are as fast as {rate:.6g}"
-                f" rad/s; allowed are {2 * _DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
+                f" rad/s; allowed are {_DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
             )
-        r["dc_steps"] = max(1, math.ceil(rate * max(net["half_h"][0, :parts]) / _DC_STEP))
+        r["dc_steps"] = max(1, math.ceil(rate * 2 * max(net["half_h"][0, :parts]) / _DC_STEP))
         for part, half in enumerate(net["half_h"][0, : 2 * parts]):
             net["sensor_weights"][0, part, k] = _low_pass(float(r["omega_s"] * 2 * half))
     for j in range(int(net[0]["n_sinks"])):

@@ -18,6 +18,9 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 _PAIRS = np.uint64(8)  # counters reserved for one tick
 _S30, _S27, _S31, _S32 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(32)
 _LOW_32, _LOW_30 = np.uint64(2**32 - 1), np.uint64(2**30 - 1)
+# of the series of cos and sin; the compiler does not turn a division into a product
+_C_4, _C_6, _C_8, _C_10 = (1 / math.factorial(n) for n in (4, 6, 8, 10))
+_S_3, _S_5, _S_7, _S_9 = (1 / math.factorial(n) for n in (3, 5, 7, 9))
 
 
 @compiled
@@ -40,8 +43,8 @@ def gaussians(seed: int, tick: int, pair: int) -> tuple[float, float]:
     # an angle between -45 and 45 degrees, by series, and one of four quarter turns
     x = (np.float64(bits & _LOW_30) * 2.0**-30 - 0.5) * (0.5 * math.pi)
     x2 = x * x
-    c = length * (1 - x2 / 2 * (1 - x2 / 12 * (1 - x2 / 30 * (1 - x2 / 56 * (1 - x2 / 90)))))
-    s = length * x * (1 - x2 / 6 * (1 - x2 / 20 * (1 - x2 / 42 * (1 - x2 / 72))))
+    c = length * (1 - x2 * (1 / 2 - x2 * (_C_4 - x2 * (_C_6 - x2 * (_C_8 - x2 * _C_10)))))
+    s = length * x * (1 - x2 * (_S_3 - x2 * (_S_5 - x2 * (_S_7 - x2 * _S_9))))
     quarter = (bits & _LOW_32) >> _S30
     if quarter == 0:
         return c, s

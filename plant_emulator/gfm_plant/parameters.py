@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -100,15 +100,21 @@ def load_converter(name_or_path: str | Path) -> ConverterParameters:
         OSError: If the path cannot be read.
     """
     if isinstance(name_or_path, str) and not name_or_path.endswith(".toml"):
-        folder = resources.files("gfm_plant") / "converters"
-        shipped = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir())
+        shipped = _shipped()
         if name_or_path not in shipped:
             raise ValueError(
                 f"converter = {name_or_path!r}: must be one of {', '.join(shipped)},"
                 " or the path of a .toml file"
             )
-        return _parsed((folder / f"{name_or_path}.toml").read_text(encoding="utf-8"))
+        return _parsed(shipped[name_or_path])
     return _parsed(Path(name_or_path).read_text(encoding="utf-8"))
+
+
+@cache
+def _shipped() -> dict[str, str]:
+    """The shipped files by the names of their converters."""
+    files = sorted((resources.files("gfm_plant") / "converters").iterdir(), key=lambda f: f.name)
+    return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files}
 
 
 @lru_cache(maxsize=16)

@@ -96,7 +96,7 @@ converter_par_dtype = np.dtype(
         ("k_i", "f8"),
         ("i_max", "f8"),
         ("tau_dc", "f8"),  # its lag, s (0: none)
-        ("dc_steps", "i8"),  # of RK4 for the DC link in half a piece, see `net`
+        ("dc_steps", "i8"),  # of the DC link in a piece, see `net`
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
         ("i_peak", "f8"),

@@ -58,8 +58,8 @@ def turned(x: float) -> tuple[float, float]:
     if abs(x) < 0.03:
         x2 = x * x
         return (
-            1 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 / 40320))),
-            x * (1 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 / 362880)))),
+            1 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 * (1 / 40320)))),
+            x * (1 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 * (1 / 362880))))),
         )
     return math.cos(x), math.sin(x)
 
@@ -183,7 +183,8 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega:
         size = d_r * d_r + d_i * d_i
         h = n.half_h[part]
         if size * h * h > 1e-8:
-            g_r, g_i = (n_r * d_r + n_i * d_i) / size, (n_i * d_r - n_r * d_i) / size
+            per_size = 1.0 / size
+            g_r, g_i = (n_r * d_r + n_i * d_i) * per_size, (n_i * d_r - n_r * d_i) * per_size
         else:  # nearly the mode's own frequency: h e^(lambda h) (1 + z/2 + z^2/6), z = d h
             z_r, z_i = d_r * h, d_i * h
             f_r = 1.0 + z_r / 2.0 + (z_r * z_r - z_i * z_i) / 6.0

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gfm_plant import NoEquilibrium
+from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.model import V_DC, f
 
 T_S = 1e-4
@@ -37,6 +38,49 @@ def test_lag_comes_after_the_limit(rest: Callable[..., Any]) -> None:
     plant.advance(100, plant.near(i_u=-9.0))  # one time constant towards -0.6
     start = plant.u[0]
     assert plant.truth()["i_dc"] == pytest.approx(-0.6 + (start + 0.6) * np.exp(-1.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("tau", [0.0, 1e-3])
+def test_a_source_that_reaches_its_limit(rest: Callable[..., Any], tau: float) -> None:
+    """Between two ticks; against SciPy in steps of 2 us, which see when."""
+    lag = {"tau_s": tau} if tau else {}
+    plant = rest(dc_source={"mode": "regulated", "i_max": 0.55, **lag})
+    r, u = plant.par[0], plant.near(omega_u=1e-2, E_u=2e-2)
+
+    def slope(_: float, z: Any) -> Any:
+        error = 1.0 - z[V_DC]
+        asked = r["k_p"] * error + z[8]
+        i, di = min(asked, 0.55), r["k_i"] * error
+        if asked > 0.55:
+            di = min(di, 0.0)
+        dx = f(z[:8].copy(), np.array([z[9] if tau else i, *u[1:]]), np.ones(2), plant.par)
+        return np.concatenate([dx, [di, (i - z[9]) / tau if tau else 0.0]])
+
+    z = np.concatenate([plant.x, [plant.u[0], plant.u[0]]])
+    t = np.arange(1, 101) * T_S
+    exact = solve_ivp(slope, (0, t[-1]), z, "DOP853", t, rtol=1e-11, atol=1e-12, max_step=2e-6)
+    v_dc = []
+    for _ in t:
+        plant.advance(u=u)
+        v_dc.append(plant.truth()["v_dc"])
+    assert min(v_dc) < 0.95  # it was at its limit
+    assert np.array(v_dc) == pytest.approx(exact.y[V_DC], abs=2e-8)
+
+
+@pytest.mark.parametrize("empty", [False, True])
+def test_a_link_that_empties(rest: Callable[..., Any], empty: bool) -> None:
+    """A load of constant power alone: C_dc / omega_b v v' = -p, so v^2 falls in a straight line."""
+    plant = rest()
+    r, s = plant.par[0], plant.st[0]
+    slope = -2.0 * r["omega_b"] / r["C_dc"]
+    ticks = 30 if empty else 29
+    s["x"][V_DC], s["u_now"][0], s["drawn"] = np.sqrt(-29.5 * slope * T_S), 0.0, 1.0
+    for _ in range(ticks):
+        advance_dc_link(r, s, T_S / 2)
+    if empty:
+        assert not s["x"][V_DC] > 0.0
+    else:
+        assert s["x"][V_DC] == pytest.approx(np.sqrt(-0.5 * slope * T_S), abs=1e-6)
 
 
 @pytest.mark.parametrize(("modulation", "most"), [("space-vector", 1.3026), ("sine", 1.1281)])

@@ -15,13 +15,15 @@ from numba.core import event
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.engine.inproc import buffers, compile_loop
+from gfm_hil.engine.inproc import compile_loop, rows
 from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
+from gfm_hil.recording.columns import kept_of
+from gfm_hil.recording.parts import Part
 from gfm_hil.scenario.model import Scenario
 
 #: a name for people, and what compiles the functions, or loads them from the cache
@@ -179,7 +181,14 @@ def _both(found: list[Bench]) -> Set:
 
 def _role(role: Role, found: list[Bench], which: str = "") -> Set:
     def compile_it() -> None:
-        parts = [buffers(1, bench.inner)[role == "controller"] for bench in found]
+        parts = [
+            Part(
+                rows(1, 1, bench.inner)[role == "controller"][0],
+                np.empty((0, len(kept_of(role))), np.int64),
+                np.zeros(2, np.int64),
+            )
+            for bench in found
+        ]
         compile_role(role, found, parts)
 
     return f"the {role}{which}", compile_it

@@ -16,12 +16,8 @@ from gfm_hil.engine.loop_records import ControllerRecords, Why
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, asks_to_start, obey, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
-from gfm_hil.recording.columns import (
-    CONTROLLER_TIMES,
-    PLANT_TIMES,
-    signals_of,
-)
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.parts import Kept, Part
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_is_delayed, plant_step
 from gfm_plant.synchro_check import WATCHING
@@ -29,6 +25,7 @@ from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
 
 CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
+_PIECE = 1_000  # ticks of all converters that are recorded at a time, in the processor's cache
 
 
 class Stack(NamedTuple):
@@ -70,7 +67,7 @@ def stack(benches: Sequence[Bench]) -> Stack:
 
 @compiled
 def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, goes_on):
-    """The compiled part of ``run_ticks``."""
+    """``run_ticks``; also whether every tick was done and left nothing to see to."""
     ctl, laws, states, est = stack.controllers
     y, u, st = stack.y, stack.u, plant.st
     delayed = plant_is_delayed(plant)
@@ -90,17 +87,17 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, go
         for i in range(len(ctl)):
             state = ctl[i].state
             if obey(plant, i, goes_on, state) != Why.GO_ON:
-                return k + 1
+                return k + 1, False
             if take(plant, i, u[i], st[i].trip, state, True) != Why.GO_ON:
-                return k + 1
+                return k + 1, False
         if not delayed:
             plant_step(plant)
         for i in range(len(ctl)):
             trips -= st[i].trip
             changed = asks_to_start(plant, i, ctl[i].state) or changed
         if changed or trips != 0 or plant.now[0].check > WATCHING:
-            return k + 1
-    return stop
+            return k + 1, False
+    return stop, True
 
 
 def run_ticks(
@@ -125,37 +122,37 @@ def run_ticks(
         goes_on: the run does after a trip.
     """
     rows = plant_rows, controller_rows
-    return int(_run_ticks(plant, controllers, *rows, start, stop, first, goes_on))
+    return int(_run_ticks(plant, controllers, *rows, start, stop, first, goes_on)[0])
 
 
 def run_inproc(
     benches: Sequence[Bench],
-    plant_parts: Sequence[Part],
-    controller_parts: Sequence[Part],
+    plant_parts: Sequence[Part | Kept],
+    controller_parts: Sequence[Part | Kept],
     timelines: Sequence[Timeline],
     go_on: Callable[[int], bool],
-) -> None:
+) -> int:
     """Run a whole scenario: of each converter its bench, its parts of the recording, and its
-    timeline. ``go_on`` gets the ticks done and returns whether to go on."""
+    timeline. ``go_on`` gets the ticks done and returns whether to go on. Returns the ticks done."""
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
-    goes_on, single = bench.scenario.survives_trips, len(benches) == 1
-    chunk = max(1, CHUNK // len(benches))
+    goes_on, plant = bench.scenario.survives_trips, bench.plant.records
+    chunk, piece = max(1, CHUNK // len(benches)), max(1, _PIECE // len(benches))
     controllers = stack(benches)
-    most = min(chunk, ticks)
-    plant_rows, controller_rows = _rows(plant_parts, most), _rows(controller_parts, most)
+    plant_rows, controller_rows = rows(len(benches), piece, bench.inner)
+    sides = (plant_rows, plant_parts), (controller_rows, controller_parts)
     while k < ticks and any(timeline.running for timeline in timelines):
         for timeline in timelines:
             timeline.carry_out(k)
-        stop = min(k + chunk, ticks, *(timeline.next_tick() for timeline in timelines))
-        begin = 0 if single else k
-        done = run_ticks(
-            bench.plant.records, controllers, plant_rows, controller_rows, k, stop, begin, goes_on
-        )
-        if not single:
-            for parts, rows in ((plant_parts, plant_rows), (controller_parts, controller_rows)):
-                for part, own in zip(parts, rows, strict=True):
-                    part.signals[k:done] = own[: done - k]
-        k = done
+        stop, calm = min(k + chunk, ticks, *(timeline.next_tick() for timeline in timelines)), True
+        while k < stop and calm:
+            end = min(k + piece, stop)
+            done, calm = _run_ticks(
+                plant, controllers, plant_rows, controller_rows, k, end, k, goes_on
+            )
+            for room, parts in sides:
+                for part, recorded in zip(parts, room, strict=True):
+                    part.put(k, recorded[: done - k])
+            k = done
         if bench.plant.net[0]["joins"]:
             follow_trips(bench.plant)
         elif int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
@@ -168,34 +165,19 @@ def run_inproc(
                 timeline.end("interrupted", "stopped by the operator", k)
     for timeline in timelines:
         timeline.finish(k)
+    return k
 
 
-def _rows(parts: Sequence[Part], ticks: int) -> NDArray[np.float64]:
-    """Where the loop records: of one converter its part itself, of several pieces of ``ticks``."""
-    if len(parts) == 1:
-        return parts[0].signals[None]
-    return np.empty((len(parts), ticks, parts[0].signals.shape[1]))
-
-
-def buffers(ticks: int, inner: bool = False) -> tuple[Part, Part]:
-    """Room in memory to record one run, with an inner stage or not: the plant's and the
-    controller's."""
-
-    def part(columns: Sequence[str], times: Sequence[str]) -> Part:
-        return Part(
-            np.empty((ticks, len(columns))),
-            np.empty((0, len(times)), np.int64),  # lockstep has no times
-            np.zeros(2, np.int64),
-        )
-
-    return (
-        part(signals_of("plant", inner), PLANT_TIMES),
-        part(signals_of("controller", inner), CONTROLLER_TIMES),
-    )
+def rows(
+    converters: int, ticks: int, inner: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Room for what the loop records: of the plant and of the controllers, each of shape
+    (converters, ticks, columns)."""
+    plant, controller = (len(signals_of(role, inner)) for role in ("plant", "controller"))
+    return np.empty((converters, ticks, plant)), np.empty((converters, ticks, controller))
 
 
 def compile_loop(benches: Sequence[Bench]) -> None:
     """Compile (or load from cache) the loop without running a tick."""
-    parts = buffers(1, benches[0].inner)
-    rows = [np.repeat(part.signals[None], len(benches), 0) for part in parts]
-    run_ticks(benches[0].plant.records, stack(benches), rows[0], rows[1], 0, 0)
+    room = rows(len(benches), 1, benches[0].inner)
+    run_ticks(benches[0].plant.records, stack(benches), *room, 0, 0)

@@ -10,7 +10,7 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,10 @@ class Part:
             mapped("progress", "i8", (2,), 0),
         )
 
+    def put(self, first: int, rows: NDArray[np.float64]) -> None:
+        """Record rows of consecutive ticks, the first of which is ``first``."""
+        self.signals[first : first + len(rows)] = rows
+
     @staticmethod
     def open(folder: Path, role: Role) -> Part | None:
         """The files of a role, or None if they do not exist or one of them is damaged."""
@@ -83,6 +87,33 @@ class Part:
         widths = known and times.shape[1:] == (len(kept_of(role)),)
         whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)
         return Part(*arrays) if whole and 0 <= progress[0] <= len(signals) else None
+
+
+class Kept:
+    """One side's columns in memory, to record one run after another.
+
+    Args:
+        role: whose.
+        ticks: of a run.
+        inner: the run has an inner stage, and records its signals.
+        only: names of the columns that are kept; None: all.
+    """
+
+    def __init__(
+        self, role: Role, ticks: int, inner: bool = False, only: Collection[str] | None = None
+    ) -> None:
+        recorded = signals_of(role, inner)
+        self._names = [name for name in recorded if only is None or name in only]
+        self._places = [recorded.index(name) for name in self._names]
+        self._columns = np.empty((len(self._names), ticks))
+
+    def put(self, first: int, rows: NDArray[np.float64]) -> None:
+        """As ``Part.put``."""
+        self._columns[:, first : first + len(rows)] = rows.T[self._places]
+
+    def named(self, done: int) -> dict[str, NDArray[np.float64]]:
+        """The columns of the first ``done`` ticks by name, as views of shape (done,)."""
+        return dict(zip(self._names, self._columns[:, :done], strict=True))
 
 
 def keep_in_memory(

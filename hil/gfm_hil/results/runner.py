@@ -6,25 +6,24 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.core.roles import ROLES
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
-from gfm_hil.engine.inproc import buffers, run_inproc
+from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
-from gfm_hil.recording.columns import Rows, named
+from gfm_hil.recording.columns import Rows
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
-from gfm_hil.recording.parts import Part, remove_parts
+from gfm_hil.recording.parts import Kept, Part, remove_parts
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, finish, in_use
@@ -35,8 +34,6 @@ from gfm_hil.scenario.toml_out import write_scenario
 __all__ = ["Notice", "Progress", "Run", "run_scenario"]
 
 Notice = Callable[[str], None]
-
-_PIECE = 256  # ticks
 
 
 def run_scenario(
@@ -175,25 +172,20 @@ def _run_here(
     return began
 
 
-def run_in_memory(
-    scenario: Scenario,
-    parts: tuple[Part, Part] | None = None,
-    only: Collection[str] | None = None,
-) -> Run:
+def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> Run:
     """Run a scenario in this process and leave nothing on the disk.
 
     Args:
         scenario: checked; its link and mode do not matter.
-        parts: from ``buffers``, to record into; the run's columns are copies.
-        only: the columns that the run keeps beside ticks and times, which must be at least
-            ``summary.READ``; None: all.
+        kept: what to record into, the plant's and the controller's columns, at least
+            ``summary.READ`` of them. The run's columns lie in there, so they are good until the
+            next run in the same room. None: new room for all columns.
 
     Raises:
         UserError: the scenario has no operating point.
     """
     bench = make_bench(scenario)
-    plant, controller = parts or buffers(scenario.ticks, bench.inner)
-    (run,) = _in_memory([bench], [plant], [controller], only)
+    (run,) = _in_memory([bench], [kept or _room(bench)])
     return run
 
 
@@ -204,37 +196,23 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
         UserError: the scenario has no operating point.
     """
     benches = make_benches(scenario)
-    parts = [buffers(scenario.ticks, scenario.has_inner) for _ in benches]
-    runs = _in_memory(benches, [plant for plant, _ in parts], [own for _, own in parts])
+    runs = _in_memory(benches, [_room(bench) for bench in benches])
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
 
 
-def _columns(
-    role: Role, rows: NDArray[np.float64], only: Collection[str] | None
-) -> dict[str, Rows]:
-    """A side's columns by name as contiguous copies."""
-    if only is not None:
-        views = named(role, rows)
-        return {name: np.ascontiguousarray(views[name]) for name in views if name in only}
-    out = np.empty(rows.shape, order="F")
-    for k in range(0, len(rows), _PIECE):  # pieces that stay in the processor's cache
-        out[k : k + _PIECE] = rows[k : k + _PIECE]
-    return dict(named(role, out))
+def _room(bench: Bench) -> tuple[Kept, Kept]:
+    """Room for all columns of a bench."""
+    ticks, inner = bench.scenario.ticks, bench.inner
+    return Kept("plant", ticks, inner), Kept("controller", ticks, inner)
 
 
-def _in_memory(
-    benches: Sequence[Bench],
-    plants: Sequence[Part],
-    controllers: Sequence[Part],
-    only: Collection[str] | None = None,
-) -> list[Run]:
-    """Run benches; the runs' columns are copies of the parts."""
-    for plant in plants:
-        plant.signals[:, 0] = np.nan  # tells below which ticks were recorded
+def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> list[Run]:
+    """Run benches; the runs' columns are those kept."""
+    plants, controllers = zip(*kept, strict=True)
     timelines = [TimelineInMemory(bench) for bench in benches]
     began, date = time.monotonic(), time.time()
     with np.errstate(all="ignore"):  # a diverging run is a result
-        run_inproc(benches, plants, controllers, timelines, lambda ticks: True)
+        done = run_inproc(benches, plants, controllers, timelines, lambda ticks: True)
     wall_s = time.monotonic() - began
     runs = []
     for bench, plant, controller, timeline in zip(
@@ -242,11 +220,8 @@ def _in_memory(
     ):
         timeline.close()
         scenario = bench.scenario
-        recorded = np.flatnonzero(~np.isnan(plant.signals[:, 0]))
-        done = int(recorded[-1]) + 1 if len(recorded) else 0
         columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
-        columns |= _columns("plant", plant.signals[:done], only)
-        columns |= _columns("controller", controller.signals[:done], only)
+        columns |= plant.named(done) | controller.named(done)
         outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
         summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
         summary |= stages(scenario) | origin(scenario, date)

@@ -89,7 +89,8 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of fresh processes, each with one thread, which start at once."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([run_chunk.__module__])  # what all import, once
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
     try:
         # they start with SIGINT blocked: Ctrl-C is the parent's to handle, also while they import

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compiled_bench
-from gfm_hil.engine.inproc import buffers
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import Kept
 from gfm_hil.results.report import finite
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.results.summary import READ
@@ -48,31 +47,39 @@ def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     Raises:
         RunFailed: an error that is not the run's own.
     """
-    parts: dict[bool, tuple[Part, Part]] = {}
+    room: dict[bool, tuple[Kept, Kept]] = {}
     records = []
     for run, law in jobs:
         try:
             scenario, drawn = campaign.scenario(run, law)
             inner = scenario.has_inner
-            if inner not in parts:
-                parts[inner] = buffers(scenario.ticks, inner)
-            summary, p = simulate(scenario, *parts[inner])
+            if inner not in room:
+                room[inner] = kept(scenario)
+            summary, columns = simulate(scenario, room[inner])
         except Exception as problem:
             words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
             raise RunFailed(words) from problem
-        records.append(record(run, law, scenario, drawn, summary, p))
+        records.append(record(run, law, scenario, drawn, summary, columns["true_p"]))
     return records
 
 
+def kept(scenario: Scenario) -> tuple[Kept, Kept]:
+    """Room for the columns of a run that its summary reads."""
+    ticks, inner = scenario.ticks, scenario.has_inner
+    return Kept("plant", ticks, inner, READ), Kept("controller", ticks, inner, READ)
+
+
 def simulate(
-    scenario: Scenario, plant: Part, controller: Part
-) -> tuple[dict[str, Any], NDArray[np.float64]]:
-    """The summary of a run, as ``run_scenario`` would write it, and p at every tick, p.u."""
+    scenario: Scenario, room: tuple[Kept, Kept]
+) -> tuple[dict[str, Any], Mapping[str, NDArray[np.float64]]]:
+    """The summary of a run, as ``run_scenario`` would write it, and the columns that it reads,
+    which are good until the next run in the same room."""
     try:
-        run = run_in_memory(scenario, (plant, controller), READ)
+        run = run_in_memory(scenario, room)
     except UserError as problem:
-        return {"status": "no-steady-state", "reason": str(problem), "events": []}, np.empty(0)
-    return run.summary, np.asarray(run.columns["true_p"])
+        summary = {"status": "no-steady-state", "reason": str(problem), "events": []}
+        return summary, dict.fromkeys(READ, np.empty(0))
+    return run.summary, {name: np.asarray(run.columns[name]) for name in READ}
 
 
 def record(

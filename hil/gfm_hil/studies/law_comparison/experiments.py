@@ -6,16 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.engine.inproc import buffers
-from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.scenario.model import check_scenario
-from gfm_hil.studies.campaign.worker import simulate
+from gfm_hil.studies.campaign.worker import kept, simulate
 
 START = "mimo-gfm"  # the law that the switchover comes from
 AT = 0.5  # s
 DURATION = 5.0  # s
 TRACE_EVERY = 40  # ticks
-_CURRENT = PLANT_COLUMNS.index("true_i")
 
 #: what happens, and how the plant differs from the ideal one
 EXPERIMENTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
@@ -51,13 +48,13 @@ def experiment(name: str, law: str) -> dict[str, Any]:
         "events": [{"t": AT, **event} | ({"law": law} if switched else {})],
     }
     scenario = check_scenario(content, f"law comparison, {name}")
-    parts = buffers(scenario.ticks, scenario.has_inner)
-    summary, p = simulate(scenario, *parts)
+    summary, columns = simulate(scenario, kept(scenario))
+    p = columns["true_p"]
     out: dict[str, Any] = {"status": summary["status"], "reason": summary["reason"]}
     at = round(AT / scenario.T_s)
     if summary["status"] == "completed":
         out |= {k: v for k, v in summary["events"][0].items() if k not in ("t", "tick", "type")}
-        out["i_peak"] = float(np.max(parts[0].signals[at : len(p), _CURRENT]))
+        out["i_peak"] = float(np.max(columns["true_i"][at:]))
         out["dp"] = float(np.max(np.abs(p[at:] - p[at - 1])))
     else:
         out["end_s"] = len(p) * scenario.T_s - AT
