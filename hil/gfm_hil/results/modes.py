@@ -117,7 +117,9 @@ def _filter(stride: int) -> Vector:
     """Weights of a window's ticks in order, in rows of ``stride``; zeros fill the last one."""
     taps = _TAPS * stride + 1
     least = scipy.signal.minimum_phase(
-        scipy.signal.firwin(taps, 0.8 / stride), n_fft=scipy.fft.next_fast_len(32 * taps), half=False
+        scipy.signal.firwin(taps, 0.8 / stride),
+        n_fft=scipy.fft.next_fast_len(32 * taps),
+        half=False,
     )
     return np.pad(least / least.sum(), (0, stride - 1)).reshape(_TAPS + 1, stride)
 
