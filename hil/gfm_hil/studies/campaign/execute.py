@@ -90,7 +90,8 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([run_chunk.__module__])  # what all import, once
+    # what all import, once; scipy loads its parts when they are first used
+    context.set_forkserver_preload([run_chunk.__module__, "scipy.signal", "scipy.linalg"])
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
     try:
         # they start with SIGINT blocked: Ctrl-C is the parent's to handle, also while they import
