@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.studies.campaign.spec import Campaign
-from gfm_hil.studies.campaign.worker import Job, Record, ready, record, run_chunk
+from gfm_hil.studies.campaign.worker import Job, Record, record, run_chunk
 
 CHUNK = 8  # runs a task: a quarter of a second, so that little is lost and little is waited for
 _AHEAD = 2  # tasks in hand a worker
@@ -86,18 +87,18 @@ def _keep(done: set[Future[list[Record]]], keep: Callable[[list[Record]], None])
 
 @contextlib.contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of fresh processes, each with one thread, which start at once."""
+    """A pool of processes with one thread each. They are forked, when there is work, from a server
+    that at once begins to import what all need."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("forkserver")
-    # what all import, once; scipy loads its parts when they are first used
+    # scipy loads its parts when they are first used
     context.set_forkserver_preload([run_chunk.__module__, "scipy.signal", "scipy.linalg"])
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
     try:
-        # they start with SIGINT blocked: Ctrl-C is the parent's to handle, also while they import
+        # it starts with SIGINT blocked: Ctrl-C is the parent's to handle, also while it imports
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        for _ in range(workers):
-            pool.submit(ready)
+        forkserver.ensure_running()
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         yield pool
     finally:

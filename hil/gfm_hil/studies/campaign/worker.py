@@ -37,10 +37,6 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
         return
 
 
-def ready() -> None:
-    """Do nothing: a process that is asked to has then imported what a run takes."""
-
-
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     """The records of some runs.
 
