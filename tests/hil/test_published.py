@@ -1,11 +1,12 @@
 """Results that others published, beside ours: the test cases of PowerSimulationsDynamics.jl, which
-its authors compare with PSCAD (commit d94d74e7d; the CSV files lie beside the scenarios)."""
+its authors compare with PSCAD (commit d94d74e7d), and Dynawo's three grid-forming converters. The
+CSV files lie beside the scenarios."""
 
 from __future__ import annotations
 
 import runpy
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -112,3 +113,69 @@ def test_files_beside_a_scenario_are_found_from_anywhere(
     scenario = load_scenario(FOLDER / "psid_droop_inverter.toml")
     assert scenario.law == str((FOLDER / "published" / "psid_droop.toml").absolute())
     assert Path(scenario.plant.converter).is_absolute()
+
+
+class Dynawo(NamedTuple):
+    """Dynawo's points, its equations, and our bench at the same instants.
+
+    Attributes:
+        t: s.
+        omega, i: published, of droop, dVOC and matching control, p.u., shape (3, points).
+        equations: of the script beside the points.
+        bench: frequencies and currents of the bench, shape (3, points) each.
+    """
+
+    t: np.ndarray
+    omega: np.ndarray
+    i: np.ndarray
+    equations: dict[str, Any]
+    bench: tuple[np.ndarray, np.ndarray]
+
+    def solved(self, of: str) -> tuple[np.ndarray, np.ndarray]:
+        omega, i = self.equations["solved"](self.t, self.equations[of])
+        return omega, i
+
+
+@pytest.fixture(scope="module")
+def dynawo() -> Dynawo:
+    folder = FOLDER / "published"
+    rows = np.loadtxt(folder / "dynawo_three_converters.csv", delimiter=",").T
+    runs = gfmhil.run_network("dynawo_three_converters")
+    found = [
+        np.stack([ours(runs[name], column, rows[0]) for name in ("droop", "dvoc", "matching")])
+        for column in ("true_omega_u", "true_i")
+    ]
+    equations = runpy.run_path(str(folder / "dynawo_three_converters.py"))
+    return Dynawo(rows[0], rows[1::2], rows[2::2], equations, (found[0], found[1]))
+
+
+def rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, axis=1))
+
+
+def test_dynawo_s_equations_are_what_it_published(dynawo: Dynawo) -> None:
+    omega, i = dynawo.solved("THEIRS")
+    assert (rms(omega - dynawo.omega) <= [1e-4, 1e-4, 5e-4]).all()
+    assert (rms(i - dynawo.i) <= 0.01).all()
+
+
+def test_dynawo_rests_where_the_bench_rests(dynawo: Dynawo) -> None:
+    """Before the line opens, after it, and in the short circuit."""
+    omega, i = dynawo.bench
+    for at in (0.49, 1.49, 1.64):
+        k = np.searchsorted(dynawo.t, at)
+        assert omega[:, k] == pytest.approx(dynawo.omega[:, k], abs=3e-4)
+        assert i[:, k] == pytest.approx(dynawo.i[:, k], abs=4e-3)
+
+
+def test_dynawo_differs_by_its_dvoc_and_by_its_lines(dynawo: Dynawo) -> None:
+    """An angle that counts once takes Dynawo's equations as far from its points as the bench is;
+    with our control they are the bench once the lines' currents have settled."""
+    _, once = dynawo.solved("ONCE")
+    assert (rms(once - dynawo.i) >= [0.05, 0.12, 0.05]).all()
+    omega, i = dynawo.solved("OURS")
+    since = dynawo.t - np.array([-9.0, 0.5, 1.5, 1.65])[:, None]
+    settled = np.min(np.where(since >= 0.0, since, np.inf), axis=0) > 0.2
+    assert settled.sum() > 50
+    assert np.abs(dynawo.bench[0] - omega)[:, settled].max() <= 6e-4
+    assert np.abs(dynawo.bench[1] - i)[:, settled].max() <= 0.04
