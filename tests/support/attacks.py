@@ -7,8 +7,8 @@ measured through the fixture ``attack_now``::
     def test_frozen(attack_now): ...
         attack_now("SAFE after 12 ticks")
 
-``python -m pytest -m attack --attack-table docs/tables/attacks.md`` runs all of them and writes
-the table.
+``python -m pytest tests -m attack --attack-table docs/tables/attacks.md`` runs all of them and
+writes the table.
 """
 
 from __future__ import annotations
