@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from gfm_plant.constant_power import PowerLoad
 from gfm_plant.emulator import plant_start, reconnect
@@ -267,14 +268,7 @@ def _pack_pieces(records: PlantRecords, fastest: float) -> None:
 def _low_pass(x: float) -> tuple[float, ...]:
     """Weights of a first-order low-pass after a stretch of x time constants: of its state, and of
     its input at the beginning, the middle and the end, between which the input is a parabola."""
-    # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)! from 0 to 1
-    if x < 1.0:
-        f_3 = sum((-x) ** k / math.factorial(k + 3) for k in range(16))
-        f_2 = 1 / 2 - x * f_3
-        f_1 = 1.0 - x * f_2
-    else:
-        f_1 = -math.expm1(-x) / x
-        f_2 = (1.0 - f_1) / x
-        f_3 = (1 / 2 - f_2) / x
-    whole = 1.0 - x * f_1
+    A = np.diag([1.0, 1.0, 1.0], 1)
+    A[0, 0] = -x
+    whole, f_1, f_2, f_3 = expm(A)[0]  # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
     return whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)

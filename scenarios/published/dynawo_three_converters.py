@@ -97,7 +97,7 @@ def rates(x: Any, z: Any, of: Variant) -> Any:
     real = np.stack([
         (i_dc - (e * i.conj()).real / v_dc) / T_DC,
         OMEGA_B * (omega - omega[2]),
-        OMEGA_P * (M_P * (P_REF[0] - power[:1].repeat(3)) - droop),
+        np.full(3, OMEGA_P * (M_P * (P_REF[0] - power[0]) - droop)),
     ], axis=1)  # fmt: skip
     return np.concatenate([rows.view(float).reshape(3, 12), real], axis=1).ravel()
 

@@ -59,7 +59,7 @@ def call(options: argparse.Namespace) -> int:
 
             def check(done: int, of: int) -> None:
                 nonlocal executor
-                if own and executor is None:  # the file is good: workers start meanwhile
+                if own and executor is None:  # the file is good: imports go on meanwhile
                     executor = stack.enter_context(processes(workers))
                 tell_checks(done, of)
 

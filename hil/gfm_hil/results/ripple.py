@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
@@ -91,7 +92,7 @@ def remaining_ripple(
     for name, column in columns.items():
         if size[name] <= max(limit, size.get(worst, 0.0)):
             continue
-        if np.ptp(_level(column[done - n // 2 : done][None])) < 0.5 * size[name]:
+        if np.ptp(scipy.signal.detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
             continue
         if done >= 2 * n:
             before, _ = _sinusoids(column[done - 2 * n : done - n][None], T_s, explained)
@@ -146,7 +147,7 @@ def _sinusoids(
     n = x.shape[1]
     window = hann(n)
     length = next_fast_len(2 * n, real=True)  # lines half as far apart: it falls on none by 4 %
-    spectra = np.abs(np.fft.rfft(_level(x) * window, length))
+    spectra = np.abs(np.fft.rfft(scipy.signal.detrend(x) * window, length))
     lines = np.fft.rfftfreq(length, T_s)
     apart = 1.0 / (n * T_s)
     spectra[:, lines < _SLOWEST * apart] = 0.0
@@ -154,9 +155,3 @@ def _sinusoids(
         spectra[:, np.abs(lines - f) < _NEAR * apart] = 0.0
     k = np.argmax(spectra, axis=1)
     return 4.0 * spectra[np.arange(len(x)), k] / window.sum(), lines[k]
-
-
-def _level(x: NDArray[Any]) -> NDArray[Any]:
-    """Rows without their mean and slope."""
-    t = np.arange(x.shape[1]) - 0.5 * (x.shape[1] - 1)
-    return np.asarray(x - x.mean(axis=1, keepdims=True) - np.outer(x @ t / (t @ t), t))

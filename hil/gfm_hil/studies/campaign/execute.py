@@ -93,7 +93,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("forkserver")
     # scipy loads its parts when they are first used
-    context.set_forkserver_preload([run_chunk.__module__, "scipy.signal", "scipy.linalg"])
+    context.set_forkserver_preload([run_chunk.__module__, "scipy.signal"])
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
     try:
         # it starts with SIGINT blocked: Ctrl-C is the parent's to handle, also while it imports
