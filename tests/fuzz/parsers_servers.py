@@ -70,7 +70,15 @@ class Served:
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(PATIENCE_S)
 
     def close(self) -> None:
-        """Stop the thread."""
+        """Cancel what still runs, and stop the thread."""
+
+        async def end() -> None:
+            others = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in others:
+                task.cancel()
+            await asyncio.gather(*others, return_exceptions=True)
+
+        self.call(end())
         logging.getLogger().removeHandler(self._handler)
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()

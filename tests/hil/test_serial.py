@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import LONGEST
@@ -212,3 +212,16 @@ def test_the_sender_drops_what_the_line_cannot_take(endpoint: str) -> None:
     finally:
         plant.close()
         controller.close()
+
+
+def test_a_line_whose_other_side_is_gone_is_a_lost_peer(endpoint: str) -> None:
+    """Whatever call of the system finds out: at the end of a run PeerLost alone is expected."""
+    controller = open_link("serial", "controller", endpoint)
+    plant = open_link("serial", "plant", endpoint)
+    assert plant.send(b"a") and controller.wait(5)
+    controller.close()
+    for _ in range(2):
+        with pytest.raises(PeerLost, match="the serial line .*line is gone: Input/output"):
+            plant.send(b"a")
+    assert plant.receive() is None
+    plant.close()

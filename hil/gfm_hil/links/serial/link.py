@@ -123,7 +123,10 @@ class SerialLink:
 
     def _waiting(self) -> int:
         """Bytes that the kernel has not yet sent."""
-        answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0\0\0\0")
+        try:
+            answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0\0\0\0")
+        except OSError as problem:  # the other side closed its pseudo terminal
+            raise self._gone(problem) from None
         return int(struct.unpack("i", answer)[0])
 
     def _write(self, what: bytes) -> bool:
