@@ -221,7 +221,7 @@ def test_a_line_whose_other_side_is_gone_is_a_lost_peer(endpoint: str) -> None:
     assert plant.send(b"a") and controller.wait(5)
     controller.close()
     for _ in range(2):
-        with pytest.raises(PeerLost, match="the serial line .*line is gone: Input/output"):
+        with pytest.raises(PeerLost, match=r"the serial line .*line is gone: Input/output"):
             plant.send(b"a")
     assert plant.receive() is None
     plant.close()
