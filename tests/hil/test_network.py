@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import gfm_plant
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
@@ -244,6 +245,8 @@ def test_a_run_on_disk_is_that_in_memory(
          "network.transformers.t.earthed: must be 'end', 'start', 'both' or 'none'"),
         ({"network": {"converters": {"A": {"node": "x", "plant": {"lcl": {"L": 0.0}}}}}},
          "network.converters.A.plant.lcl.L: must be greater than 0"),
+        ({"network": {"converters": {"A": {"node": "x", "plant": {"converter": "papr"}}}}},
+         "network.converters.A.plant.converter = 'papr': must be one of paper"),
         ({"network": {"converters": {"A": {"node": "x", "plant": {"grid": {"V_g": 0.9}}}}}},
          "plant.grid: is the scenario's own"),
     ],
@@ -252,6 +255,16 @@ def test_what_is_wrong_is_one_line_that_names_it(change: dict[str, Any], message
     with pytest.raises(UserError, match=message) as caught:
         load_scenario(content(**change))
     assert "\n" not in str(caught.value)
+
+
+def test_what_a_converters_file_lacks_is_said_with_its_name(tmp_path: Path) -> None:
+    shipped = Path(gfm_plant.__file__).with_name("converters") / "paper.toml"
+    file = tmp_path / "mine.toml"
+    file.write_text(re.sub("(?m)^L_f.*$", "", shipped.read_text()))
+    change = {"network": {"converters": {"A": {"node": "x", "plant": {"converter": str(file)}}}}}
+    message = f"network.converters.A.plant.converter = '{file}': L_f: missing"
+    with pytest.raises(UserError, match=re.escape(message)):
+        load_scenario(content(**change))
 
 
 def test_what_takes_one_converter_says_so() -> None:

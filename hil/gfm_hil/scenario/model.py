@@ -640,22 +640,25 @@ def plant_of(scenario: Scenario) -> Network:
 
 def _try_plant(scenario: Scenario) -> None:
     """Build the plant and try those of its events that not every plant can carry out."""
-    converter = f"plant.converter = {scenario.plant.converter!r}"
-    files = {converter: scenario.plant.converter}
-    for name in scenario.converters:
-        file = scenario.of(name).plant.converter
-        files[f"network.converters.{name}.plant.converter = {file!r}"] = file
-    for place, file in files.items():
-        if file.endswith(".toml"):
-            try:
-                read_toml(file)
-            except ValueError as problem:
-                raise UserError(f"{place}: {problem}") from None
+    plants = {"plant.": scenario.plant} | {
+        f"network.converters.{name}.plant.": scenario.of(name).plant for name in scenario.converters
+    }
+    for of, options in plants.items():
+        place = f"{of}converter = {options.converter!r}"
+        try:
+            if options.converter.endswith(".toml"):
+                ConverterParameters.model_validate(read_toml(options.converter))
+        except ValidationError as problem:
+            wrong = lines(problem, ConverterParameters)
+            raise UserError("; ".join(f"{place}: {line}" for line in wrong)) from None
+        except ValueError as problem:
+            raise UserError(f"{place}: {problem}") from None
+        try:
+            load_converter(options.converter)
+        except ValueError as problem:
+            raise UserError(f"{of}{problem}") from None
     try:
         plant = plant_of(scenario)
-    except ValidationError as problem:
-        wrong = lines(problem, ConverterParameters)
-        raise UserError("; ".join(f"{converter}: {line}" for line in wrong)) from None
     except ValueError as problem:
         raise UserError(str(problem)) from None
     for k, event in enumerate(scenario.events):
