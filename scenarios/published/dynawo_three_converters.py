@@ -3,7 +3,7 @@
 The equations are those of Converter, CurrentLoop, VoltageLoop, VirtualImpedance, DroopControl,
 DispatchableVirtualOscillatorControl and MatchingControl in dynawo/dynawo, which its authors'
 nrt/data/GridFormingConverters puts together; the values those of GridForming.mo, whose start is
-that of the published curves. Lines are static, so node voltages follow from the currents.
+that of the published curves. Variants show one by one what gfmhil has differently.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LINES = {(2, 0): 0.00075 + 0.0075j, (2, 1): 0.00375 + 0.0375j, (0, 1): 0.003 + 0
 OPENED = (2, 0)
 SEGMENTS = [(-12.0, 0.5, True, False), (0.5, 1.5, False, False), (1.5, 1.65, False, True),
             (1.65, 2.6, False, False)]  # from, to [s], whether closed, whether faulted  # fmt: skip
-N_STATES = 15
+N_STATES, N_BRANCHES = 15, 8
 
 
 class Variant(NamedTuple):
@@ -36,28 +36,83 @@ class Variant(NamedTuple):
         twice: dVOC gives its voltage the angle of its frame, within that frame.
         by_v_dc: the bridge's voltage rises with v_dc.
         of_square: the virtual impedance sees |i|^2 - 1, else 2 (|i| - 1).
+        static: the lines are impedances at the nominal frequency, else inductances, and the
+            short circuit is a resistance of the same size.
     """
 
     twice: bool
     by_v_dc: bool
     of_square: bool
+    static: bool
 
 
-THEIRS = Variant(True, True, True)
+THEIRS = Variant(True, True, True, True)
 ONCE = THEIRS._replace(twice=False)
-OURS = Variant(False, False, False)
+OUR_CONTROL = Variant(False, False, False, True)
+OURS = OUR_CONTROL._replace(static=False)
 
 
-def impedances(closed: bool, faulted: bool) -> Any:
-    """Voltages of buses 2, 3, 1 and 4 over the currents into them, p.u."""
-    y = np.zeros((4, 4), complex)
-    for (a, b), z in LINES.items():
+class Circuit(NamedTuple):
+    """Transformers of the converters, lines and buses 2, 3, 1 and 4 between two events.
+
+    Attributes:
+        z: voltages of the buses over the currents of the transformers into them, p.u., (4, 3), if
+            the lines are static.
+        into: 1 where a branch leads into a bus, -1 where it leaves one, (4, 8).
+        x, r: of the branches, p.u., (8,).
+        g: conductances from the buses to earth, p.u., (4,).
+    """
+
+    z: Any
+    into: Any
+    x: Any
+    r: Any
+    g: Any
+
+
+def circuit(closed: bool, faulted: bool) -> Circuit:
+    """The circuit with and without the line that opens and the short circuit."""
+    into = np.zeros((4, N_BRANCHES))
+    into[range(3), range(3)] = 1.0
+    for k, (a, b) in enumerate(LINES, 3):
         if closed or (a, b) != OPENED:
-            y[[a, b], [a, b]] += 1 / z
-            y[[a, b], [b, a]] -= 1 / z
-    y[0, 0] += LOAD
-    y[3, 3] += faulted / FAULT
-    return np.linalg.inv(y)
+            into[[b, a], [k, k]] = 1.0, -1.0
+    z = np.append((R_T + 1j * X_T) / S, list(LINES.values()))
+    lines = into[:, 3:]
+    y = lines @ np.diag(1 / z[3:]) @ lines.T + np.diag([LOAD, 0, 0, faulted / FAULT])
+    g = np.array([LOAD, 0.0, 0.0, faulted / abs(FAULT)])
+    return Circuit(np.linalg.inv(y)[:, :3], into, z.imag, z.real, g)
+
+
+def buses(i: Any, e: Any, omega: float, at: Circuit) -> Any:
+    """Voltages of the buses, p.u.: on the load and the fault by the current into them, elsewhere
+    such that the currents' rates sum up to zero.
+
+    Args:
+        i: of the branches, p.u.
+        e: at the converters' side of the transformers, p.u.; 0 for lines.
+        omega: of the frame, p.u.
+    """
+    free = at.g == 0
+    v = np.zeros(4, complex)
+    v[~free] = (at.into[~free] @ i) / at.g[~free]
+    own = at.into[free] / at.x
+    v[free] = np.linalg.solve(
+        own @ at.into[free].T, own @ (e - at.into.T @ v - (at.r + 1j * omega * at.x) * i)
+    )
+    return v
+
+
+def switch(x: Any, at: Circuit) -> None:
+    """Bring the currents to what they are right after an event: an impulse of voltage at the buses
+    without a load, whose currents sum up to zero at once, keeps the flux of each mesh."""
+    own, lines = x[: 3 * N_STATES].reshape(3, N_STATES), x[-2 * len(LINES) :].view(complex)
+    frame = S * np.exp(1j * own[:, 13])
+    i = np.append((own[:, 0] + 1j * own[:, 1]) * frame, lines) * at.into.any(axis=0)
+    free = at.into[at.g == 0]
+    i -= free.T @ np.linalg.solve(free / at.x @ free.T, free @ i) / at.x
+    own[:, 0], own[:, 1] = (i[:3] / frame).real, (i[:3] / frame).imag
+    lines[:] = i[3:]
 
 
 def frequencies(power: Any, v_dc: Any, droop: Any) -> Any:
@@ -66,15 +121,23 @@ def frequencies(power: Any, v_dc: Any, droop: Any) -> Any:
     return np.array([1 + droop, dvoc, 1 + v_dc[2] - V_REF[2]])
 
 
-def rates(x: Any, z: Any, of: Variant) -> Any:
+def rates(x: Any, at: Circuit, of: Variant) -> Any:
     """d/dt of the states, in a frame that turns with the matching control."""
-    x = x.reshape(3, N_STATES)
+    lines, x = x[-2 * len(LINES) :].view(complex), x[: 3 * N_STATES].reshape(3, N_STATES)
     i_o, i, v, v_int, i_int, damped = (x[:, k] + 1j * x[:, k + 1] for k in range(0, 12, 2))
     v_dc, theta, droop = x[:, 12], x[:, 13], x[0, 14]
     power = (v * i_o.conj()).real
     omega = frequencies(power, v_dc, droop)
     frame = np.exp(1j * theta)
-    bus = (z @ np.append(i_o * frame * S, 0))[:3] / frame
+    into = i_o * frame * S
+    if of.static:
+        bus, change = at.z @ into, 0 * lines
+    else:
+        whole = np.append(into, lines)
+        bus = buses(whole, np.append(v * frame, 0 * lines), omega[2], at)
+        drop = -at.into.T @ bus - (at.r + 1j * omega[2] * at.x) * whole
+        change = np.where(at.into.any(axis=0), OMEGA_B / at.x * drop, 0)[3:]
+    bus = bus[:3] / frame
     over = np.maximum(abs(i) ** 2 - 1 if of.of_square else 2 * (abs(i) - 1), 0.0)
     v_ref = V_REF - K_THR * over * (1 + 1j * X_R) * i
     v_ref[0] -= damped[0]
@@ -99,7 +162,8 @@ def rates(x: Any, z: Any, of: Variant) -> Any:
         OMEGA_B * (omega - omega[2]),
         np.full(3, OMEGA_P * (M_P * (P_REF[0] - power[0]) - droop)),
     ], axis=1)  # fmt: skip
-    return np.concatenate([rows.view(float).reshape(3, 12), real], axis=1).ravel()
+    own = np.concatenate([rows.view(float).reshape(3, 12), real], axis=1)
+    return np.append(own.ravel(), change.view(float))
 
 
 def solved(t: Any, of: Variant) -> tuple[Any, Any]:
@@ -112,15 +176,17 @@ def solved(t: Any, of: Variant) -> tuple[Any, Any]:
     x = np.zeros((3, N_STATES))
     x[:, 0] = x[:, 2] = 0.6
     x[:, 4], x[:, 12], x[:, 13] = 1.01, V_REF, [-0.03, 0.0, 0.02]
-    x = x.ravel()
+    x = np.append(x.ravel(), np.zeros(2 * len(LINES)))
     found = []
     for start, end, closed, faulted in SEGMENTS:
-        z = impedances(closed, faulted)
+        now = circuit(closed, faulted)
+        if not of.static:
+            switch(x, now)
         at = np.append(t[(t >= start) & (t < end)], end)
-        result = solve_ivp(lambda _, x, z=z: rates(x, z, of), (start, end), x, "LSODA", at,
+        result = solve_ivp(lambda _, x, now=now: rates(x, now, of), (start, end), x, "LSODA", at,
                            rtol=1e-8, atol=1e-10)  # fmt: skip
-        x = result.y[:, -1]
-        found.append(result.y[:, :-1])
+        x = result.y[:, -1].copy()
+        found.append(result.y[: 3 * N_STATES, :-1])
     y = np.concatenate(found, axis=1).reshape(3, N_STATES, -1)
     i_o, i, v = (y[:, k] + 1j * y[:, k + 1] for k in (0, 2, 4))
     return frequencies((v * i_o.conj()).real, y[:, 12], y[0, 14]), np.abs(i)

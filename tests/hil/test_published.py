@@ -170,12 +170,13 @@ def test_dynawo_rests_where_the_bench_rests(dynawo: Dynawo) -> None:
 
 def test_dynawo_differs_by_its_dvoc_and_by_its_lines(dynawo: Dynawo) -> None:
     """An angle that counts once takes Dynawo's equations as far from its points as the bench is;
-    with our control they are the bench once the lines' currents have settled."""
+    with our control they differ from the bench until the lines' currents have settled, and with
+    inductive lines, too, by no more than what the sampling of 20 us does."""
     _, once = dynawo.solved("ONCE")
     assert (rms(once - dynawo.i) >= [0.05, 0.12, 0.05]).all()
+    _, control = dynawo.solved("OUR_CONTROL")
+    assert (rms(dynawo.bench[1] - control) >= [0.03, 0.03, 0.07]).all()
     omega, i = dynawo.solved("OURS")
-    since = dynawo.t - np.array([-9.0, 0.5, 1.5, 1.65])[:, None]
-    settled = np.min(np.where(since >= 0.0, since, np.inf), axis=0) > 0.2
-    assert settled.sum() > 50
-    assert np.abs(dynawo.bench[0] - omega)[:, settled].max() <= 6e-4
-    assert np.abs(dynawo.bench[1] - i)[:, settled].max() <= 0.04
+    assert np.abs(dynawo.bench[0] - omega).max() <= 2.5e-3
+    assert np.abs(dynawo.bench[1] - i).max() <= 0.06
+    assert (rms(dynawo.bench[1] - i) <= 0.01).all()
