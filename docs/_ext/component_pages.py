@@ -105,7 +105,7 @@ COMPONENTS = (
         "Load of constant power", options.ConstantPowerLoad, "`[network.constant_power.NAME]`",
         {"constant_power": {_NAME: {**_AT, "P": 0.1}}, "capacitors": {"c": {**_AT, "Q": 0.1}}},
         more=(("v_f", "p.u., a space vector", "the voltage that it has measured"),),
-        most=f"{N_SINKS}; one beside a single converter",
+        most=str(N_SINKS),
     ),
     _Component(
         "Capacitor bank", options.CapacitorBank, "`[network.capacitors.NAME]`",
@@ -119,7 +119,7 @@ COMPONENTS = (
             ("angle", "rad", "of the voltage behind its reactance"),
             ("P_turbine", "p.u. of its rating", "power of its turbine, behind the governor"),
         ),
-        columns=("true_omega_g",), most=f"{N_MACHINES}; beside two converters or more",
+        columns=("true_omega_g",), most=str(N_MACHINES),
     ),
 )  # fmt: skip
 
@@ -144,7 +144,7 @@ def _states(one: _Component) -> list[str]:
     lines = []
     for shown, name in names.items():
         what = "voltage" if name in banks else "current"
-        lines.append(f"- {shown}: {what} of the circuit, a space vector, p.u.")
+        lines.append(f"- {shown}: {what}, a space vector, p.u. of the first converter")
     return lines + [f"- {name}: {text}, {unit}" for name, unit, text in one.more]
 
 

@@ -27,8 +27,10 @@ def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) ->
     """Step the frequency of an ideal grid to `omega_g`, or ramp it there at `rate` (p.u./s, > 0).
 
     Raises:
-        ValueError: If a value is out of range, or the grid is finite and has its own frequency.
+        ValueError: If a value is out of range, the grid is finite and has its own frequency, or
+            there is none.
     """
+    _needs_grid(plant)
     if plant.net[0]["H"][0] > 0:
         raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
     _require("omega_g", omega_g, omega_g > 0, "> 0 p.u.")
@@ -51,8 +53,10 @@ def grid_voltage(
             ramp within a sag cancels the recovery.
 
     Raises:
-        ValueError: If a value is out of range, or both `rate` and `duration` are given.
+        ValueError: If a value is out of range, both `rate` and `duration` are given, or there is
+            no grid.
     """
+    _needs_grid(plant)
     _require("V_g", V_g, V_g >= 0, ">= 0 p.u.")
     if rate is not None and duration is not None:
         raise ValueError(f"rate = {rate}, duration = {duration}: give one, a ramp or a sag")
@@ -186,8 +190,9 @@ def grid_unbalance(
         duration: Time until they are equal again, s; None: until another call.
 
     Raises:
-        ValueError: If a value is out of range. The plant is then unchanged.
+        ValueError: If a value is out of range, or there is no grid. The plant is then unchanged.
     """
+    _needs_grid(plant)
     a, b, c = phases
     for value in phases:
         _require("phases", abs(value), True, "finite")
@@ -211,7 +216,12 @@ def grid_unbalance(
 
 
 def phase_jump(plant: Network, degrees: float) -> None:
-    """Advance the grid's angle by `degrees`, so that delta falls by as much."""
+    """Advance the grid's angle by `degrees`, so that delta falls by as much.
+
+    Raises:
+        ValueError: If `degrees` is not finite, or there is no grid.
+    """
+    _needs_grid(plant)
     _require("degrees", degrees, True, "finite")
     angle = math.radians(degrees)
     plant.st["x"][:, DELTA] -= angle
@@ -419,6 +429,11 @@ def start_again(plant: Network, k: int) -> None:
     """
     plant.rewire(replace(plant.wiring, blocked=plant.wiring.blocked - {k}))
     synchronise(plant.records, k)
+
+
+def _needs_grid(plant: Network) -> None:
+    if plant.wiring.grid is None:
+        raise ValueError("network.grid: not set; an island has no grid whose voltage could change")
 
 
 def _grid_source(plant: Network) -> int:

@@ -395,7 +395,7 @@ class ConstantPowerLoad(Options):
     as the filter of such a load is."""
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
-    P: float = Field(description="active power, p.u. of the first one; negative: it feeds in")
+    P: float = Field(description="active power, p.u. of the first converter; negative: it feeds in")
     Q: float = Field(0.0, description="reactive power, p.u.")
     tau_s: Positive = Field(0.005, description="lag of its measurement of the voltage, s")
     V_least: Positive = Field(
@@ -408,7 +408,9 @@ class CapacitorBank(Options):
     """Capacitors between a node and ground."""
 
     node: str = Field(min_length=1, description="where it is")
-    Q: Positive = Field(description="reactive power at nominal voltage, p.u. of the first one")
+    Q: Positive = Field(
+        description="reactive power at nominal voltage, p.u. of the first converter"
+    )
 
 
 class Machine(Options):

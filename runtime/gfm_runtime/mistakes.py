@@ -64,9 +64,10 @@ def _line(error: Any, model: Any) -> str:
         # a file is always a table; only a message as a whole, in JSON, can be something else
         text = "must be a table" if path else "must be an object"
         text += f" with {', '.join(dict.fromkeys(keys))}" if keys else ""
+    text += f", not {shown}"
     if error["type"] == "literal_error":
         text += meant(error["input"], _quoted(context["expected"]))
-    return f"{path}: {text}, not {shown}" if path else f"{text}, not {shown}"
+    return f"{path}: {text}" if path else text
 
 
 def _quoted(text: str) -> list[str]:

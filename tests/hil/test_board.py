@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ def test_a_board_controls_the_plant_over_its_uart(tmp_path: Path) -> None:
             assert machine.stdout is not None
             device = re.search(r"/dev/pts/\d+", machine.stdout.readline())
             assert device is not None
-            link = {"type": "serial", "peer_timeout_s": 20.0, "repeat_s": 0.2}
+            link = tomllib.loads((BOARD / "scenario.toml").read_text())["link"]
             step = {"tick": 50, "type": "grid-phase-jump", "degrees": 2.0}
             file = write(tmp_path, law="vsg-2", link=link, duration=0.02, events=[step])
             for name in ("first", "again"):  # the board is ready for the next run

@@ -167,7 +167,7 @@ def test_the_example_holds_the_plant(
     [
         ("fault", "c a library that fails: blocks the bridge: fault 7, the cooling has stopped"),
         ("start", "c a library that fails: blocks the bridge: fault 3, it does not say what it is"),
-        ("nan", "an output is not finite: E_u"),
+        ("nan", "c a library that fails: out->e[1] = nan at t = 0.01 s"),
         ("hang", "c a library that fails: has not answered for 2 s"),
         ("crash", "the controller was ended by SIGSEGV"),
     ],

@@ -16,8 +16,8 @@ from gfm_hil.engine.waiting import send_last
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.frame import FrameReader, FrameWriter, frame_dtype
 from gfm_hil.links.zeromq.link import ZmqLink
-from gfm_hil.recording.log import read_log, worst
-from gfm_runtime.states import RUNNING, SAFE
+from gfm_hil.recording.log import Outcome, read_log, worst
+from gfm_runtime.states import PLANT_TRIP, REASONS, RUNNING, SAFE
 
 from ..support.links import PATIENT, Tampering, assert_same, run_pair
 
@@ -46,6 +46,14 @@ def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
     assert "gone" in outcome.reason
     # the plant may have repeated a frame, or still receive the controller's last frame
     assert 1 <= len(signals["tick"]) <= 21
+
+
+def test_the_plant_s_own_reason_goes_before_what_the_controller_saw_of_it():
+    seen = {"event": "end", "status": "tripped", "reason": REASONS[PLANT_TRIP], "tick": 9}
+    own = {"event": "end", "status": "safe", "reason": "no fresh u", "tick": 8}
+    assert worst([own, seen], None) == Outcome("safe", "no fresh u", 8)
+    done = {"event": "end", "status": "completed", "reason": "", "tick": 10}
+    assert worst([done, seen], None).status == "tripped"
 
 
 def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint):

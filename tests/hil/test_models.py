@@ -193,8 +193,16 @@ def test_a_model_that_fails_is_named_and_the_run_is_kept(
     [
         (STEP, "", "input dispatch[0]: signal 'dispatch[0]' must be one of V_dcref, P_ref"),
         (STEP, MAP + "parameters.droop = -1.0", "Model_Initialize failed: the droop must be posit"),
-        (STEP, MAP + "parameters.dropo = 1.0", "parameters.dropo: there are droop, at, what"),
-        (STEP, MAP.replace("2e-4", "1.5e-4"), "step of 0.00015 s must be a multiple"),
+        (
+            STEP,
+            MAP + "parameters.dropo = 1.0",
+            "parameters.dropo in its map: it has droop, at, what",
+        ),
+        (
+            STEP,
+            MAP.replace("2e-4", "1.5e-4"),
+            "FixedStepBaseSampleTime = 0.0002 s; leave step_s out",
+        ),
         (STEP, MAP.replace("2e-4", "2e-4\nscale = 1"), "scale = 1: unknown key"),
         ({"t": 0.02, "type": "law", "law": "vsg-5"}, MAP, "droop of others has a law of its own"),
     ],
@@ -244,14 +252,22 @@ def test_ports_are_found_by_name_and_by_map() -> None:
             ["i_u", "omega_u", "E_u"],
             "fixed: only a run with an inner stage",
         ),
-        ({"outputs": {"x": "E_u"}}, ["i_u", "omega_u"], "outputs.x: must be one of i_u, omega_u"),
+        (
+            {"outputs": {"x": "E_u"}},
+            ["i_u", "omega_u"],
+            "outputs.x in its map: it has i_u, omega_u",
+        ),
         ({"inputs": {"p": "P"}}, ["i_u", "omega_u", "E_u"], "input p: signal 'P' must be one of"),
         (
             {"inputs": {"p": {"signal": "p", "scale": 0.0}}},
             ["i_u", "omega_u", "E_u"],
             "input p: scale = 0 must not be 0",
         ),
-        ({"blocks": "x"}, ["i_u", "omega_u", "E_u"], "blocks = 'x': must be one of i_u, omega_u"),
+        (
+            {"blocks": "x"},
+            ["i_u", "omega_u", "E_u"],
+            "blocks = 'x' in its map: must be one of i_u, omega_u",
+        ),
     ],
 )
 def test_ports_that_do_not_fit_are_refused(ports: Any, outputs: list[str], message: str) -> None:

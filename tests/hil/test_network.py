@@ -223,7 +223,7 @@ def test_a_run_on_disk_is_that_in_memory(
          r"events.0.converter = 'C': must be one of \['A', 'B'\]"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bsu"}]},
          r"events.0: node = 'bsu': must be one of \['bus'\]"),
-        ({"events": [{"type": "fault", "t": 0.1, "R": 0.1}]}, "position = None, node = None"),
+        ({"events": [{"type": "fault", "t": 0.1, "R": 0.1}]}, "position, node: give one of them"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bus", "kind": "LG"}]},
          "events.0: X_0: not set, and no closed line leads from node bus to the earthed star"),
         ({"events": [{"type": "fault", "t": 0.1, "R": 0.1, "node": "bus", "kind": "GL"}]},
@@ -232,6 +232,11 @@ def test_a_run_on_disk_is_that_in_memory(
                       "phases": "b"}]}, r"events.0: phases = 'b': must be one of \['bc', 'ca'"),
         ({"events": [{"type": "fault", "t": 0.1, "R": -0.1, "node": "bus"}]},
          "events.0.R: must be greater than or equal to 0"),
+        *[({"events": [{"t": 0.1, **event}]}, "events.0: network.grid: not set; an island has no")
+          for event in (
+              {"type": "grid-voltage", "V_g": 0.5}, {"type": "grid-frequency", "f_hz": 49.0},
+              {"type": "grid-phase-jump", "degrees": 10.0},
+              {"type": "grid-unbalance", "retained": [0.0, 1.0, 1.0]})],
         ({"network": {"converters": {"A": {"node": "x", "law": "drop-1"}}, "grid": "x"},
           "events": []}, "network.converters.A.law"),
         ({"network": {"converters": {"A": {"node": "x"}}, "grid": "y"}}, "the grid is at node 'y'"),
@@ -277,6 +282,8 @@ def test_what_takes_one_converter_says_so() -> None:
         })  # fmt: skip
     with pytest.raises(UserError, match="network: the scenario has none"):
         gfmhil.run_network("pref_step")
+    with pytest.raises(KeyError, match="'C': must be one of A, B"):
+        gfmhil.run_network(content(duration=0.01, events=[]))["C"]
 
 
 def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:

@@ -209,6 +209,8 @@ def test_roles_started_by_hand_meet(tmp_path: Path) -> None:
     file.write_text(toml_text(content(link=over("zmq"), duration=0.3)), "utf-8")
     ended = {name: end(process) for name, process in by_hand(tmp_path, file).items()}
     assert {name: code for name, (code, *_) in ended.items()} == {"plant": 0, "A": 0, "B": 0}
+    with pytest.raises(UserError, match="are of different converters: A, B"):
+        merge_roles(tmp_path / "plant" / "A", tmp_path / "B", tmp_path / "mixed")
     merge_roles(tmp_path / "plant" / "B", tmp_path / "B", tmp_path / "whole")
     memory, found = gfmhil.run_network(content(duration=0.3))["B"], signals(tmp_path / "whole")
     for key, column in memory.columns.items():

@@ -50,10 +50,10 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     """Options that override what a scenario says."""
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     command.add_argument("--mode", choices=["lockstep", "realtime"], help="override mode")
-    command.add_argument("--link", help="override link.type: zmq, inproc or another link there is")
+    command.add_argument("--link", help="override link.type: zmq, shm, serial, can or inproc")
     command.add_argument(
         "--endpoint", action="append", default=[],
-        help="override link.endpoint, e.g. tcp://127.0.0.1:5555; of the plant of a network once for"
+        help="override link.endpoint, e.g. tcp://127.0.0.1:5555; of a network's plant repeat it for"
         " each converter, as NAME=ENDPOINT",
     )  # fmt: skip
     command.add_argument(

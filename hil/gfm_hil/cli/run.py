@@ -32,7 +32,10 @@ from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
-    command.add_argument("--law", help="override law: catalogue name or law file")
+    command.add_argument(
+        "--law",
+        help="override law: catalogue name or law file; of a network's converters that name none",
+    )
     command.add_argument(
         "--controller", metavar="KIND:NAME",
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"

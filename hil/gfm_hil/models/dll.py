@@ -122,7 +122,12 @@ class DllModel:
             raise UserError(f"{path}: cannot be loaded: {problem}") from None
         for needed in ("Model_GetInfo", "Model_Initialize", "Model_Outputs"):
             if not hasattr(self._of, needed):
-                raise UserError(f"{path}: has no function {needed}, so it is no real-code model")
+                other = (
+                    "; it has gfmhil_version: use c:" if hasattr(self._of, "gfmhil_version") else ""
+                )
+                raise UserError(
+                    f"{path}: has no function {needed}, so it is no real-code model{other}"
+                )
         self._of.Model_GetInfo.restype = c.POINTER(_ModelInfo)
         info = self._of.Model_GetInfo().contents
         if info.DLLInterfaceVersion[0] != 1:
@@ -137,7 +142,13 @@ class DllModel:
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
         self._wiring = wire(where, ports, self._in.names, self._out.names, inner)
         self._parameters = _parameters(where, info, ports)
-        step_s = ports.step_s or info.FixedStepBaseSampleTime or T_s
+        declared = info.FixedStepBaseSampleTime
+        if ports.step_s and declared and abs(ports.step_s - declared) > 1e-6 * declared:
+            raise UserError(
+                f"{where}: step_s = {ports.step_s:g} in its map, but it declares"
+                f" FixedStepBaseSampleTime = {declared:g} s; leave step_s out"
+            )
+        step_s = declared or ports.step_s or T_s
         self._every, self._T_s = ticks_a_step(where, step_s, T_s), T_s
         self._states = (
             np.zeros(max(info.NumIntStates, 1), np.int32),
@@ -209,7 +220,7 @@ def _parameters(where: str, info: _ModelInfo, ports: PortMap) -> _Values:
     for name, value in ports.parameters.items():
         if name not in values.names:
             there = ", ".join(values.names) or "none"
-            raise UserError(f"{where}: parameters.{name}: there are {there}")
+            raise UserError(f"{where}: parameters.{name} in its map: it has {there}")
         view = values.view(name)
         view[0] = value
     return values

@@ -62,8 +62,11 @@ class LibraryModel:
     real = "float64"
 
     def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
-        if ports != PortMap(step_s=ports.step_s):
-            raise UserError(f"{path.name}: of a map it takes step_s only; its ports are fixed")
+        if beyond := sorted(ports.model_fields_set - {"step_s"}):
+            raise UserError(
+                f"{path.name}: {', '.join(beyond)} in its map: of a map it takes step_s only; its"
+                " ports are fixed"
+            )
         check_currents(f"c:{path.name}", rig.inner)
         self._of = _loaded(path)
         said = self._of.gfmhil_name()
@@ -81,7 +84,11 @@ class LibraryModel:
         )  # fmt: skip
         self._self = self._of.gfmhil_new(c.byref(setup))
         if not self._self:
-            raise UserError(f"{path.name}: {self.name} refuses this bench: gfmhil_new gave NULL")
+            offered = ", ".join(f"{key} {getattr(setup, key):.6g}" for key, *_ in _Setup._fields_)
+            raise UserError(
+                f"{path.name}: {self.name} refuses this bench: gfmhil_new gave NULL; offered were"
+                f" {offered} (SI units; step_s in the map file sets the period)"
+            )
         self._in, self._out = _Input(), _Output()
         self._ticks, self._speed = 0, 1.0
         y = {name: k for k, name in enumerate(carried("y", True))}
@@ -152,6 +159,10 @@ class LibraryModel:
                 said = self._of.gfmhil_fault(c.c_void_p(self._self), c.c_int(number))
             words = (said or b"").decode("utf-8", "replace").strip() or "it does not say what it is"
             raise ModelError(f"{self.name}: blocks the bridge: fault {number}, {words}")
+        given = {**{f"e[{k}]": e for k, e in enumerate(self._out.e)}, "i_dc": self._out.i_dc}
+        for field, value in given.items():
+            if not math.isfinite(value):
+                raise ModelError(f"{self.name}: out->{field} = {value} at t = {self._in.t:g} s")
 
 
 def _phases(space: complex) -> tuple[float, float, float]:
@@ -166,7 +177,10 @@ def _loaded(path: Path) -> c.CDLL:
         raise UserError(f"{path}: cannot be loaded: {problem}") from None
     for name in _NEEDED:
         if not hasattr(of, f"gfmhil_{name}"):
-            raise UserError(f"{path}: has no function gfmhil_{name}; see gfmhil_controller.h")
+            other = "; it has Model_GetInfo: use dll:" if hasattr(of, "Model_GetInfo") else ""
+            raise UserError(
+                f"{path}: has no function gfmhil_{name}; see gfmhil_controller.h{other}"
+            )
     version = of.gfmhil_version()
     if version != VERSION:
         raise UserError(

@@ -133,7 +133,9 @@ def wire(
     for table, there in (("inputs", inputs), ("outputs", outputs)):
         for port in getattr(ports, table):
             if port not in there:
-                raise UserError(f"{where}: {table}.{port}: must be one of {', '.join(there)}")
+                raise UserError(
+                    f"{where}: {table}.{port} in its map: it has {', '.join(there) or 'none'}"
+                )
     constants = np.zeros(len(inputs))
     into: list[tuple[int, int, float]] = []
     for k, port in enumerate(inputs):
@@ -161,7 +163,9 @@ def wire(
             raise UserError(f"{where}: {name} {how}; name its port in the map file, or fix it")
     blocks = ports.blocks or (REASON if REASON in outputs else None)
     if blocks is not None and blocks not in outputs:
-        raise UserError(f"{where}: blocks = {blocks!r}: must be one of {', '.join(outputs)}")
+        raise UserError(
+            f"{where}: blocks = {blocks!r} in its map: must be one of {', '.join(outputs)}"
+        )
     (ports_in, signals, scales), (sources, targets, units) = map(_columns, (into, out))
     place = -1 if blocks is None else list(outputs).index(blocks)
     return Wiring(constants, ports_in, signals, scales, sources, targets, units, fixed, place)

@@ -90,5 +90,8 @@ def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     found = [outside, *ends] if outside else ends
     if not found:
         return Outcome("safe", "the run was cut off: no process recorded its end", 0)
+    # a controller sees that the bridge is blocked and calls it a trip; the plant knows better
+    own = [o for o in found if o.reason != REASONS[PLANT_TRIP]]
+    found = own if any(o.status != "completed" for o in own) else found
     first = max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))
     return next((o for o in found if o.reason.startswith(f"{first.reason}: ")), first)

@@ -35,6 +35,8 @@ class NetworkRun(Mapping[str, Run]):
     folder: Path | None = None
 
     def __getitem__(self, converter: str) -> Run:
+        if converter not in self.runs:
+            raise KeyError(f"{converter!r}: must be one of {', '.join(self.runs)}")
         return self.runs[converter]
 
     def __iter__(self) -> Iterator[str]:

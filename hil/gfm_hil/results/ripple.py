@@ -56,7 +56,7 @@ class Ripple(NamedTuple):
         name = self.oscillates
         return (
             f"still oscillating: {_SIGNALS[name]} by {self.pu[name]:.3g} p.u. peak to peak at "
-            f"{self.hz[name]:.4g} Hz > {self.limit:g} p.u. in the last {self.span_s:.3g} s"
+            f"about {self.hz[name]:.3g} Hz > {self.limit:g} p.u. in the last {self.span_s:.3g} s"
         )
 
 

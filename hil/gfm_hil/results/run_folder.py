@@ -217,8 +217,8 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
         folder: new or empty.
 
     Raises:
-        UserError: a folder is not that of one side, they are not of the same run, or ``folder``
-            is in use or cannot be written.
+        UserError: a folder is not that of one side, they are not of the same run or of the same
+            converter, or ``folder`` is in use or cannot be written.
     """
     roles: dict[Role, Run] = {}
     for run in (Run.load(first), Run.load(second)):
@@ -234,6 +234,9 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
     ids = [run.summary.get("run") for run in (plant, controller)]
     if ids[0] is None or ids[0] != ids[1]:
         raise UserError(f"{first}, {second}: are not of the same run: run = {ids[0]!r}, {ids[1]!r}")
+    names = [run.scenario.converter for run in (plant, controller)]
+    if names[0] != names[1]:
+        raise UserError(f"{first}, {second}: are of different converters: {names[0]}, {names[1]}")
     done = plant.summary["ticks"]
     check_free(folder, done, "inner" in plant.summary)
     log = read_log(*(run.file("events.jsonl") for run in roles.values()))

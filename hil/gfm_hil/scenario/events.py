@@ -326,7 +326,9 @@ class Fault(_Event):
     @model_validator(mode="after")
     def _has_one_place(self) -> Fault:
         if (self.position is None) == (self.node is None):
-            raise ValueError(f"position = {self.position}, node = {self.node}: give one of them")
+            raise ValueError(
+                "position, node: give one of them" + (", not both" if self.node else "")
+            )
         if self.line is not None and self.position is None:
             raise ValueError(f"line = {self.line!r}: goes with a position")
         return self

@@ -24,8 +24,11 @@ from gfm_hil.scenario.events import (
     GridImpedance,
     GridLoad,
     GridProfile,
+    GridUnbalance,
+    GridVoltage,
     LawChange,
     LineBreaker,
+    PhaseJump,
     Reset,
     apply_grid_event,
     check_reference,
@@ -58,7 +61,8 @@ class _Model(BaseModel):
 
 
 _CAN_BE_IMPOSSIBLE = (
-    Breaker, Fault, GridFrequency, GridImpedance, GridLoad, GridProfile, LineBreaker
+    Breaker, Fault, GridFrequency, GridImpedance, GridLoad, GridProfile, GridUnbalance,
+    GridVoltage, LineBreaker, PhaseJump,
 )  # fmt: skip
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
