@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 HERE = Path(__file__).parent
-RIG = {"L_g": 3.0, "R_g": 1.5, "R_f": 0.5}
 FAULTS = {"towards": "plant", "seed": 1, "loss": 0.01, "corrupt": 0.01, "duplicate": 0.01}
 
 
@@ -23,9 +22,7 @@ def programs():
 def begin(bench, link, *words, **changed):
     """The rig at rest; the program's own P_ref steps from 0.5 to 0.7 p.u. at tick 500."""
     command = [HERE / f"controller-{link}", "{endpoint}", *words, "0=0.5", "500=0.7"]
-    # the plant starts at the operating point of the law that is named
-    setting = {"law": "droop-5", "events": [], "plant__factors": RIG, **changed}
-    bench.start("rig_pref_step", link=link, controller_command=command, **setting)
+    bench.start(HERE / "scenario.toml", link=link, controller_command=command, **changed)
 
 
 def test_power_follows_its_reference_over_both_links(bench):
