@@ -85,12 +85,12 @@ def cause(reasons: list[str]) -> str:
 def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     """The most severe of the outcomes that the roles wrote and the one seen from ``outside``. Of
     equally severe ones, that from outside, or that of the role where the cause occurred, which may
-    say more."""
+    say more. What a controller calls the plant's trip counts only if nobody else has a reason: the
+    bridge is also blocked when the plant lost its controller."""
     ends = [Outcome(e["status"], e["reason"], e["tick"]) for e in lines if e["event"] == "end"]
     found = [outside, *ends] if outside else ends
     if not found:
         return Outcome("safe", "the run was cut off: no process recorded its end", 0)
-    # a controller sees that the bridge is blocked and calls it a trip; the plant knows better
     own = [o for o in found if o.reason != REASONS[PLANT_TRIP]]
     found = own if any(o.status != "completed" for o in own) else found
     first = max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))

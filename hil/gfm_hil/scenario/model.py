@@ -649,18 +649,19 @@ def _try_plant(scenario: Scenario) -> None:
     }
     for of, options in plants.items():
         place = f"{of}converter = {options.converter!r}"
+        if not options.converter.endswith(".toml"):
+            try:
+                load_converter(options.converter)
+            except ValueError as problem:  # names key and value itself
+                raise UserError(f"{of}{problem}") from None
+            continue
         try:
-            if options.converter.endswith(".toml"):
-                ConverterParameters.model_validate(read_toml(options.converter))
+            ConverterParameters.model_validate(read_toml(options.converter))
         except ValidationError as problem:
             wrong = lines(problem, ConverterParameters)
             raise UserError("; ".join(f"{place}: {line}" for line in wrong)) from None
         except ValueError as problem:
             raise UserError(f"{place}: {problem}") from None
-        try:
-            load_converter(options.converter)
-        except ValueError as problem:
-            raise UserError(f"{of}{problem}") from None
     try:
         plant = plant_of(scenario)
     except ValueError as problem:
