@@ -8,38 +8,32 @@ that are known to have it.
 
 numba keeps what it compiles on disk, and takes it for current as long as the function's own file
 has not changed. But a compiled function contains its callees, which are in other files: after an
-update, a stale one would compute something else without a word. Here any change of any of our
-compiled code makes all of it compile again.
+update, a stale one would compute something else without a word. ``_Cache`` compiles again after any
+change of any of our compiled code.
 
 numba names a compiled function by its arguments, and a record among them by a number that counts
 the types of the process. The records of two sizes of plants, compiled by two processes, could so
-have one name: a third process that loads both would call either for both. Here a record is named by
-what it holds.
+have one name: a third process that loads both would call either for both. ``_Named`` adds what the
+arguments hold to the name.
+
+Both act on the functions that are decorated here and on no others: a program that imports us keeps
+numba as it is.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from numba import njit, types
-from numba.core.caching import IndexDataCacheFile, _SourceFileBackedLocatorMixin
-
-#: options of njit and cfunc; a division by 0 gives infinity or NaN as in C, and no branch
-FREE: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False, "error_model": "numpy"}
-
-#: decorator for such a function
-compiled: Any = njit(**FREE)
-
-#: decorator for the innermost functions, which become part of their callers: the compiler would
-#: otherwise emit a call, pass every word of every array on the stack, and save registers
-inlined: Any = njit(**FREE, forceinline=True)
-
-#: decorator for a function of a tick that needs numba's runtime, as slices of arrays do
-cached: Any = njit(cache=True, nogil=True, error_model="numpy")
+from numba import njit
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.ccallback import CFunc
+from numba.core.compiler import Compiler
+from numba.core.sigutils import normalize_signature
 
 #: where compiled functions, and constants that they contain, come from
 _PLACES = {
@@ -49,50 +43,84 @@ _PLACES = {
 }
 #: rooms in these folders that generate text; no compiled function of another room calls theirs
 _TEXT_ONLY = ("firmware",)
-_own_stamp = _SourceFileBackedLocatorMixin.get_source_stamp
+
+
+class _Named(Compiler):
+    """numba's compiler, with the types of the arguments in the name of what it compiles."""
+
+    def define_pipelines(self) -> Any:
+        """As numba asks for it, once a compilation and before it names anything."""
+        function, held = self.state.func_id, repr(self.state.args).encode()
+        function.unique_id = f"{function.unique_id}_{hashlib.sha256(held).hexdigest()[:16]}"
+        return super().define_pipelines()
 
 
 @cache
-def _sources() -> tuple[tuple[Path, ...], bytes]:
-    """The folders of our packages, and a digest of all that may be compiled into a function."""
-    digest, folders = hashlib.sha256(), []
+def _digest() -> bytes:
+    """A digest of all that may be compiled into a function."""
+    digest = hashlib.sha256()
     for package, rooms in _PLACES.items():
         spec = find_spec(package)  # does not import it
         for folder in map(Path, (spec and spec.submodule_search_locations) or ()):
-            folders.append(folder)
             for room in rooms:
                 for file in sorted((folder / room).rglob("*.py")):
                     if file.relative_to(folder).parts[0] not in _TEXT_ONLY:
                         digest.update(file.read_bytes())
-    return tuple(folders), digest.digest()
+    return digest.digest()
 
 
-def _stamp(locator: Any) -> Any:
-    """What numba compares with the stamp in its cache; of our files, it covers all of them."""
-    folders, digest = _sources()
-    own, file = _own_stamp(locator), Path(locator._py_file)
-    return (own, digest) if any(file.is_relative_to(folder) for folder in folders) else own
+class _Index(IndexDataCacheFile):
+    """The index of a cache: it also holds the types of arguments, which an update may have taken
+    away. Such a cache is as good as none."""
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except (AttributeError, ImportError):
+            return {}
 
 
-_SourceFileBackedLocatorMixin.get_source_stamp = _stamp  # type: ignore[method-assign]
+class _Cache(FunctionCache):
+    """numba's cache of a function, current as long as all our compiled code is the same."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        stamp = (self._impl.locator.get_source_stamp(), _digest())
+        self._cache_file = _Index(self._cache_path, self._impl.filename_base, stamp)
 
 
-def _load_index(file: Any) -> Any:
-    """What numba finds in a cache. It also holds the types of arguments, which an update may have
-    taken away: such a cache is as good as none."""
-    try:
-        return _own_load_index(file)
-    except (AttributeError, ImportError):
-        return {}
+#: options of numba; a division by 0 gives infinity or NaN as in C, and no branch
+FREE: dict[str, Any] = {"nogil": True, "_nrt": False, "error_model": "numpy"}
 
 
-_own_load_index = IndexDataCacheFile._load_index
-IndexDataCacheFile._load_index = _load_index  # type: ignore[method-assign]
+def _decorator(**options: Any) -> Any:
+    """``numba.njit`` with our cache."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(pipeline_class=_Named, **options)(function)
+        dispatcher._cache = _Cache(function)
+        return dispatcher
+
+    return decorate
 
 
-def _name_of_record(record: Any) -> tuple[str, tuple[int]]:
-    """By what numba names a record among the arguments of a function."""
-    return "Record", (int.from_bytes(hashlib.sha256(record.name.encode()).digest()[:8]),)
+def callback(
+    function: Callable[..., Any], signature: Any, kept: bool = True, **options: Any
+) -> CFunc:
+    """Compile a function for callers in C, who use its ``address``; ``kept``: in our cache."""
+    made = CFunc(function, normalize_signature(signature), {}, options, _Named)
+    if kept:
+        made._cache = _Cache(function)  # type: ignore[attr-defined]
+    made.compile()
+    return made
 
 
-types.Record.mangling_args = property(_name_of_record)  # type: ignore[method-assign,assignment]
+#: decorator for such a function
+compiled: Any = _decorator(**FREE)
+
+#: decorator for the innermost functions, which become part of their callers: the compiler would
+#: otherwise emit a call, pass every word of every array on the stack, and save registers
+inlined: Any = _decorator(**FREE, forceinline=True)
+
+#: decorator for a function of a tick that needs numba's runtime, as slices of arrays do
+cached: Any = _decorator(nogil=True, error_model="numpy")

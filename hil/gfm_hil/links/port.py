@@ -12,10 +12,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import cfunc, types
+from numba import types
 from numpy.typing import NDArray
 
-from gfm_runtime.compiled import FREE
+from gfm_runtime.compiled import FREE, callback
 
 #: signature of the functions: (handle, message) -> number
 PORT_CALL = types.int64(types.int64[::1], types.uint8[::1])
@@ -68,7 +68,7 @@ class PortFunction(types.WrapperAddressProtocol):
 
     @cached_property
     def _compiled(self) -> Any:
-        return cfunc(PORT_CALL, **self._options)(self._function)
+        return callback(self._function, PORT_CALL, **self._options)
 
     def __wrapper_address__(self) -> int:
         return int(self._compiled.address)
@@ -81,7 +81,7 @@ class PortFunction(types.WrapperAddressProtocol):
 def port_function(function: Callable[[Any, Any], int], cached: bool = True) -> PortFunction:
     """Make a function of (handle, message) one of a ``Port``; numba keeps what it compiles on disk
     unless ``cached`` is False."""
-    return PortFunction(function, cache=cached)
+    return PortFunction(function, kept=cached)
 
 
 def free_port_function(function: Callable[[Any, Any], int]) -> PortFunction:

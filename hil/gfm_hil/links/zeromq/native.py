@@ -84,7 +84,7 @@ def _send(handle, message):
     return 1 if sent == message.size else 0
 
 
-@njit(**{**FREE, "cache": False})
+@njit(**FREE)
 def _take(handle, message, flags):
     if handle[_SOCKET] == 0:
         return 0
