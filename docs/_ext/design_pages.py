@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
-from gfm_design.tuning.gains import FreeGain, tied
+from gfm_design.tuning.gains import FreeGain
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_hil.core.terminal import markdown
 from gfm_runtime import law_file
+from gfm_runtime.lawfile import tied
 
 #: column: law, gains that differ from its file
 _COLUMNS = (

@@ -292,6 +292,16 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
     return law
 
 
+def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
+    """``values`` and all parameters that the file ties to others, e.g. k_35 = k_34 / D_q."""
+    numbers = {n: p.value for n, p in file.parameters.items()} | dict(values)
+    out = dict(values)
+    for name, p in file.parameters.items():
+        if p.tied is not None:
+            out[name] = evaluate(f"parameters.{name}.tied", p.tied, numbers)
+    return out
+
+
 def parse_law(text: str, where: str = "law file") -> LawFile:
     """Parse the text of a law file.
 

@@ -13,7 +13,7 @@ from gfm_design.model.box import Point
 from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import linearise_plant
-from gfm_design.tuning.gains import free_gains, tied
+from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.robust import Loops
 from gfm_hil.engine.inproc import run_ticks, stack
@@ -26,6 +26,7 @@ from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_fi
 from gfm_runtime.assembly import Controller
 from gfm_runtime.inner import Inner
 from gfm_runtime.inner_file import named_inner
+from gfm_runtime.lawfile import tied
 from gfm_runtime.signals import NU_INNER, NY_INNER
 
 T_S = 1e-4

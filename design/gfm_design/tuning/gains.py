@@ -20,8 +20,8 @@ from gfm_design.model.batch import realise_each
 from gfm_design.model.linear import LinearLaw, closed_law, error_map_slopes, linearise_law
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_runtime.errors import LawError
-from gfm_runtime.expressions import evaluate, evaluate_each
-from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.expressions import evaluate_each
+from gfm_runtime.lawfile import LawFile, build_law, tied
 from gfm_runtime.realisation import realise
 
 Vector = NDArray[np.float64]
@@ -81,16 +81,6 @@ def free_gains(
             raise LawError(f"gain {name}", f"start {value:g} lies outside [{low:g}, {high:g}]")
         gains.append(FreeGain(name, value, low, high))
     return tuple(gains)
-
-
-def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
-    """``values`` and all parameters that the file ties to others, e.g. k_35 = k_34 / D_q."""
-    numbers = {n: p.value for n, p in file.parameters.items()} | dict(values)
-    out = dict(values)
-    for name, p in file.parameters.items():
-        if p.tied is not None:
-            out[name] = evaluate(f"parameters.{name}.tied", p.tied, numbers)
-    return out
 
 
 def _generic(gain: FreeGain, k: int) -> float:

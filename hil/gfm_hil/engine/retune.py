@@ -8,11 +8,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from gfm_design.tuning.gains import tied
 from gfm_runtime import law_file, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.errors import LawError
 from gfm_runtime.kernel import pack_law
+from gfm_runtime.lawfile import tied
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
 Gains = tuple[tuple[str, float], ...]

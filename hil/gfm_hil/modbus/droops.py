@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from gfm_design.tuning.gains import tied
 from gfm_runtime import LawError, law_file
 from gfm_runtime.law import Law
-from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.lawfile import LawFile, build_law, tied
 
 _NEARLY_DC = 1e-7j  # rad/s; integrators have no value at 0
 _RTOL = 1e-3  # printed gains are rounded

@@ -20,7 +20,7 @@ from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import DiscreteLaw, LawError, build_law, discretise, law_file, law_names, parse_law
 from gfm_runtime import Law as BuiltLaw
 from gfm_runtime.inner_file import named_inner
-from gfm_runtime.lawfile import ElementSpec, LawFile
+from gfm_runtime.lawfile import ElementSpec, LawFile, tied
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
@@ -132,8 +132,6 @@ class Law:
             if gain not in self.file.parameters:
                 known = sorted(self.file.parameters)
                 raise LawError(f"parameter {gain}", f"unknown to {self.name}; known: {known}")
-        from gfm_design.tuning.gains import tied
-
         content = self.file.model_dump(mode="json", exclude_none=True)
         for gain, value in (tied(self.file, gains) | gains).items():
             content["parameters"][gain] |= {"value": float(value), "source": "with_gains"}

@@ -20,14 +20,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
-from gfm_design.tuning.gains import tied
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import describe, signals_of
 from gfm_hil.scenario.events import check_reference
 from gfm_runtime import LawError, law_file
 from gfm_runtime.firmware import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.c_text import identifier
-from gfm_runtime.lawfile import LawFile, build_law
+from gfm_runtime.lawfile import LawFile, build_law, tied
 from gfm_runtime.signals import SIGNALS, group
 
 CELL = 8  # bytes

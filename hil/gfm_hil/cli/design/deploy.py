@@ -11,7 +11,7 @@ from gfm_design.margins.delays import overall_delay
 from gfm_design.model.box import Box, Point, Source
 from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.deployable import Round, deploy
-from gfm_design.tuning.gains import free_gains, tied
+from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.robust import Wanted, paper_problem
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.cli.design.box import add_box, margin_text, read_box, wanted
@@ -27,7 +27,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.tuned_law import law_text, problem_name
 from gfm_runtime import build_law, discretise, parse_law
-from gfm_runtime.lawfile import LawFile
+from gfm_runtime.lawfile import LawFile, tied
 
 
 def add(kinds: Any) -> None:
