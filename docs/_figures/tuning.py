@@ -23,7 +23,6 @@ EXAMPLE = {
     "tune_tune": f"gfmhil design tune --law {LAW} --out {TUNED} --quiet",
     "tune_run": f"gfmhil run pref_step --law {TUNED} --link inproc --out runs/tuned --quiet",
     "tune_margins": f"gfmhil design margins --law {TUNED} --scenario pref_step",
-    "tune_box": f"gfmhil design box --law {TUNED} --random 100",
 }
 #: commands of the page that stand by themselves
 OTHERS = {

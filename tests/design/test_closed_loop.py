@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from deployable.box import Point
 from gfm_design.margins.locus import locus_at_u, locus_at_y
-from gfm_design.model.box import Point
 from gfm_design.model.closed_loop import INPUTS, REFERENCES, T_S, ClosedLoop, response
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains

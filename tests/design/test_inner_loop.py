@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deployable.box import Point
+from deployable.robust import Loops
 from gfm_design.margins.all_margins import loop_margins
-from gfm_design.model.box import Point
 from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import linearise_plant
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
-from gfm_design.tuning.robust import Loops
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import signals_of

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gfm_design.model.least_stable import least_stable
 from gfm_design.norms.peaks import model, peaks
 from gfm_design.norms.performance import StateSpace
 from gfm_design.tuning.gains import Encoding, free_gains
-from gfm_design.tuning.law_comparison_modes import culprit
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_design.tuning.polish import polish
 from gfm_design.tuning.synthesis import UNSTABLE
@@ -43,7 +43,7 @@ def test_unstable_points_are_ranked_by_their_growth() -> None:
     costs = PROBLEM.many(values)
     assert (costs > UNSTABLE).all()
     assert np.argmax(costs) == np.argmax(
-        [culprit(PROBLEM.closed_loop(v)).mode.sigma for v in values]
+        [least_stable(PROBLEM.closed_loop(v)).mode.sigma for v in values]
     )
 
 

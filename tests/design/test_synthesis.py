@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from gfm_design.model.least_stable import least_stable
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
-from gfm_design.tuning.law_comparison_modes import culprit
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import tune_paper
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
@@ -105,7 +105,7 @@ def test_the_reason_when_there_are_none() -> None:
     problem = PaperProblem(file, free_gains(file))
     with pytest.raises(NotStabilised, match="no stabilising gains") as none:
         tune_paper(problem)
-    words = culprit(problem.closed_loop(none.value.values)).words()
+    words = least_stable(problem.closed_loop(none.value.values)).words()
     assert "mode at 50.7" in words
     assert "i_o" in words  # of the grid's current
 

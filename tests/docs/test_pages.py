@@ -135,8 +135,7 @@ def test_worked_example_of_a_tuning_says_what_the_page_shows(
     monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
     from _figures import tuning
 
-    # all but tune_box, whose thousand corners that command's tests cover
-    said = tuning.run_example(tmp_path, ("tune_tune", "tune_run", "tune_margins"))
+    said = tuning.run_example(tmp_path)
     for name, what in (
         ("tune_tune", r"γ = ([\d.]+)"),
         ("tune_file", r"gamma = ([\d.]+)"),

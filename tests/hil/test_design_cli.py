@@ -165,35 +165,7 @@ def test_tune_behind_an_inner_stage(capsys: Capture, tmp_path: Path) -> None:
         (["nyquist", "--law", "no-such-law"], "no-such-law"),
         (["step", "--of", "P"], "'P' is no input of the loop"),
         (["poles", "--out", "poles.none"], "poles.none"),
-        *(
-            ([*command, "--law", "mimo-gfm", *(f"--box={entry}" for entry in entries)], words)
-            for command in (["box"], ["deploy", "--out", "never.toml"])
-            for entries, words in (
-                (["R_x=1"], "R_x"),
-                (["R_f="], "NAME=v,v"),
-                (["R_f=0.1,-1"], "from 0.001 to 100"),
-                (["L_g=far"], "from 0.01 to 100"),
-                (["delay=9"], "from 0 to 5.99"),
-                (["dc=ideal"], "controlled"),
-                (["dc=regulated", "dc=controlled"], "twice"),
-            )
-        ),
-        *(
-            (["deploy", "--law", "mimo-gfm", "--out", "x.toml", *more], words)
-            for more, words in (
-                (["--want", "speed=1"], "speed"),
-                (["--want", "alpha"], "--want"),
-                (["--want", "alpha=-1"], "positive"),
-                (["--want", "rig_alpha=1", "--box", "dc=regulated"], "both DC sources"),
-                (["--only", "k_99"], "k_99"),
-            )
-        ),
-        (["compare", "--laws", "no-such-law"], "not in the catalogue"),
-        (["compare", "--laws", "vsg-2,,mimo-gfm"], "none empty"),
-        (["compare", "--laws", "mimo-gfm-scheduled"], "first stage"),
-        (["compare", "--jobs", "0"], "at least 1"),
-        (["compare", "--seed", "-1"], "at least 0"),
-        (["compare", "--evaluations", "0"], "at least 1"),
+        (["box", "--law", "mimo-gfm"], "python -m deployable check takes the same options"),
     ],
 )
 def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:

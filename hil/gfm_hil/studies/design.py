@@ -11,11 +11,11 @@ import numpy as np
 
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
+from gfm_design.model.least_stable import least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
 from gfm_design.norms.weights import read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.law_comparison_modes import culprit
 from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
@@ -224,7 +224,7 @@ def tune(
         mode = loop.modes()[0].words()
         if on is None:
             where = f"on the paper's converter at P_ref = {problem.references[1]:g}"
-            mode = culprit(loop).words()
+            mode = least_stable(loop).words()
         wanted = f" against a decay of {decay:g} 1/s" if decay else ""
         raise NotTuned(f"{none}{wanted}; in the way, {where}: {mode}") from None
     except ModuleNotFoundError as missing:

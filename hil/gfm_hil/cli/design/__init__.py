@@ -4,11 +4,27 @@ from __future__ import annotations
 
 import argparse
 
-from gfm_hil.cli.design import box, compare, deploy, gamma, loop, margins, tune
+from gfm_hil.cli.design import gamma, loop, margins, tune
+from gfm_hil.core.errors import UserError
+
+#: commands of version 0.1 that are scripts of the repository now; the note goes with version 0.3
+_MOVED = {"compare": "law_comparison", "box": "deployable check", "deploy": "deployable tune"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
     """Add the sub-commands."""
     kinds = command.add_subparsers(dest="design", required=True, metavar="WHAT")
-    for module in (gamma, margins, loop, tune, box, deploy, compare):
+    for module in (gamma, margins, loop, tune):
         module.add(kinds)
+    for name in _MOVED:
+        moved = kinds.add_parser(name, add_help=False, prefix_chars="\0")  # any option is a word
+        moved.add_argument("words", nargs="*")
+        moved.set_defaults(call=_moved)
+
+
+def _moved(options: argparse.Namespace) -> int:
+    to = _MOVED[options.design]
+    raise UserError(
+        f"design {options.design}: is a script now: in examples/paper of the repository, "
+        f"python -m {to} takes the same options"
+    )

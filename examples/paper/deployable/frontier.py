@@ -1,7 +1,7 @@
 """The frontier of docs/deployable.md: the least gamma found for boxes and demands of several sizes.
 
-Usage: python docs/deployable_frontier.py    (about a quarter of an hour; writes
-docs/deployable_frontier.csv, and goes on where a stopped run was)
+Usage, in examples/paper: python -m deployable.frontier    (about a quarter of an hour; writes
+deployable/frontier.csv, and goes on where a stopped run was)
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_design.model.box import Box
-from gfm_design.tuning.deployable import deploy
+from deployable.box import Box
+from deployable.robust import Wanted
+from deployable.search import deploy
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.robust import Wanted
 from gfm_runtime import law_file
 
-TABLE = Path(__file__).resolve().parent / "deployable_frontier.csv"
+TABLE = Path(__file__).resolve().parent / "frontier.csv"
 COLUMNS = ("dc", "moved", "value", "gamma", "sigma", "overshoot", "slow", "beyond", "seconds")
 
 _SEED, _ROUNDS, _EVALUATIONS = 0, 3, 1500

@@ -1,4 +1,4 @@
-"""gfmhil design deploy: gains that hold in the box of real loops, as a law file."""
+"""Gains that hold in the box of real loops, as a law file."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from deployable.box import Box, Point, Source
+from deployable.check import add_box, margin_text, read_box, wanted
+from deployable.robust import Wanted, paper_problem
+from deployable.search import Round, deploy
 from gfm_design.margins.delays import overall_delay
-from gfm_design.model.box import Box, Point, Source
 from gfm_design.model.closed_loop import T_S
-from gfm_design.tuning.deployable import Round, deploy
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.robust import Wanted, paper_problem
 from gfm_design.tuning.synthesis import NotStabilised
-from gfm_hil.cli.design.box import add_box, margin_text, read_box, wanted
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
@@ -31,7 +31,7 @@ from gfm_runtime.lawfile import LawFile, tied
 
 
 def add(kinds: Any) -> None:
-    command = kinds.add_parser("deploy", help="choose the free gains to hold in the box")
+    command = kinds.add_parser("tune", help="choose the free gains to hold in the box")
     add_law_options(command)
     add_box(command)
     command.add_argument("--want", help="k=v,…: other demands, e.g. alpha=1.5,strong=0.04")
@@ -109,11 +109,11 @@ def _write(
     text = law_text(
         file,
         gains,
-        f"gfmhil design deploy, seed {result['seed']}",
+        f"python -m deployable tune, seed {result['seed']}",
         comments,
         name=path.stem,
         title=f"the paper's MIMO-GFM, gains that hold in the real loop{_source(box)}",
-        source="Eq. (36); gains by gfmhil design deploy, see the comments of the file\n",
+        source="Eq. (36); gains by python -m deployable tune, see the comments of the file\n",
     )
     law = discretise(build_law(parse_law(text)), T_S)
     margins = ", ".join(

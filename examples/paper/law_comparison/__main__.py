@@ -1,4 +1,10 @@
-"""gfmhil design compare: every law tuned for the same problem, and how each then behaves."""
+"""Every law tuned for the same problem, and how each then behaves.
+
+Usage, in examples/paper:  python -m law_comparison [--jobs N] [--out FOLDER] [--publish ROOT]
+
+``--publish`` copies what the project keeps of a whole comparison into its repository: the tables
+and figures of docs/law-comparison.md, and the laws of runtime/gfm_runtime/laws/tuned.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +12,10 @@ import argparse
 import contextlib
 import json
 import math
+import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn
@@ -19,15 +27,16 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
 from gfm_hil.studies.campaign.execute import WorkerLost
-from gfm_hil.studies.law_comparison.execute import kept, run
-from gfm_hil.studies.law_comparison.figures import draw
-from gfm_hil.studies.law_comparison.row import LEFT_OUT, Job, Row
-from gfm_hil.studies.law_comparison.tables import TABLES, markdown, print_comparison, ranked
-from gfm_runtime import law_names
+from gfm_runtime import LawError, law_names
+from law_comparison.execute import kept, run
+from law_comparison.figures import draw
+from law_comparison.row import LEFT_OUT, Job, Row
+from law_comparison.tables import TABLES, markdown, print_comparison, ranked
 
 
-def add(kinds: Any) -> None:
-    command = kinds.add_parser("compare", help="every law tuned for the same problem, in a table")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare the laws, as the command line says; returns the exit code."""
+    command = argparse.ArgumentParser(prog="python -m law_comparison", description=__doc__)
     command.add_argument("--laws", help="names separated by commas; the whole catalogue by default")
     command.add_argument("--seed", type=int, default=0, help="of the searches")
     command.add_argument("--evaluations", type=int, default=EVALUATIONS, help="of each start")
@@ -40,7 +49,13 @@ def add(kinds: Any) -> None:
         "--json", action="store_true", help="print law_comparison.json, nothing else"
     )
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    command.set_defaults(call=call)
+    command.add_argument("--publish", metavar="ROOT", help="repository to copy the results into")
+    options = command.parse_args(arguments)
+    try:
+        return call(options)
+    except (UserError, LawError) as problem:
+        print(f"law_comparison: {problem}", file=sys.stderr)
+        return 2
 
 
 def call(options: argparse.Namespace) -> int:
@@ -81,9 +96,24 @@ def call(options: argparse.Namespace) -> int:
     if len(rows) < len(jobs):
         why = f"{lost}; " if lost else "interrupted; "
         again = f"the same command with --out {folder} goes on"
-        print(f"gfmhil: {why}{len(jobs) - len(rows)} laws are missing; {again}", file=sys.stderr)
+        print(
+            f"law_comparison: {why}{len(jobs) - len(rows)} laws are missing; {again}",
+            file=sys.stderr,
+        )
         return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
+    if options.publish:
+        _publish(folder, Path(options.publish))
     return 0
+
+
+def _publish(folder: Path, root: Path) -> None:
+    """Copy tables, figures and laws to where the project keeps them."""
+    laws = root / "runtime" / "gfm_runtime" / "laws" / "tuned"
+    for pattern, to in (("*.md", "docs/tables"), ("*.png", "docs/_static/figures")):
+        for path in folder.glob(f"law_comparison_{pattern}"):
+            shutil.copy(path, root / to / path.name)
+    shutil.rmtree(laws, ignore_errors=True)
+    shutil.copytree(folder / "laws", laws)
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
@@ -126,3 +156,7 @@ def _bar(jobs: list[Job], options: argparse.Namespace) -> Iterator[tuple[Any, An
             bar.console.print(f"{row['law']}: {found}, {row['seconds']:.0f} s")
 
         yield tell, done
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

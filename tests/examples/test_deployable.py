@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deployable.bench import step_run
+from deployable.box import Box, Point, Source
+from deployable.robust import Loops, RobustProblem, Wanted, paper_problem
+from deployable.search import Round, deploy, steps
 from gfm_design.margins.delays import overall_delay
-from gfm_design.model.box import Box, Point, Source
 from gfm_design.model.closed_loop import T_S
 from gfm_design.model.linear import linearise_law, linearise_plant
 from gfm_design.model.operating_point import operating_point
-from gfm_design.tuning.deployable import Round, deploy, steps
 from gfm_design.tuning.gains import FreeGain, free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
-from gfm_design.tuning.robust import Loops, RobustProblem, Wanted, paper_problem
 from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_hil.studies.box import step_run
 from gfm_plant import make_plant
 from gfm_runtime import discretise, get_law, law_file
 

@@ -1,4 +1,4 @@
-"""gfmhil design box: whether a law holds in the box of real loops, point by point."""
+"""Whether a law holds in the box of real loops, point by point."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 from rich.progress import track
 from rich.table import Table
 
+from deployable.bench import STEP, step_run
+from deployable.box import Box, Point, Source
+from deployable.robust import Loops, Wanted, paper_problem
 from gfm_design.margins.delays import longest, overall_delay
-from gfm_design.model.box import Box, Point, Source
 from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.robust import Loops, Wanted, paper_problem
 from gfm_hil.cli.design.common import add_inner_option, channels_as_json, chosen_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.studies.box import STEP, step_run
 from gfm_hil.studies.tuned_law import problem_name
 from gfm_runtime import build_law, discretise
 from gfm_runtime.lawfile import LawFile
@@ -38,7 +38,7 @@ _RANGE = {
 
 
 def add(kinds: Any) -> None:
-    command = kinds.add_parser("box", help="whether a law holds in the box of real loops")
+    command = kinds.add_parser("check", help="whether a law holds in the box of real loops")
     command.add_argument("--law", required=True, help="catalogue name or law file")
     add_inner_option(command)
     add_box(command)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
-from gfm_hil.studies.law_comparison.row import Job, Row, make_row
+from law_comparison.row import Job, Row, make_row
 
 _POLL_S = 0.2
 

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from gfm_design.model.closed_loop import T_S
+from gfm_design.model.least_stable import LeastStable, least_stable
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.law_comparison import (
+from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.synthesis import UNSTABLE
+from gfm_runtime import law_file
+from law_comparison.search import (
     ALPHA,
     LateProblem,
     as_it_is,
@@ -16,10 +20,6 @@ from gfm_design.tuning.law_comparison import (
     search,
     stands,
 )
-from gfm_design.tuning.law_comparison_modes import Culprit, culprit
-from gfm_design.tuning.paper_problem import PaperProblem
-from gfm_design.tuning.synthesis import UNSTABLE
-from gfm_runtime import law_file
 
 from ..support.loops import reference_loop
 
@@ -29,8 +29,8 @@ SHORT = {"seed": 0, "evaluations": 64, "starts": 1}
 def test_a_law_that_nothing_stabilises_names_the_mode_and_its_states() -> None:
     found = search(law_file("droop-1"), **SHORT)
     assert found.gains is None
-    assert isinstance(found.before, Culprit)
-    assert isinstance(found.after, Culprit)
+    assert isinstance(found.before, LeastStable)
+    assert isinstance(found.after, LeastStable)
     assert found.after.mode.sigma > 0.0
     assert found.after.mode.frequency_hz == pytest.approx(50.7, abs=0.5)
     assert {name for name, _ in found.after.states} == {"i_d", "i_q", "i_od", "i_oq"}
@@ -42,7 +42,7 @@ def test_participation_is_how_far_the_mode_moves_with_a_state() -> None:
     file = law_file("droop-1")
     problem = PaperProblem(file, free_gains(file))
     values = np.array([g.start for g in problem.gains])
-    found = culprit(problem.closed_loop(values))
+    found = least_stable(problem.closed_loop(values))
     A = problem.closed_loop(values).A
     target = found.mode.sigma + 2j * np.pi * found.mode.frequency_hz
     moved = []
@@ -59,9 +59,9 @@ def test_channels_that_the_structure_fixes_do_not_hide_the_others() -> None:
     # no gain of droop-2 moves p or q + V/D_q at rest: W_11 and W_41 stay where they are
     found = search(law_file("droop-2"), **SHORT)
     assert set(found.fixed) == {(1, 1), (4, 1)}
-    assert not isinstance(found.before, Culprit)
-    assert not isinstance(found.ideal, Culprit)
-    assert not isinstance(found.after, Culprit)
+    assert not isinstance(found.before, LeastStable)
+    assert not isinstance(found.ideal, LeastStable)
+    assert not isinstance(found.after, LeastStable)
     before, ideal, after = (
         {(c.i, c.j): c.norm for c in channels}
         for channels in (found.before, found.ideal, found.after)
@@ -76,7 +76,7 @@ def test_channels_that_the_structure_fixes_do_not_hide_the_others() -> None:
 
 def test_a_law_as_it_is() -> None:
     found = as_it_is(law_file("mimo-gfm"))
-    assert not isinstance(found.after, Culprit)
+    assert not isinstance(found.after, LeastStable)
     assert gamma(found.after) == pytest.approx(2.0209, rel=5e-5)
     assert found.gains is not None
     assert found.gains["k_pdc"] == law_file("mimo-gfm").parameters["k_pdc"].value
@@ -122,14 +122,14 @@ def test_the_search_ends_at_gains_that_can_be_run() -> None:
     file = law_file("vsg-5")
     found = search(file, seed=0, evaluations=64, starts=1)
     assert found.gains is not None
-    assert not isinstance(found.ideal, Culprit)
-    assert not isinstance(found.after, Culprit)
+    assert not isinstance(found.ideal, LeastStable)
+    assert not isinstance(found.after, LeastStable)
     assert stands(file, found.gains).sigma < -0.98 * ALPHA
     assert gamma(found.ideal) <= gamma(found.after) < 1.2 * gamma(found.ideal)
 
 
-def test_a_late_culprit_names_the_states_of_the_sampled_loop() -> None:
-    found = culprit(late_loop(law_file("mimo-gfm"), {}))
+def test_the_least_stable_late_mode_names_the_states_of_the_sampled_loop() -> None:
+    found = least_stable(late_loop(law_file("mimo-gfm"), {}))
     assert found.mode.frequency_hz == pytest.approx(1180, abs=2)
     assert found.mode.sigma == pytest.approx(22.6, abs=0.1)
     assert {name for name, _ in found.states} & {"i_d", "i_q", "v_d", "v_q"}

@@ -1,7 +1,7 @@
 """Figures of docs/deployable.md: sigma over delay, line and resistance, overshoot, the frontier.
 
-Usage: python docs/deployable_figures.py    (about a minute; the frontier is drawn from
-docs/deployable_frontier.csv, which docs/deployable_frontier.py writes)
+Usage, in examples/paper: python -m deployable.figures    (about a minute; the frontier is drawn
+from deployable/frontier.csv, which deployable.frontier writes)
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gfm_design.model.box import Box, Point
+from deployable.bench import step_run
+from deployable.box import Box, Point
+from deployable.robust import Loops
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.robust import Loops
-from gfm_hil.studies.box import step_run
 from gfm_runtime import law_file
 
-FIGURES = Path(__file__).resolve().parent / "_static" / "figures"
+FIGURES = Path(__file__).resolve().parents[3] / "docs" / "_static" / "figures"
 LAWS = ("mimo-gfm", "mimo-gfm-deployable")
 NAMES = ("printed gains", "deployable gains")
 RIG_LAW, RIG_R = "mimo-gfm-deployable-rig", (0.33, 1.0, 3.0)
-FRONTIER = Path(__file__).resolve().parent / "deployable_frontier.csv"
+FRONTIER = Path(__file__).resolve().parent / "frontier.csv"
 MET = (0.1, 0.005)  # 1/s, a part of the step: the searches ask for so much more than is needed
 RESISTANCE = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0)
 

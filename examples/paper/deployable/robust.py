@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.box import SOURCES, Point, Source
+from deployable.box import SOURCES, Point, Source
 from gfm_design.model.closed_loop import INPUTS, T_S, ClosedLoop
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
 from gfm_design.tuning.paper_problem import PaperProblem

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from gfm_design.margins.tolerance import End, Range
+from gfm_design.model.least_stable import LeastStable
 from gfm_design.norms.performance import Channel
-from gfm_design.tuning.law_comparison import ALPHA, Found, as_it_is, late_loop, search, stands
-from gfm_design.tuning.law_comparison_modes import Culprit
 from gfm_hil.results.report import finite
-from gfm_hil.studies.law_comparison.experiments import EXPERIMENTS, experiment
 from gfm_hil.studies.tuned_law import channels_as_json, write_law
 from gfm_runtime import law_file
+from law_comparison.experiments import EXPERIMENTS, experiment
+from law_comparison.search import ALPHA, Found, as_it_is, late_loop, search, stands
 
 #: laws without a row, and why
 LEFT_OUT = {
@@ -82,7 +82,7 @@ def make_row(job: Job, folder: Path, tell: Tell) -> Row:
     if not as_shipped(job.law):
         path = folder / "laws" / f"{job.law}-tuned.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_law(path, file, found.gains, row, _notes(job, row), "gfmhil design compare")
+        write_law(path, file, found.gains, row, _notes(job, row), "python -m law_comparison")
         name = str(path)
     row["bench"] = {kind: experiment(kind, name) for kind in EXPERIMENTS}
     return row
@@ -101,9 +101,9 @@ def _found(found: Found) -> Row:
     }
 
 
-def _channels(found: Sequence[Channel] | Culprit) -> Row:
+def _channels(found: Sequence[Channel] | LeastStable) -> Row:
     """gamma and channels, or the reason why there are none."""
-    if isinstance(found, Culprit):
+    if isinstance(found, LeastStable):
         mode = {**found.mode.plain(), "states": [list(s) for s in found.states]}
         return {"gamma": None, "channels": [], "reason": found.words(), "mode": mode}
     return channels_as_json(found)

@@ -16,7 +16,7 @@ _SHOWN = 4
 
 
 @dataclass(frozen=True)
-class Culprit:
+class LeastStable:
     """A mode of a loop, and its largest participation factors by state.
 
     The factor of state k is |l_k r_k| of the mode's left and right eigenvectors, divided by the sum
@@ -32,7 +32,7 @@ class Culprit:
         return f"{self.mode.words()}: {who}"
 
 
-def culprit(loop: ClosedLoop) -> Culprit:
+def least_stable(loop: ClosedLoop) -> LeastStable:
     """The mode of a loop with the largest sigma, and the states that take part in it."""
     values, right = np.linalg.eig(loop.A)
     k = int(np.argmax(values.real if loop.T_s is None else np.abs(values)))
@@ -41,7 +41,7 @@ def culprit(loop: ClosedLoop) -> Culprit:
     names, shares = _states(loop), shares / shares.sum()
     assert len(names) == len(shares)
     largest = tuple((names[n], float(shares[n])) for n in np.argsort(-shares)[:_SHOWN])
-    return Culprit(Mode.of(s), largest)
+    return LeastStable(Mode.of(s), largest)
 
 
 def _states(loop: ClosedLoop) -> list[str]:

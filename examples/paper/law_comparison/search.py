@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from gfm_design.margins.delays import DelayMargin, overall_delay
 from gfm_design.margins.tolerance import Range, element_range
 from gfm_design.model.closed_loop import T_S, ClosedLoop
+from gfm_design.model.least_stable import LeastStable, least_stable
 from gfm_design.model.linear import LinearLaw, Mode
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
-from gfm_design.tuning.law_comparison_modes import Culprit, culprit
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import tune_paper
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
@@ -43,7 +43,7 @@ ALPHA = 1.0  # 1/s
 _SHARES = (1.0, 0.3, 0.1)  # of a polish's step that are tried
 
 Pair = tuple[int, int]  # i, j of a channel
-After = tuple[Channel, ...] | Culprit
+After = tuple[Channel, ...] | LeastStable
 Progress = Callable[[int, float], None]
 
 
@@ -186,7 +186,7 @@ def search(
     try:
         found = tune_paper(problem, seed, evaluations, starts, progress)
     except NotStabilised as none:
-        ideal = culprit(problem.closed_loop(none.values))
+        ideal = least_stable(problem.closed_loop(none.values))
         return left(None, ideal)
     ideal, spent = problem.channels(found.values), found.evaluations
     if LateProblem(problem).sigma(found.values[None])[0] > -ALPHA:
@@ -195,9 +195,9 @@ def search(
             try:
                 tried.append(late(start))
             except NotStabilised as none:
-                culprit_late = culprit(late_loop(file, problem.law.named(none.values)))
+                in_the_way = least_stable(late_loop(file, problem.law.named(none.values)))
         if not tried:
-            return left(None, culprit_late)
+            return left(None, in_the_way)
         spent += sum(t.evaluations for t in tried)
         found = min(tried, key=lambda t: t.cost)
     values = found.values
@@ -254,7 +254,7 @@ def as_it_is(file: LawFile) -> Found:
     problem = PaperProblem(file, free_gains(file))
     at = np.array([g.start for g in problem.gains])
     channels = _channels(problem, at)
-    named = None if isinstance(channels, Culprit) else problem.law.named(at)
+    named = None if isinstance(channels, LeastStable) else problem.law.named(at)
     free = tuple(g.name for g in problem.gains)
     return Found(free, channels, channels, named, channels, (), 0, 0.0)
 
@@ -292,7 +292,7 @@ def _channels(problem: PaperProblem, values: Vector) -> After:
     try:
         return problem.channels(values)
     except Unstable:
-        return culprit(problem.closed_loop(values))
+        return least_stable(problem.closed_loop(values))
 
 
 def late_loop(file: LawFile, gains: Mapping[str, float]) -> ClosedLoop:

@@ -1,4 +1,4 @@
-"""gfmhil design compare: rows, tables, law files, going on, what it refuses."""
+"""examples/paper/law_comparison: rows, tables, law files, going on, what it refuses."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from gfm_hil.cli.main import main
-from gfm_hil.studies.law_comparison.experiments import AT, EXPERIMENTS, TRACE_EVERY, experiment
-from gfm_hil.studies.law_comparison.row import as_shipped
-from gfm_hil.studies.law_comparison.tables import markdown, number
+from gfm_hil.cli.main import main as gfmhil
 from gfm_runtime import law_file
+from law_comparison.__main__ import main
+from law_comparison.experiments import AT, EXPERIMENTS, TRACE_EVERY, experiment
+from law_comparison.row import as_shipped
+from law_comparison.tables import markdown, number
 
 Capture = pytest.CaptureFixture[str]
 SHORT = ("--evaluations", "320", "--starts", "1", "--quiet")
@@ -20,7 +21,7 @@ SHORT = ("--evaluations", "320", "--starts", "1", "--quiet")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("comparison") / "out"
-    assert main(["design", "compare", "--laws", "droop-1,vsg-2", "--out", str(out), *SHORT]) == 0
+    assert main(["--laws", "droop-1,vsg-2", "--out", str(out), *SHORT]) == 0
     return out
 
 
@@ -55,7 +56,7 @@ def test_a_run_that_oscillates_has_no_figures_in_the_table() -> None:
 def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Capture) -> None:
     path = folder / "laws" / "vsg-2-tuned.toml"
     row = json.loads((folder / "law_comparison.json").read_text())["laws"][0]
-    assert main(["design", "gamma", "--law", str(path), "--json"]) == 0
+    assert gfmhil(["design", "gamma", "--law", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["gamma"] == pytest.approx(row["gamma"], rel=1e-9)
     file = law_file(str(path))
     assert file.name == "vsg-2-tuned"
@@ -76,7 +77,7 @@ def test_what_is_done_is_kept(folder: Path, capsys: Capture) -> None:
         return {p.name: p.stat().st_mtime_ns for p in (folder / "rows").iterdir()}
 
     before = written()
-    again = ("design", "compare", "--laws", "droop-1,vsg-2", "--out", str(folder))
+    again = ("--laws", "droop-1,vsg-2", "--out", str(folder))
     assert main([*again, *SHORT]) == 0
     assert written() == before
     assert main([*again, *SHORT, "--seed", "1"]) == 0
@@ -112,3 +113,20 @@ def test_mimo_gfm_with_other_gains_is_not_searched() -> None:
 )
 def test_numbers(value: float | None, text: str) -> None:
     assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--laws", "no-such-law"], "not in the catalogue"),
+        (["--laws", "vsg-2,,mimo-gfm"], "none empty"),
+        (["--laws", "mimo-gfm-scheduled"], "first stage"),
+        (["--jobs", "0"], "at least 1"),
+        (["--seed", "-1"], "at least 0"),
+        (["--evaluations", "0"], "at least 1"),
+    ],
+)
+def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line

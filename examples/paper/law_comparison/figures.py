@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import T_S
 from gfm_hil.results.figures import COLOURS, dress
-from gfm_hil.studies.law_comparison.experiments import AT, TRACE_EVERY
-from gfm_hil.studies.law_comparison.tables import others, worst
+from law_comparison.experiments import AT, TRACE_EVERY
+from law_comparison.tables import others, worst
 
 Row = dict[str, Any]
 

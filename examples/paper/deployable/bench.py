@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_design.model.box import Point
+from deployable.box import Point
 from gfm_design.model.closed_loop import T_S
 from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import check_scenario

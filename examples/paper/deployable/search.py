@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.box import Box, Point, Source
+from deployable.box import Box, Point, Source
+from deployable.robust import Loops, RobustProblem, Wanted, paper_problem
 from gfm_design.tuning.gains import FreeGain
-from gfm_design.tuning.robust import Loops, RobustProblem, Wanted, paper_problem
 from gfm_design.tuning.synthesis import tune
 from gfm_runtime.lawfile import LawFile
 
