@@ -16,7 +16,7 @@ from pathlib import Path
 from gfm_runtime.errors import LawError, meant
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import Law
-from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file
+from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file, shipped_law
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ def _names(group: str) -> tuple[str, ...]:
 
 
 @cache
-def _shipped(name: str, group: str) -> LawFile:
-    path = files("gfm_runtime").joinpath("laws", group, f"{name}.toml")
-    return parse_law(path.read_text(encoding="utf-8"), f"law {name}")
+def _shipped(name: str) -> LawFile | None:
+    text = shipped_law(name)
+    return None if text is None else parse_law(text, f"law {name}")
 
 
 def law_file(name: str) -> LawFile:
@@ -72,10 +72,8 @@ def law_file(name: str) -> LawFile:
     """
     if name.endswith(".toml"):
         return read_law_file(name)
-    if name in law_names():
-        return _shipped(name, "")
-    if name in tuned_names():
-        return _shipped(name, "tuned")
+    if (shipped := _shipped(name)) is not None:
+        return shipped
     known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
     close = meant(name, [*law_names(), *tuned_names()])
     with contextlib.suppress(OSError, ValueError):  # of what can be no path

@@ -6,11 +6,13 @@ and the same checks. ``docs/law-files.md`` shows one line by line.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
@@ -21,7 +23,7 @@ from gfm_runtime.inner_file import InnerSpec, build_inner, named_inner
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
 from gfm_runtime.signals import U_NAMES
-from gfm_runtime.toml_file import Number, Table, parse_toml, read_text
+from gfm_runtime.toml_file import Number, Table, parse_toml, read_text, read_toml
 
 
 def _listed(value: Any) -> Any:
@@ -57,6 +59,9 @@ Factors = Annotated[
 
 class ParameterSpec(Table):
     """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
+
+    # of a file with a base, what the base says of the number may be missing here
+    model_config = ConfigDict(json_schema_extra=lambda schema: schema.pop("required"))
 
     value: float = Field(allow_inf_nan=False, description="the number, in its unit")
     unit: str = Field(description="e.g. p.u. or 1/s")
@@ -126,9 +131,22 @@ class Schedule(Table):
     )
 
 
-class LawFile(Table):
-    """The whole file."""
+def _base_or_whole(schema: dict[str, Any]) -> None:
+    """A file with a base may leave out what the base has."""
+    whole = {"required": schema.pop("required")}
+    schema |= {"if": {"required": ["base"]}, "then": {"required": ["name"]}, "else": whole}
 
+
+class LawFile(Table):
+    """The whole file; ``parse_law`` has put the content of its ``base`` into it."""
+
+    model_config = ConfigDict(json_schema_extra=_base_or_whole)
+
+    base: str | None = Field(
+        None,
+        description="a law of the catalogue, or a .toml file beside this one, that this file "
+        "changes: what stands here replaces what stands there, key by key",
+    )
     name: str = Field(
         pattern=r"^[a-z0-9][a-z0-9_.-]*$", description="lower case letters, digits, _, . and -"
     )
@@ -302,14 +320,67 @@ def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
     return out
 
 
-def parse_law(text: str, where: str = "law file") -> LawFile:
+def shipped_law(name: str) -> str | None:
+    """The text of a law of the catalogue, tuned or not; None if no law has this name."""
+    for group in ("", "tuned"):
+        path = files("gfm_runtime").joinpath("laws", group, f"{name}.toml")
+        if re.fullmatch("[a-z0-9-]+", name) and path.is_file():
+            return path.read_text(encoding="utf-8")
+    return None
+
+
+def _with_base(content: dict[str, Any], folder: Path, seen: tuple[str, ...]) -> dict[str, Any]:
+    """The content of a law file over that of its base, of the base's base, and so on.
+
+    Raises:
+        ValueError: one line: a base cannot be read, or is one of itself.
+    """
+    if "base" not in content:
+        return content
+    base = content["base"]
+    if not isinstance(base, str):
+        raise ValueError("base: must be a law's name or a .toml file, in quotes")
+    if base in seen:
+        raise ValueError(f"base: {' is based on '.join((*seen, base))}, a circle")
+    if base.endswith(".toml"):
+        try:
+            below, folder = read_toml(folder / base), (folder / base).parent
+        except ValueError as problem:
+            raise ValueError(f"base: {base}: {problem}") from None
+    elif (text := shipped_law(base)) is not None:
+        below = parse_toml(text)
+    else:
+        raise ValueError(
+            f"base: no law of the catalogue is named {base!r} (gfmhil laws lists them)"
+        )
+    below = _with_base(below, folder, (*seen, base))
+    return _over(below, {key: value for key, value in content.items() if key != "base"})
+
+
+def _over(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """Tables are joined key by key; anything else replaces what is below it."""
+    merged = dict(below)
+    for key, value in content.items():
+        old = below.get(key)
+        if isinstance(value, dict) and isinstance(old, dict) and "type" not in value:
+            value = _over(old, value)
+        merged[key] = value
+    return merged
+
+
+def parse_law(text: str, where: str = "law file", folder: str | Path = ".") -> LawFile:
     """Parse the text of a law file.
+
+    Args:
+        text: TOML.
+        where: what an error calls the file.
+        folder: where a ``base`` that is a file lies.
 
     Raises:
         LawError: every mistake found, each with its path in the file.
     """
     try:
-        return LawFile.model_validate(parse_toml(text))
+        return LawFile.model_validate(_with_base(parse_toml(text), Path(folder), ()))
     except ValidationError as problem:
         raise LawError(where, *lines(problem, LawFile)) from None
     except ValueError as problem:
@@ -322,4 +393,4 @@ def read_law_file(path: str | Path) -> LawFile:
         text = read_text(path)
     except ValueError as problem:
         raise LawError(f"law file {path}", str(problem)) from None
-    return parse_law(text, f"law file {path}")
+    return parse_law(text, f"law file {path}", Path(path).parent)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,12 +18,14 @@ from gfm_runtime import (
     Limits,
     build_law,
     discretise,
+    law_file,
     load_law,
     parse_law,
     read_law_file,
 )
 from gfm_runtime.elements import IF, PD, PI, D, Element, I, O, P
 from gfm_runtime.kernel import pack_law
+from gfm_runtime.lawfile import LawFile
 
 from ..support.laws import repeatable
 
@@ -390,3 +394,61 @@ def test_any_law_file_builds_or_raises_law_error(content: dict[str, Any], T_s: f
 def test_any_text_is_a_law_or_a_law_error(text: str) -> None:
     with pytest.raises(LawError):
         parse_law(text)
+
+
+BASED = """
+base = "vsg-2"
+name = "softer"
+title = "VSG-2 with more damping"
+source = "here"
+parameters.D_p = { value = 0.02 }
+phi.22 = { type = "P", k = "D_p" }
+"""
+
+
+def test_a_base_gives_what_the_file_does_not_say() -> None:
+    softer, own = parse_law(BASED), law_file("vsg-2")
+    assert (softer.name, softer.title, softer.base) == ("softer", "VSG-2 with more damping", None)
+    assert softer.parameters["D_p"].value == 0.02
+    assert softer.parameters["D_p"].unit == own.parameters["D_p"].unit
+    assert [factor.type for factor in softer.phi["22"]] == ["P"]
+    assert {cell: softer.phi[cell] for cell in softer.phi if cell != "22"} == {
+        cell: own.phi[cell] for cell in own.phi if cell != "22"
+    }
+    assert (softer.u_0, softer.limits, softer.psi) == (own.u_0, own.limits, own.psi)
+
+
+def test_a_base_may_be_a_file_beside_the_law_with_a_base_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "softer.toml").write_text(BASED)
+    (tmp_path / "own.toml").write_text(
+        'base = "below/softer.toml"\nname = "own"\nlimits.T_t = 0.1\n'
+    )
+    own = read_law_file(tmp_path / "own.toml")
+    assert (own.name, own.limits.T_t, own.parameters["D_p"].value) == ("own", 0.1, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('base = "vsg-99"', "base: no law of the catalogue is named 'vsg-99'"),
+        ("base = 3", "base: must be a law's name or a .toml file, in quotes"),
+        ('base = "none.toml"', "base: none.toml: cannot be read: No such file or directory"),
+        ('base = "circle.toml"', "base: circle.toml is based on circle.toml, a circle"),
+        ('base = "../vsg-2"', "base: no law of the catalogue"),
+    ],
+)
+def test_a_base_that_is_none(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "circle.toml"
+    path.write_text(f'name = "mine"\n{text}\n')
+    with pytest.raises(LawError) as problem:
+        read_law_file(path)
+    (line,) = str(problem.value).splitlines()
+    assert str(path) in line and words in line
+
+
+def test_the_schema_lets_a_file_with_a_base_leave_the_rest_out() -> None:
+    schema = jsonschema.Draft202012Validator(LawFile.model_json_schema())
+    content = tomllib.loads(BASED)
+    assert schema.is_valid(content)
+    assert not schema.is_valid({key: content[key] for key in content if key not in ("base", "phi")})

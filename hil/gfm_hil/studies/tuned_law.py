@@ -11,7 +11,10 @@ import numpy as np
 from gfm_design.norms.performance import Channel
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import toml_text
-from gfm_runtime.lawfile import LawFile
+from gfm_runtime import law_file
+from gfm_runtime.lawfile import GridSpec, LawFile, shipped_law
+
+_PAPERS_GRID = GridSpec().model_dump(mode="json")
 
 
 def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
@@ -39,22 +42,43 @@ def problem_name(file: LawFile, on: Scenario | None = None, converter: str | Non
 
 
 def law_text(
-    file: LawFile, gains: Mapping[str, float], by: str, comments: Sequence[str], **about: str | None
+    file: LawFile, gains: Mapping[str, float], by: str, comments: Sequence[str], **about: Any
 ) -> str:
-    """A law file with other gains, and comments above them.
+    """A law file with other gains, and comments above them: what differs from the law of the
+    catalogue that ``file`` is, or all of it if the law is no such one.
 
     Args:
         file: the law.
         gains: the parameters that change.
         by: what found the gains; their source.
         comments: one a line.
-        about: other keys of the file that change, such as name and title; None leaves a key out.
+        about: other keys of the file that change, such as name and title.
     """
     content = {**file.model_dump(mode="json", exclude_none=True), **about}
     for name, value in gains.items():
         content["parameters"][name] |= {"value": value, "source": by}
-    kept = {key: value for key, value in content.items() if value is not None}
-    return "".join(f"# {line}\n" for line in comments) + "\n" + toml_text(kept)
+    if shipped_law(file.name) is not None:
+        base = law_file(file.name).model_dump(mode="json", exclude_none=True)
+        changed = _difference(content, base)
+        content = content if changed is None else {"base": file.name, **changed}
+    return "".join(f"# {line}\n" for line in comments) + "\n" + toml_text(content)
+
+
+def _difference(new: Mapping[str, Any], old: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What of ``new`` is not in ``old``, table by table; None if ``new`` lacks what ``old`` has."""
+    if old.keys() - new.keys():
+        return None
+    out: dict[str, Any] = {}
+    for key, value in new.items():
+        before = old.get(key)
+        if value == before:
+            continue
+        if isinstance(value, dict) and isinstance(before, dict) and "type" not in value:
+            value = _difference(value, before)
+            if value is None:
+                return None
+        out[key] = value
+    return out
 
 
 def write_law(
@@ -90,5 +114,5 @@ def write_law(
     source = f"{file.source.strip()}; tuned by {by}, see the comments"
     about = {"name": path.stem, "title": f"{file.title}, tuned", "source": source}
     found_by = f"{by}, seed {result['seed']}"
-    text = law_text(file, gains, found_by, comments, home_grid=None, **about)
+    text = law_text(file, gains, found_by, comments, home_grid=_PAPERS_GRID, **about)
     path.write_text(text, encoding="utf-8")
