@@ -14,6 +14,7 @@ import numpy as np
 
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.models import PilModel
+from gfm_hil.realtime.priority import one_processor
 from gfm_hil.scenario.model import load_scenario
 from gfm_runtime.firmware import TARGETS
 
@@ -70,4 +71,5 @@ def _compiler(name: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with one_processor():  # as the controller's process in lockstep
+        main()

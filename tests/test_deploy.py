@@ -18,7 +18,7 @@ from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE
 from gfm_hil.cli.main import parser
 from gfm_hil.links.can import CanOptions
 from gfm_hil.realtime.priority import PRIORITY
-from gfm_hil.scenario.model import Link
+from gfm_hil.scenario.model import PEER_TIMEOUT_S
 from gfm_hil.scenario.toml_out import toml_text
 
 pytestmark = pytest.mark.processes
@@ -121,8 +121,7 @@ def test_services_fit_the_program(name):
     assert found["LimitRTPRIO"] == str(PRIORITY)
     assert found["RestartPreventExitStatus"] == f"2 {EXIT_OTHERWISE}"
     assert found["SuccessExitStatus"] == str(EXIT_INTERRUPTED)
-    default = Link.model_fields["peer_timeout_s"].default
-    assert float(found["WatchdogSec"].removesuffix("s")) >= 2 * default
+    assert float(found["WatchdogSec"].removesuffix("s")) >= 2 * PEER_TIMEOUT_S["realtime"]
     # machine code is made at run time, memory is shared, and only the loop's thread has priority
     forbidden = {"MemoryDenyWriteExecute", "PrivateIPC", "DynamicUser", "PrivateNetwork"}
     forbidden |= {"RestrictRealtime", "CPUSchedulingPolicy"}

@@ -17,6 +17,7 @@ from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.models import PortMap, Rig, library, open_model
 from gfm_hil.models.model import ModelError
+from gfm_hil.realtime.priority import processors
 from gfm_hil.results.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
@@ -187,6 +188,29 @@ def test_a_library_that_fails_is_named_and_the_run_is_kept(
     if what != "start":
         assert found.summary["ticks"] >= 100
         assert np.ptp(found.columns["true_p"][:100]) < 0.05  # a voltage that turns: at rest
+
+
+@pytest.mark.apt
+def test_in_lockstep_a_library_may_take_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
+    monkeypatch.setenv("FOREIGN_WHAT", "pause")
+    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2"))
+    assert (found.summary["status"], found.summary["ticks"]) == ("completed", 1000)
+    assert found.summary["wall_s"] > 2.0
+
+
+@pytest.mark.apt
+@pytest.mark.skipif(processors() < 2, reason="every process has one processor")
+def test_in_lockstep_a_library_and_its_threads_share_a_processor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A processor that sleeps takes long to wake: no thread waits for another processor."""
+    assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
+    monkeypatch.setenv("FOREIGN_WHAT", "where")
+    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2"))
+    assert found.summary["reason"].endswith("fault 8, 1 for its thread, 1 for its step, 1 for both")
 
 
 @pytest.mark.apt

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import signal
 import sys
 import tempfile
@@ -18,7 +20,7 @@ import pytest
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.models import PortMap, Rig, open_model
+from gfm_hil.models import PortMap, Rig, open_model, pil
 from gfm_hil.results import runner
 from gfm_hil.results.run import Run
 from gfm_hil.scenario.model import find_scenario, load_scenario
@@ -28,6 +30,7 @@ from ..support.processes import write
 
 qemu = pytest.mark.compilers
 
+SHM, PAUSE_S = {"type": "shm"}, 2.0
 STEP = {"tick": 100, "type": "reference", "P_ref": 0.8, "ramp_s": 0.01}
 GAINS = {"tick": 150, "type": "gains", "values": {"D_p": 0.02}}
 CHANGE = {"tick": 300, "type": "law", "law": "mimo-gfm"}
@@ -37,8 +40,7 @@ DIP = [{"tick": 100, "type": "grid-voltage", "V_g": 0.0}, {"tick": 300, "type": 
 
 def run(tmp_path: Path, target: str, **content: Any) -> Run:
     """A run on a target, by the command."""
-    link = {"type": "shm", "peer_timeout_s": 20.0}
-    file = write(tmp_path, **{"law": "vsg-2", "link": link, "duration": 0.06, **content})
+    file = write(tmp_path, **{"law": "vsg-2", "link": SHM, "duration": 0.06, **content})
     folder = tmp_path / "run"
     command = ["run", file, "--controller", f"pil:{target}", "--out", str(folder), "--quiet"]
     code = main([*command, "--no-figures"])
@@ -121,36 +123,66 @@ def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(
 @qemu
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    ("number", "reason"),
+    ("number", "link", "reason"),
     [
-        (signal.SIGKILL, "gfmhil on m4f: qemu-system-arm has ended by SIGKILL"),
-        (signal.SIGSTOP, "gfmhil on m4f: has not answered for 2 s"),
+        (signal.SIGKILL, SHM, "gfmhil on m4f: qemu-system-arm has ended by SIGKILL"),
+        (signal.SIGSTOP, SHM, "gfmhil on m4f: has not answered for 10 s"),
+        (
+            signal.SIGSTOP,
+            SHM | {"peer_timeout_s": 4.0},
+            "gfmhil on m4f: has not answered for 2 s",
+        ),
     ],
 )
 def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(
-    number: signal.Signals, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: signal.Signals,
+    link: Any,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scratch = Path(tempfile.mkdtemp(prefix="pil-"))  # short: a socket is to be made there
     monkeypatch.setenv("TMPDIR", str(scratch))
     machines: list[int] = []
-
-    def hit() -> None:
-        parts = tmp_path / "run" / "parts" / "plant_progress.npy"
-        while not (parts.exists() and np.load(parts)[0] > 100):
-            time.sleep(0.01)
-        machines.extend(processes_in(scratch))
-        os.kill(machines[0], number)
-
-    thread = threading.Thread(target=hit)
+    thread = threading.Thread(target=hit, args=(tmp_path, scratch, machines, number))
     thread.start()
-    timeout_s = 4.0 if number == signal.SIGSTOP else 20.0
-    found = run(tmp_path, "m4f", duration=60.0, link={"type": "shm", "peer_timeout_s": timeout_s})
+    found = run(tmp_path, "m4f", duration=60.0, link=link)
     thread.join()
     assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
     assert found.summary["ticks"] > 100
     assert np.isfinite(found.columns["u_omega_u"][:100]).all()
     assert not Path(f"/proc/{machines[0]}").exists()
     scratch.rmdir()  # nothing is left there
+
+
+@qemu
+@pytest.mark.timeout(300)
+def test_a_machine_that_answers_after_seconds_completes_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = Path(tempfile.mkdtemp(prefix="pil-"))
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    machines: list[int] = []
+    stops = (signal.SIGSTOP, signal.SIGCONT)
+    thread = threading.Thread(target=hit, args=(tmp_path, scratch, machines, *stops))
+    thread.start()
+    found = run(tmp_path, "m4f", duration=4.0, link=SHM)
+    thread.join()
+    assert (found.summary["status"], found.summary["ticks"]) == ("completed", 40_000)
+    assert found.summary["wall_s"] > PAUSE_S
+    assert not Path(f"/proc/{machines[0]}").exists()
+    scratch.rmdir()
+
+
+def hit(tmp_path: Path, scratch: Path, machines: list[int], *numbers: signal.Signals) -> None:
+    """Send the machine, which works below ``scratch``, signals in the middle of the run."""
+    parts = tmp_path / "run" / "parts" / "plant_progress.npy"
+    while not (parts.exists() and np.load(parts)[0] > 100):
+        time.sleep(0.01)
+    machines.extend(processes_in(scratch))
+    for number in numbers:
+        os.kill(machines[0], number)
+        time.sleep(PAUSE_S if number == signal.SIGSTOP else 0.0)
 
 
 def processes_in(folder: Path) -> list[int]:
@@ -171,8 +203,12 @@ import os, struct
 os.write(from_ := os.open("from", os.O_WRONLY), bytes({size}))
 to = os.open("to", os.O_RDONLY)
 print("the machine is on fire", flush=True)
-while request := os.read(to, 4096):
-    {does}
+while request := os.read(to, {asks}):
+    if (what := request[0]) == 0:
+        {does}
+    else:
+        os.read(to, 4096)  # a state, or a golden row of which no word differs
+        what == 3 and os.write(from_, bytes({size}))
 """
 
 
@@ -184,7 +220,7 @@ while request := os.read(to, 4096):
         ("os._exit(3)", "qemu-system-arm has ended with code 3: the machine is on fire"),
         (
             "os.write(from_, struct.pack('<ii', 77, 0) + bytes({size} - 8))",
-            "answers 77 for signal 0, which no law does",
+            "answers 77 for signal 0, which no law does: the machine is on fire",
         ),
         (
             "os.write(from_, struct.pack('<ii', 1, 3) + bytes({size} - 8))",
@@ -197,9 +233,9 @@ def test_a_wrong_answer_is_named(
 ) -> None:
     """Another program in the machine's place."""
     machine = tmp_path / "qemu-system-arm"
-    size = 4 * (4 + 3 + 3 + 1 + 2)
+    asks, size = 4 * (3 + 5 + 5), 4 * (4 + 3 + 3 + 1 + 2)
     does = does.replace("{size}", str(size))
-    machine.write_text(IMPOSTOR.format(python=sys.executable, size=size, does=does))
+    machine.write_text(IMPOSTOR.format(python=sys.executable, asks=asks, size=size, does=does))
     machine.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     found = run(tmp_path, "m4f")
@@ -218,6 +254,63 @@ def test_what_it_cannot_do_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main([*command, "--model", "pil:m4f", "--mode", "realtime"]) == 2
     said = capsys.readouterr().err
     assert "mode = 'realtime': gfmhil on m4f keeps no time; choose --mode lockstep" in said
+
+
+@qemu
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("content", [{"events": [STEP, CHANGE]}, {"inner": "cascaded"}])
+def test_a_program_with_other_bits_is_refused_before_tick_0(
+    content: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    """A compiler that fuses multiply-add, which the processor can do."""
+    instead(tmp_path, "arm-none-eabi-gcc", 'exec {real} "$@" -ffp-contract=fast', monkeypatch)
+    file = write(tmp_path, **{"law": "vsg-2", "link": SHM, **content})
+    command = ["run", file, "--controller", "pil:m4f", "--out", str(tmp_path / "run")]
+    assert main([*command, "--quiet", "--no-figures"]) == 2
+    said = re.sub(r"[1-9][\d,]*", "N", capsys.readouterr().err.strip())
+    assert said == (
+        "gfmhil: controller pil: gfmhil on mNf: its program does not compute the kernel's bits: "
+        "N words differ in N golden rows, the first in law vsg-N; a compiler that fuses "
+        "multiply-add (-ffp-contract=fast, -ffast-math) does this"
+    )
+    assert not (tmp_path / "run" / "signals.npz").exists()
+
+
+@qemu
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("does", "reason"),
+    [
+        (
+            'exec {real} "${{@/mps2-an386/mps3}}"',
+            "qemu-system-arm has ended with code 1: qemu-system-arm: unsupported machine type",
+        ),
+        (  # a Cortex-M3, which has no floating-point unit
+            'exec {real} "${{@/mps2-an386/mps2-an385}}"',
+            "qemu-system-arm has ended by SIGABRT: qemu: fatal: Lockup: can't escalate 3 to Hard",
+        ),
+        ("echo no machine; echo for you; exec sleep 60", "for 0.5 s: no machine; for you"),
+        ("yes > from", r"answers a golden row with 175704697, which no law does"),
+    ],
+)
+def test_what_is_no_such_machine_is_refused_with_what_it_says(
+    does: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instead(tmp_path, "qemu-system-arm", does, monkeypatch)
+    monkeypatch.setattr(pil, "_START_S", 0.5 if "sleep" in does else 30.0)
+    model = open_model("pil:m4f", PortMap(), Rig())
+    bench = setup.make_bench(load_scenario("pref_step", in_process=True, law="vsg-2"), "float32")
+    with pytest.raises(UserError, match=re.escape(reason)):
+        model.begin(bench.controller)
+    assert not processes_in(tmp_path)
+
+
+def instead(folder: Path, name: str, does: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a shell script in a program's place, whose path is ``real`` in it."""
+    script = folder / name
+    script.write_text("#!/bin/bash\n" + does.format(real=shutil.which(name)) + "\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
 
 
 # --- without a compiler ---

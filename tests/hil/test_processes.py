@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import time
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,22 @@ def test_ctrl_c_ends_both_and_keeps_the_data(start, tmp_path):
     assert len(recorded["t"]) == found["ticks"] >= 200
     assert not np.isnan(recorded["true_p"]).any()
     assert not (folder / "parts").exists()
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_in_lockstep_a_role_may_stand_still_for_seconds(role, start, tmp_path):
+    """As on a busy machine."""
+    scenario, folder = write(tmp_path, **LONG | {"duration": 3.0}), tmp_path / "run"
+    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+    wait_for(lambda: has_run(folder, 200), process)
+    stopped = roles_of(folder)[role]
+    os.kill(stopped, signal.SIGSTOP)
+    time.sleep(2.0)
+    os.kill(stopped, signal.SIGCONT)
+    code, out, _ = end(process)
+    found = json.loads(out)
+    assert (code, found["status"], found["ticks"]) == (0, "completed", 30_000)
+    assert found["wall_s"] > 2.0
 
 
 @pytest.mark.parametrize("role", ROLES)

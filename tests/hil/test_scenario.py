@@ -291,6 +291,21 @@ def test_any_scenario_survives_being_written_and_read(content):
     assert again.digest() == scenario.digest()
 
 
+def test_lockstep_waits_longer_than_real_time_unless_the_scenario_says(make) -> None:
+    """Where no time passes, a busy machine has seconds; what the scenario says holds in both."""
+    waits = {}
+    for mode in ("lockstep", "realtime"):
+        for link in ({"type": "shm"}, {"type": "shm", "peer_timeout_s": 4.0}):
+            found = make(mode=mode, link=link)
+            waits[mode, len(link)] = found.peer_timeout_s, found.model_timeout_s
+    assert waits == {
+        ("lockstep", 1): (20.0, 10.0),
+        ("realtime", 1): (0.5, 0.25),
+        ("lockstep", 2): (4.0, 2.0),
+        ("realtime", 2): (4.0, 2.0),
+    }
+
+
 def test_the_digest_is_of_contents_not_of_places(make, tmp_path):
     good = LAW.replace("PD", "P").replace(", T = 0.1", "")
     digests = []

@@ -1,9 +1,12 @@
 /* A controller library that misbehaves at its step AT in the way that FOREIGN_WHAT names; until then
  * it leaves the bridge's voltage turning at the nominal speed. */
-#define _DEFAULT_SOURCE
+#define _GNU_SOURCE
 #include "gfmhil_controller.h"
 
 #include <math.h>
+#include <pthread.h>
+#include <sched.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
@@ -16,6 +19,14 @@
 static gfmhil_setup rated;
 static const char *what;
 static int steps;
+static cpu_set_t of_thread, of_step, of_both;
+static char where[80];
+
+static void *look(void *processors)
+{
+    sched_getaffinity(0, sizeof of_thread, processors);
+    return NULL;
+}
 
 int gfmhil_version(void) { return SAYS; }
 const char *gfmhil_name(void) { return "a library that fails"; }
@@ -24,6 +35,9 @@ void *gfmhil_new(const gfmhil_setup *setup)
 {
     what = getenv("FOREIGN_WHAT");
     rated = *setup;
+    pthread_t thread;
+    if (!strcmp(what, "where") && !pthread_create(&thread, NULL, look, &of_thread))
+        pthread_join(thread, NULL);
     return strcmp(what, "refuse") ? &rated : NULL;
 }
 
@@ -53,6 +67,15 @@ int gfmhil_step(void *self, const gfmhil_input *in, gfmhil_output *out)
             sleep(1);
     if (!strcmp(what, "slow"))
         usleep(80000);
+    if (!strcmp(what, "pause") && steps == AT + 1)
+        sleep(2);
+    if (!strcmp(what, "where")) {
+        look(&of_step);
+        CPU_AND(&of_both, &of_step, &of_thread);
+        snprintf(where, sizeof where, "%d for its thread, %d for its step, %d for both",
+                 CPU_COUNT(&of_thread), CPU_COUNT(&of_step), CPU_COUNT(&of_both));
+        return 8;
+    }
     if (!strcmp(what, "nan"))
         out->e[1] = NAN;
     return strcmp(what, "fault") ? 0 : 7;
@@ -61,7 +84,7 @@ int gfmhil_step(void *self, const gfmhil_input *in, gfmhil_output *out)
 const char *gfmhil_fault(void *self, int number)
 {
     (void)self;
-    return number == 7 ? "the cooling has stopped" : NULL;
+    return number == 7 ? "the cooling has stopped" : number == 8 ? where : NULL;
 }
 
 void gfmhil_free(void *self) { (void)self; }

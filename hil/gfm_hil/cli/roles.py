@@ -26,6 +26,7 @@ from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
 from gfm_hil.models import FORMS, Rig, open_model, read_map
+from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, finish, in_use
 from gfm_hil.scenario.model import Scenario
@@ -58,7 +59,8 @@ def call(options: argparse.Namespace) -> int:
     model = None
     if options.model is not None:
         ports = read_map(options.map)
-        model = open_model(options.model, ports, _rig(scenario))
+        with one_processor(scenario.mode):
+            model = open_model(options.model, ports, _rig(scenario))
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
     if options.part is not None:  # of `gfmhil run`, which puts the parts together

@@ -230,7 +230,7 @@ def shake_hands(
                 if role == "plant" and not met:
                     meeting.come()
                 # from here on silence means that the other side is gone
-                quiet = now + int(scenario.link.peer_timeout_s * 1e9)
+                quiet = now + int(scenario.peer_timeout_s * 1e9)
                 deadline = max(deadline, min(quiet, latest)) if met else quiet
                 met = True
             elif isinstance(greeting, _Go) and met:

@@ -138,7 +138,8 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
     loop["seen"], loop["unseen"] = RUNNING, -1
     loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
     loop["T"] = round(scenario.T_s * 1e9)
-    loop["patience"], loop["repeat"] = int(link.peer_timeout_s * 1e9), int(link.repeat_s * 1e9)
+    loop["patience"] = int(scenario.peer_timeout_s * 1e9)
+    loop["repeat"] = int(link.repeat_s * 1e9)
     if tick < 0 and scenario.mode == "lockstep" and scenario.network is not None:
         loop["patience"] *= 2  # the plant may wait for another controller, and then goes on
     return loop

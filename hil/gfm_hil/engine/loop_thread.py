@@ -71,7 +71,7 @@ def run_loop(
                 timeline.flush()
             flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
             if model is not None:
-                model.watch(timelines[0], shares[0].bench.scenario.link.peer_timeout_s / 2)
+                model.watch(timelines[0], shares[0].bench.scenario.model_timeout_s)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
         while thread.is_alive() and not (model is not None and model.given_up):

@@ -35,6 +35,7 @@ from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import (
     ask_for_real_time,
     no_collector_pauses,
+    one_processor,
     ordinary_priority,
     processors,
 )
@@ -80,6 +81,7 @@ def run_role(
         benches = make_benches(scenario) if scenario.parts else [make_bench(scenario, real)]
         sides = []
         if model is not None:
+            stack.enter_context(one_processor(scenario.mode))
             benches[0].model = _stepped(model, benches[0])
             stack.callback(benches[0].model.close)
         _begin(folder, scenario)

@@ -206,7 +206,7 @@ class Processes:
                         self.notice(process.crash)
                     at_once, rests = self._ends_all(process, part)
                     if at_once or rests:
-                        wait = self.scenario.link.peer_timeout_s + _GRACE_S
+                        wait = self.scenario.peer_timeout_s + _GRACE_S
                         stop_at = min(stop_at, now if at_once else now + wait)
             if not told and (self.interrupt.came or now >= stop_at):
                 self._send(signal.SIGINT)

@@ -53,7 +53,7 @@ class Watched:
 
     def __init__(self, scenario: Scenario, progress: NDArray[np.int64]) -> None:
         self._ticks, self._progress = scenario.ticks, progress
-        self._least_s = 2 * scenario.link.peer_timeout_s
+        self._least_s = 2 * scenario.peer_timeout_s
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
 

@@ -271,10 +271,9 @@ class FrameReader:
         plant's loop writes its own tick into ``newest`` at every tick.
         """
         reader = cls("u" if role == "plant" else "y", scenario.has_inner)
-        link = scenario.link
         lockstep, r = scenario.mode == "lockstep", reader.record
-        r["delta"] = math.ceil(link.peer_timeout_s / scenario.T_s) + 1
-        asked = math.ceil(min(link.peer_timeout_s / link.repeat_s, LONGEST_JUMP))
+        r["delta"] = math.ceil(scenario.peer_timeout_s / scenario.T_s) + 1
+        asked = math.ceil(min(scenario.peer_timeout_s / scenario.link.repeat_s, LONGEST_JUMP))
         r["jump"] = min(int(r["delta"][0]) + asked + LAST_TIMES, LONGEST_JUMP)
         r["again"] = asked if lockstep else 0
         if role == "controller":

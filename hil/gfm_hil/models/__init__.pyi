@@ -1,14 +1,5 @@
-from .model import (
-    FORMS,
-    PIL,
-    Model,
-    ModelError,
-    Rig,
-    check_currents,
-    model_file,
-    open_model,
-    precision,
-)
+from .kinds import FORMS, PIL, model_file, open_model, precision
+from .model import Model, ModelError, Rig, check_currents
 from .pil import PilModel
 from .ports import PortMap, read_map
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.model import ModelError, run_name, ticks_a_step
+from gfm_hil.models.model import ModelError, Rig, Wired, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
 
 _EMT, _ERROR = 1, 2
@@ -101,20 +101,18 @@ class _Values:
         return self._views[self.names.index(name)]
 
 
-class DllModel:
+class DllModel(Wired):
     """A model in a shared library of Linux.
 
     Args:
         path: of the library.
-        ports, T_s, inner: as for ``open_model``.
+        ports, rig: as for ``open_model``.
 
     Raises:
         UserError: it cannot be loaded, has not the interface, or its ports do not fit.
     """
 
-    real = "float64"
-
-    def __init__(self, path: Path, ports: PortMap, T_s: float, inner: bool) -> None:
+    def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
         where = path.name
         try:
             self._of = c.CDLL(str(path))
@@ -140,7 +138,8 @@ class DllModel:
         self.name = run_name("dll", _text(info.ModelName) or path.stem)
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
-        self._wiring = wire(where, ports, self._in.names, self._out.names, inner)
+        self._names = self._out.names
+        self._wiring = wire(where, ports, self._in.names, self._names, rig.inner)
         self._parameters = _parameters(where, info, ports)
         declared = info.FixedStepBaseSampleTime
         if ports.step_s and declared and abs(ports.step_s - declared) > 1e-6 * declared:
@@ -148,8 +147,8 @@ class DllModel:
                 f"{where}: step_s = {ports.step_s:g} in its map, but it declares"
                 f" FixedStepBaseSampleTime = {declared:g} s; leave step_s out"
             )
-        step_s = declared or ports.step_s or T_s
-        self._every, self._T_s = ticks_a_step(where, step_s, T_s), T_s
+        step_s, self._T_s = declared or ports.step_s or rig.T_s, rig.T_s
+        self._every = ticks_a_step(where, step_s, rig.T_s)
         self._states = (
             np.zeros(max(info.NumIntStates, 1), np.int32),
             np.zeros(max(info.NumFloatStates, 1), np.float32),
@@ -159,7 +158,6 @@ class DllModel:
             self._in.at, self._out.at, self._parameters.at, 0.0, _EMT, None, None,
             *(states.ctypes.data for states in self._states),
         )  # fmt: skip
-        self._ticks = 0
 
     def start(self, u: NDArray[np.float64]) -> None:
         """See ``Model``."""
@@ -169,26 +167,14 @@ class DllModel:
         for name in ("Model_FirstCall", "Model_CheckParameters"):
             if hasattr(self._of, name):
                 self._call(name)
-        self._out.write(self._wiring.outputs(u, len(self._out.names)))
+        self._out.write(self._wiring.outputs(u, len(self._names)))
         self._call("Model_Initialize")
 
-    def tick(
-        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> None:
-        """See ``Model``."""
-        if self._ticks % self._every == 0:
-            self._in.write(self._wiring.inputs(ref, y))
-            self._now.Time = self._ticks * self._T_s
-            self._call("Model_Outputs")
-            outputs = self._out.read()
-            blocks = self._wiring.blocks
-            if blocks >= 0 and outputs[blocks] != 0:
-                raise ModelError(
-                    f"{self.name}: blocks the bridge: "
-                    f"{self._out.names[blocks]} = {outputs[blocks]:g}"
-                )
-            self._wiring.take(outputs, u)
-        self._ticks += 1
+    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        self._in.write(inputs)
+        self._now.Time = self._ticks * self._T_s
+        self._call("Model_Outputs")
+        return self._out.read()
 
     def close(self) -> None:
         """See ``Model``."""

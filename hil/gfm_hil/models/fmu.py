@@ -11,27 +11,25 @@ from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.models.model import ModelError, run_name, ticks_a_step
+from gfm_hil.models.model import ModelError, Rig, Wired, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
 from gfm_runtime.signals import carried
 
 _NUMBERS = ("Real", "Float64")
 
 
-class FmuModel:
+class FmuModel(Wired):
     """An FMU with a library for this machine.
 
     Args:
         path: of the .fmu.
-        ports, T_s, inner: as for ``open_model``.
+        ports, rig: as for ``open_model``.
 
     Raises:
         UserError: FMPy is missing, it cannot read the file, or the ports do not fit.
     """
 
-    real = "float64"
-
-    def __init__(self, path: Path, ports: PortMap, T_s: float, inner: bool) -> None:
+    def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
         need("fmpy", "FMPy", f"controller fmu:{path.name}", "fmu")
         import fmpy
         from fmpy.fmi1 import FMICallException
@@ -53,7 +51,7 @@ class FmuModel:
         inputs = [v for v in variables.values() if v.causality == "input"]
         outputs = [v for v in variables.values() if v.causality == "output"]
         self._names = [v.name for v in outputs]
-        self._wiring = wire(where, ports, [v.name for v in inputs], self._names, inner)
+        self._wiring = wire(where, ports, [v.name for v in inputs], self._names, rig.inner)
         self._in, self._out = _by_type(inputs), _by_type(outputs)
         self._fixed: list[tuple[Any, float]] = []
         for name, value in ports.parameters.items():
@@ -61,9 +59,8 @@ class FmuModel:
                 raise UserError(f"{where}: parameters.{name}: is no parameter of the FMU")
             self._fixed.append((variables[name], value))
         #: of an FMU of ours: where the outputs begin
-        self._begins = [variables.get(f"start.{name}") for name in carried("u", inner)]
-        self._every = ticks_a_step(where, ports.step_s or T_s, T_s)
-        self._T_s, self._ticks = T_s, 0
+        self._begins = [variables.get(f"start.{name}") for name in carried("u", rig.inner)]
+        self._every, self._T_s = ticks_a_step(where, ports.step_s or rig.T_s, rig.T_s), rig.T_s
         try:
             self._it = fmpy.instantiate_fmu(unpacked, of, "CoSimulation", logger=self._log)
         except Exception as problem:
@@ -91,28 +88,17 @@ class FmuModel:
         except self._failed as problem:
             raise ModelError(self._why(problem)) from None
 
-    def tick(
-        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> None:
-        """See ``Model``."""
-        if self._ticks % self._every == 0:
-            values = self._wiring.inputs(ref, y)
-            outputs = np.zeros(len(self._names))
-            try:
-                for kind, places, references in self._in:
-                    self._set(kind, references, values[places])
-                self._it.doStep(self._ticks * self._T_s, self._every * self._T_s)
-                for kind, places, references in self._out:
-                    outputs[places] = getattr(self._it, f"get{kind}")(references)
-            except self._failed as problem:
-                raise ModelError(self._why(problem)) from None
-            blocks = self._wiring.blocks
-            if blocks >= 0 and outputs[blocks] != 0:
-                raise ModelError(
-                    f"{self.name}: blocks the bridge: {self._names[blocks]} = {outputs[blocks]:g}"
-                )
-            self._wiring.take(outputs, u)
-        self._ticks += 1
+    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        outputs = np.zeros(len(self._names))
+        try:
+            for kind, places, references in self._in:
+                self._set(kind, references, inputs[places])
+            self._it.doStep(self._ticks * self._T_s, self._every * self._T_s)
+            for kind, places, references in self._out:
+                outputs[places] = getattr(self._it, f"get{kind}")(references)
+        except self._failed as problem:
+            raise ModelError(self._why(problem)) from None
+        return outputs
 
     def close(self) -> None:
         """See ``Model``."""

@@ -1,25 +1,17 @@
-"""What a model is to the controller's process, and how one is opened by its kind."""
+"""What a model is to the controller's process, and what those that are not ours share."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.ports import PortMap
+from gfm_hil.models.ports import Wiring
 from gfm_plant import Bases
 
-if TYPE_CHECKING:
-    from gfm_hil.models.pil import PilModel
-
-PIL = "pil:"
-KINDS = ("dll", "fmu", "c")
-_FILES = "dll:FILE, fmu:FILE or c:FILE"
-FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 
@@ -75,51 +67,31 @@ class Model(Protocol):
         """End it, and remove what it left."""
 
 
-def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
-    """The model that ``text`` names.
+class Wired:
+    """A model whose ports a map wires to the signals, and which steps every so many ticks; each
+    kind sets the wiring, the outputs' names and how many ticks."""
 
-    Args:
-        text: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` for a library that has the interface of
-            ``gfmhil_controller.h``, or ``pil:TARGET`` for the run's own laws.
-        ports: which signal each of its ports is.
-        rig: what it is connected to.
+    real = "float64"
+    name: str
+    _wiring: Wiring
+    _names: list[str]
+    _every: int
+    _ticks = 0
 
-    Raises:
-        UserError: there is no such file, it is no such model, or its ports do not fit.
-    """
-    if text.startswith(PIL):
-        from gfm_hil.models.pil import PilModel
+    def tick(
+        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> None:
+        """See ``Model``."""
+        if self._ticks % self._every == 0:
+            outputs, blocks = self._step(self._wiring.inputs(ref, y)), self._wiring.blocks
+            if blocks >= 0 and outputs[blocks] != 0:
+                what = f"{self._names[blocks]} = {outputs[blocks]:g}"
+                raise ModelError(f"{self.name}: blocks the bridge: {what}")
+            self._wiring.take(outputs, u)
+        self._ticks += 1
 
-        if ports != PortMap():
-            raise UserError(f"controller {text}: has our signals, and takes no map")
-        return PilModel(text.removeprefix(PIL))
-    kind, path = model_file(text, FORMS)
-    if kind == "dll":
-        from gfm_hil.models.dll import DllModel
-
-        return DllModel(path, ports, rig.T_s, rig.inner)
-    if kind == "c":
-        from gfm_hil.models.library import LibraryModel
-
-        return LibraryModel(path, ports, rig)
-    from gfm_hil.models.fmu import FmuModel
-
-    return FmuModel(path, ports, rig.T_s, rig.inner)
-
-
-def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
-    """The kind and the file of the model ``KIND:FILE``; ``forms`` is what the message allows.
-
-    Raises:
-        UserError: there is no such kind or file.
-    """
-    kind, colon, file = text.partition(":")
-    if not colon or kind not in KINDS or not file:
-        raise UserError(f"controller {text!r}: must be {forms}")
-    path = Path(file).absolute()
-    if not path.is_file():
-        raise UserError(f"{file}: there is no such file")
-    return kind, path
+    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        raise NotImplementedError
 
 
 def check_currents(text: str, inner: bool) -> None:
@@ -133,19 +105,6 @@ def check_currents(text: str, inner: bool) -> None:
             f"controller {text}: measures currents, which only a run with an inner stage carries: "
             "choose --inner virtual-stator"
         )
-
-
-def precision(text: str) -> str:
-    """The precision, float64 or float32, of the laws beside the model that ``text`` names.
-
-    Raises:
-        UserError: it is a target that is not there.
-    """
-    if not text.startswith(PIL):
-        return "float64"
-    from gfm_hil.models.pil import PilModel
-
-    return PilModel(text.removeprefix(PIL)).real
 
 
 def run_name(kind: str, model: str) -> str:

@@ -2,7 +2,8 @@
 
 The laws of the run are built as one program for a target of ``gfmhil firmware check``. QEMU runs it
 and gives it two pipes, through which it gets references and measurements tick by tick and answers
-with u. The bench keeps what is not a law: ramps, checks, the choice of a scheduled law's stage.
+with u. Before tick 0 the program has to give the kernel's bits in golden rows. The bench keeps what
+is not a law: ramps, checks, the choice of a scheduled law's stage.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import our_controller_on
 from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.models.model import ModelError
-from gfm_hil.realtime.priority import one_processor
 from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
 from gfm_runtime.firmware.check import TARGETS, need_tools
-from gfm_runtime.firmware.loop import CHANGE, FROM, START, TICK, TO, LoopProgram, build_loop
+from gfm_runtime.firmware.golden import SHIPPED, Golden, golden
+from gfm_runtime.firmware.loop import CHANGE, CHECK, FROM, START, TICK, TO, LoopProgram, build_loop
 from gfm_runtime.firmware.module import RESULTS, Module
 from gfm_runtime.signals import REF_NAMES, carried
 from gfm_runtime.states import BAD_U, BAD_Y, OK
@@ -38,6 +39,7 @@ from gfm_runtime.tustin import DiscreteLaw
 Retuned = tuple[DiscreteLaw, NDArray[Any]]
 
 _START_S, _LOOK_S = 30.0, 0.05
+_LINES, _BYTES = 3, 2000  # of what QEMU says, at most
 _SIGNALS = {BAD_Y: carried("y", True), RESULTS["BAD_REF"][0]: REF_NAMES}
 _SAID = dict(RESULTS.values())
 
@@ -68,6 +70,7 @@ class PilModel:
             raise UserError(f"controller pil: {problem}") from None
         self.name = our_controller_on(target)
         self.count = -1
+        self._starts: select.poll | None = None
         self._target = target
         self._ends = contextlib.ExitStack()
 
@@ -79,7 +82,7 @@ class PilModel:
             changed: further laws, discretised and packed, that may come into its spare places.
 
         Raises:
-            UserError: it cannot be built, or does not start.
+            UserError: it cannot be built, does not start, or gives other bits than the kernel.
         """
         self._controller, kind = controller, controller.laws.dtype
         ready = [*zip(controller.discrete, controller.laws, strict=True)][:-SPARE]
@@ -93,6 +96,7 @@ class PilModel:
         try:
             folder = self._ends.enter_context(scratch.temporary("gfmhil-pil-"))
             self._run(build_loop(modules, controller.T_s, self._target, folder))
+            self._check(modules, golden(modules, SHIPPED))
         except (LawError, ModelError) as problem:
             self.close()
             raise UserError(f"controller pil: {problem}") from None
@@ -116,7 +120,6 @@ class PilModel:
         self._from = os.open(folder / FROM, os.O_RDONLY | os.O_NONBLOCK)
         self._ends.callback(os.close, self._from)
         self._log = self._ends.enter_context((folder / "log").open("w+b"))
-        self._ends.enter_context(one_processor())  # QEMU inherits it
         try:
             self._process = subprocess.Popen(
                 program.target.run, cwd=folder, stdin=subprocess.DEVNULL, stdout=self._log,
@@ -126,7 +129,37 @@ class PilModel:
         except OSError as problem:
             raise ModelError(f"{self.name}: cannot be started: {problem.strerror}") from None
         self._ends.callback(self._end)
-        self._await_first()
+        self._starts = select.poll()
+        self._starts.register(self._from, select.POLLIN)
+        self._give_up = time.monotonic() + _START_S
+        self._receive()
+        self._none = int(self._answer["count"][0])
+
+    def _check(self, modules: Sequence[Module], rows: Golden) -> None:
+        """Step the program through golden rows; from then on reading waits for ever.
+
+        Raises:
+            ModelError: a bit is not the kernel's, or the program has ended.
+        """
+        differ = []
+        for row in rows.words:
+            self._request["what"], self._give_up = CHECK, time.monotonic() + _START_S
+            self._send(self._request)
+            self._send(row)
+            self._receive()
+            differ.append(int(self._answer["result"][0]))
+            if not 0 <= differ[-1] <= len(row):
+                raise self._problem(f"answers a golden row with {differ[-1]}, which no law does")
+        if any(differ):
+            first = np.flatnonzero(differ)[0]
+            name = modules[int(rows.words[first, 1])].name.partition(" ")[2]
+            raise self._problem(
+                f"its program does not compute the kernel's bits: {sum(differ):,} words differ in"
+                f" {len(differ):,} golden rows, the first in law {name}; a compiler that fuses"
+                " multiply-add (-ffp-contract=fast, -ffast-math) does this"
+            )
+        self._starts = None
+        os.set_blocking(self._from, True)
 
     def start(self) -> None:
         """Load the controller's active law in its present state.
@@ -184,21 +217,7 @@ class PilModel:
         """End the program, and remove what it left."""
         self._ends.close()
 
-    def _await_first(self) -> None:
-        """Wait for the program's first answer, and let reading wait from then on."""
-        poll = select.poll()
-        poll.register(self._from, select.POLLIN)
-        give_up = time.monotonic() + _START_S
-        while not poll.poll(_LOOK_S * 1e3):
-            if self._process.poll() is not None:
-                raise ModelError(self._why())
-            if time.monotonic() > give_up:
-                raise ModelError(f"{self.name}: has not begun within {_START_S:g} s")
-        os.set_blocking(self._from, True)
-        self._receive()
-        self._none = int(self._answer["count"][0])
-
-    def _send(self, what: NDArray[np.void]) -> None:
+    def _send(self, what: NDArray[Any]) -> None:
         os.write(self._to, what.view(np.uint8).data)
 
     def _receive(self) -> None:
@@ -209,21 +228,31 @@ class PilModel:
         """
         into = self._answer.view(np.uint8).data
         while len(into):
+            while self._starts and not self._starts.poll(_LOOK_S * 1e3):
+                if self._process.poll() is not None:
+                    raise self._ended()
+                if time.monotonic() > self._give_up:
+                    raise self._problem(f"has not answered for {_START_S:g} s")
             got = os.readv(self._from, [into])
             if not got:
-                raise ModelError(self._why())
+                raise self._ended()
             into = into[got:]
 
-    def _why(self) -> str:
-        """How the program has ended, in words."""
+    def _ended(self) -> ModelError:
+        """How the program has ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         code = self._process.returncode
         how = f"by {signal.Signals(-code).name}" if code and code < 0 else f"with code {code}"
-        self._log.seek(0)
-        said = self._log.read().decode("utf-8", "replace").strip().splitlines()[:1]
-        program = self._program.target.run[0]
-        return ": ".join([self.name, f"{program} has ended {how}", *said])
+        return self._problem(f"{self._program.target.run[0]} has ended {how}")
+
+    def _problem(self, what: str) -> ModelError:
+        """What is wrong, and what QEMU and the program have said first."""
+        # pread: QEMU writes on where the file's position is
+        log = os.pread(self._log.fileno(), _BYTES, 0).decode("utf-8", "replace").strip()
+        lines = log.partition("\n\n")[0].splitlines()[:_LINES]
+        said = "".join(c if c.isprintable() else " " for c in "; ".join(lines))
+        return ModelError(": ".join([self.name, what, *filter(None, [said])]))
 
     def _place(self, k: int) -> int:
         """The program's number of the controller's law k."""
@@ -237,9 +266,7 @@ class PilModel:
         """
         names = {**_SIGNALS, BAD_U: range(n_u)}.get(result, ())
         if not 0 <= channel < len(names):
-            raise ModelError(
-                f"{self.name}: answers {result} for signal {channel}, which no law does"
-            )
+            raise self._problem(f"answers {result} for signal {channel}, which no law does")
         if result != BAD_U:
             raise ModelError(f"{self.name}: refuses: {_SAID[result]}: {names[channel]}")
 

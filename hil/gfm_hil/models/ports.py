@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from gfm_runtime.signals import carried, names
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 #: the groups that an FMU of ours puts before its names
-_GROUPS = ("ref.", "y.", "u.")
+_GROUP = re.compile(r"^(ref|y|u)\.")
 #: an output of our own models: 0, or why the bridge must be blocked
 REASON = "reason"
 
@@ -129,7 +130,6 @@ def wire(
             that comes from nowhere or twice.
     """
     known, u = [*names("ref"), *carried("y", inner)], carried("u", inner)
-    own = {port: port.removeprefix(next(filter(port.startswith, _GROUPS), "")) for port in inputs}
     for table, there in (("inputs", inputs), ("outputs", outputs)):
         for port in getattr(ports, table):
             if port not in there:
@@ -139,23 +139,20 @@ def wire(
     constants = np.zeros(len(inputs))
     into: list[tuple[int, int, float]] = []
     for k, port in enumerate(inputs):
-        asked = ports.inputs.get(port, own[port])
+        asked = ports.inputs.get(port, _GROUP.sub("", port))
         if isinstance(asked, (int, float)):
             constants[k] = asked
             continue
-        wanted = Scaled(signal=asked) if isinstance(asked, str) else asked
-        into.append((k, _place(f"{where}: input {port}", wanted, known), wanted.scale))
+        into.append((k, *_place(f"{where}: input {port}", asked, known)))
     out: list[tuple[int, int, float]] = []
     for k, port in enumerate(outputs):
-        name = port.removeprefix(next(filter(port.startswith, _GROUPS), ""))
+        name = _GROUP.sub("", port)
         found = ports.outputs.get(port, name if name in u else None)
-        if found is None:
-            continue
-        wanted = Scaled(signal=found) if isinstance(found, str) else found
-        out.append((k, _place(f"{where}: output {port}", wanted, u), wanted.scale))
+        if found is not None:
+            out.append((k, *_place(f"{where}: output {port}", found, u)))
     fixed = np.zeros(len(u))
     for name, value in ports.fixed.items():
-        fixed[_place(f"{where}: fixed", Scaled(signal=name), u)] = value
+        fixed[_place(f"{where}: fixed", name, u)[0]] = value
     given = [*(u[place] for _, place, _ in out), *ports.fixed]
     for name in u:
         if given.count(name) != 1:
@@ -179,7 +176,9 @@ def _columns(rows: list[tuple[int, int, float]]) -> tuple[_Column, _Column, NDAr
     return np.array(first, np.int64), np.array(second, np.int64), np.array(scales, np.float64)
 
 
-def _place(where: str, wanted: Scaled, known: Sequence[str]) -> int:
+def _place(where: str, asked: str | Scaled, known: Sequence[str]) -> tuple[int, float]:
+    """Where a signal is among the known ones, and its scale."""
+    wanted = Scaled(signal=asked) if isinstance(asked, str) else asked
     if wanted.signal not in known:
         if wanted.signal in (*carried("y", True), *carried("u", True)):
             raise UserError(
@@ -192,4 +191,4 @@ def _place(where: str, wanted: Scaled, known: Sequence[str]) -> int:
         )
     if wanted.scale == 0 or not math.isfinite(wanted.scale):
         raise UserError(f"{where}: scale = {wanted.scale:g} must not be 0")
-    return list(known).index(wanted.signal)
+    return list(known).index(wanted.signal), wanted.scale

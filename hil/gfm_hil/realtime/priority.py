@@ -56,17 +56,19 @@ def own_processor(role: Role, place: int = 0, controllers: int = 1) -> dict[str,
 
 
 @contextmanager
-def one_processor() -> Iterator[None]:
-    """Keep this thread on one processor, and what it starts meanwhile.
+def one_processor(mode: str = "lockstep") -> Iterator[None]:
+    """Keep this thread in lockstep on one processor, and what it starts meanwhile.
 
-    For two programs of which one waits while the other works: to wake one on another processor
-    takes longer (30 µs on a virtual machine) than to change from one to the other on the same.
+    For a controller and its model's own threads and processes, of which one waits while the other
+    works: to wake one on another processor takes longer (30 µs on a virtual machine) than to change
+    from one to the other on the same. It is the same processor at each call; another process, as of
+    a campaign, is likely to take another one.
     """
-    if not hasattr(os, "sched_setaffinity"):
+    if mode != "lockstep" or not hasattr(os, "sched_setaffinity"):
         yield
         return
     allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
+    os.sched_setaffinity(0, {sorted(allowed)[os.getpid() % len(allowed)]})
     try:
         yield
     finally:

@@ -64,6 +64,9 @@ _CAN_BE_IMPOSSIBLE = (
     Breaker, Fault, GridFrequency, GridImpedance, GridLoad, GridProfile, GridUnbalance,
     GridVoltage, LineBreaker, PhaseJump,
 )  # fmt: skip
+#: ``link.peer_timeout_s`` by mode where none is given: real time cannot wait; in lockstep no time
+#: passes meanwhile, and a busy machine may keep a side for seconds
+PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
 
@@ -76,8 +79,12 @@ class Link(_Model):
         description="where the sides meet, in the form of the link; a fresh one if none",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="the link's own options")
-    peer_timeout_s: float = Field(
-        0.5, gt=0, le=60, description="silence after which the other side counts as gone"
+    peer_timeout_s: float | None = Field(
+        None,
+        gt=0,
+        le=60,
+        description="silence after which the other side counts as gone, s; by default "
+        + " and ".join(f"{wait:g} in {mode}" for mode, wait in PEER_TIMEOUT_S.items()),
     )
     repeat_s: float = Field(
         0.002, gt=0, le=60, description="lockstep: silence after which the plant sends y[k] again"
@@ -295,6 +302,17 @@ class Scenario(_Model):
         """Whether plant and controllers go on after a trip: they wait for a reset, or there may be
         other converters."""
         return self.after_trip == "wait" or self.network is not None
+
+    @property
+    def peer_timeout_s(self) -> float:
+        """Silence after which the other side counts as gone, s."""
+        return self.link.peer_timeout_s or PEER_TIMEOUT_S[self.mode]
+
+    @property
+    def model_timeout_s(self) -> float:
+        """How long a model may take for an answer, s: half, so that its controller can still say
+        what has failed."""
+        return self.peer_timeout_s / 2
 
     @property
     def in_process(self) -> bool:

@@ -11,7 +11,6 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
 
 _PLAIN = "pref_step"  # used for its grid and converter; its step is dropped
-_PATIENCE_S = 10.0  # in lockstep a busy machine must not fail a test
 
 
 class Unfit(UserError):
@@ -83,8 +82,6 @@ def make_setting(
         chosen = str(link_wanted)
     if scenario is None:
         changed = {"events": [], "title": "on the paper's grid", **changed}
-    if (mode or "lockstep") == "lockstep":
-        changed = {"link__peer_timeout_s": _PATIENCE_S, **changed}
     loaded = load_scenario(
         beside(near, scenario or _PLAIN),
         law=None if law is None else beside(near, law),

@@ -20,8 +20,9 @@ from gfm_runtime.firmware.stage import SIZE, VARIABLES
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.signals import NU, NY, carried
 
-#: what a request asks for before its tick: nothing, a change to its law; or to start at a state
-TICK, START, CHANGE = range(3)
+#: what a request asks for before its tick: nothing, a change to its law; or to start at a state, or
+#: to step through a golden row
+TICK, START, CHANGE, CHECK = range(4)
 #: the pipes in the program's folder, by which it gets requests and gives answers
 TO, FROM = "to", "from"
 
@@ -33,7 +34,8 @@ class LoopProgram:
     Attributes:
         target: where it runs.
         folder: where it lies, and in which its pipes have to be.
-        request, state, answer: of what goes over the pipes; a state follows each START.
+        request, state, answer: of what goes over the pipes; a state follows each START, a golden
+            row each CHECK.
     """
 
     target: Target

@@ -35,9 +35,6 @@ from gfm_runtime.inner_file import named_inner
 _POLL_S = 0.2
 
 
-_LINK = Link(type="shm", peer_timeout_s=10.0)  # of a model
-
-
 @dataclass(frozen=True)
 class Foreign:
     """A model as the controller, in place of a law.
@@ -278,7 +275,7 @@ def _scenario(job: Job) -> Scenario:
         return found
     if found.network is not None:
         raise UserError(f"{job.law} is one controller, and the test's network has several")
-    return found.model_copy(update={"link": _LINK})
+    return found.model_copy(update={"link": Link(type="shm")})
 
 
 def run_part(job: Job) -> Found:

@@ -1,8 +1,9 @@
 /* The program of a processor in the loop: waits for a request in the file `to`, and answers in the file
  * `from`. A request is what a tick does first, the number of a law, whether its stage limits, the
- * references and the measurements; at a start the law's whole state follows. The first answer says
- * that the program runs; its count is what reading the clock takes. The number of a law that is not
- * there ends the program. */
+ * references and the measurements; at a start the law's whole state follows. At a check a golden row
+ * follows, and the answer's result is how many of its words differ. The first answer says that the
+ * program runs; its count is what reading the clock takes. The number of a law that is not there ends
+ * the program. */
 #define GOLDEN_NO_MAIN
 #define GOLDEN_CLOCK clock_now
 #include "selftest.c"
@@ -10,7 +11,7 @@
 #include "board.h"
 #include "states.h"
 
-enum { TICK, START, CHANGE };
+enum { TICK, START, CHANGE, CHECK };
 
 static struct {
     golden_word what, law, limited;
@@ -23,6 +24,7 @@ static struct {
 } answer;
 
 static golden_real state[STATE_REALS];
+static golden_word row[GOLDEN_WORDS];
 
 /* What the host records of a law after a tick. */
 static void look_at(int law, int k)
@@ -60,6 +62,13 @@ int main(void)
             k = 0;
             laws[law].init(k);
             states[law].load(k, state, (int)request.limited);
+            continue;
+        }
+        if (request.what == CHECK) {
+            if (!whole(to, row, sizeof row))
+                break;
+            answer.result = golden_row(row);
+            board_write(from, &answer, sizeof answer);
             continue;
         }
         answer.bump = 0;

@@ -1,0 +1,76 @@
+"""How a model is opened by its kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.models.dll import DllModel
+from gfm_hil.models.fmu import FmuModel
+from gfm_hil.models.library import LibraryModel
+from gfm_hil.models.model import Model, Rig
+from gfm_hil.models.ports import PortMap
+
+if TYPE_CHECKING:
+    from gfm_hil.models.pil import PilModel
+
+PIL = "pil:"
+_KINDS: dict[str, Callable[[Path, PortMap, Rig], Model]] = {
+    "dll": DllModel,
+    "fmu": FmuModel,
+    "c": LibraryModel,
+}
+_FILES = "dll:FILE, fmu:FILE or c:FILE"
+FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
+
+
+def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
+    """The model that ``text`` names.
+
+    Args:
+        text: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` for a library that has the interface of
+            ``gfmhil_controller.h``, or ``pil:TARGET`` for the run's own laws.
+        ports: which signal each of its ports is.
+        rig: what it is connected to.
+
+    Raises:
+        UserError: there is no such file, it is no such model, or its ports do not fit.
+    """
+    if text.startswith(PIL):
+        if ports != PortMap():
+            raise UserError(f"controller {text}: has our signals, and takes no map")
+        return _pil(text)
+    kind, path = model_file(text, FORMS)
+    return _KINDS[kind](path, ports, rig)
+
+
+def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
+    """The kind and the file of the model ``KIND:FILE``; ``forms`` is what the message allows.
+
+    Raises:
+        UserError: there is no such kind or file.
+    """
+    kind, colon, file = text.partition(":")
+    if not colon or kind not in _KINDS or not file:
+        raise UserError(f"controller {text!r}: must be {forms}")
+    path = Path(file).absolute()
+    if not path.is_file():
+        raise UserError(f"{file}: there is no such file")
+    return kind, path
+
+
+def precision(text: str) -> str:
+    """The precision, float64 or float32, of the laws beside the model that ``text`` names.
+
+    Raises:
+        UserError: it is a target that is not there.
+    """
+    return _pil(text).real if text.startswith(PIL) else "float64"
+
+
+def _pil(text: str) -> PilModel:
+    from gfm_hil.models.pil import PilModel  # brings the compilers in, which few runs need
+
+    return PilModel(text.removeprefix(PIL))
