@@ -18,7 +18,7 @@ from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.ramps import advance_grid, brought, given, settle
+from gfm_plant.ramps import advance_grid, grid_power, machine_power, settle
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
 from gfm_plant.solution import (
     I_F,
@@ -244,7 +244,7 @@ def _stretch(plant: PlantRecords, part: int) -> None:
             scale = most / math.sqrt(size)
             s.E[0] *= scale
             s.E[1] *= scale
-        s.E_told[0], s.E_told[1] = s.E[0], s.E[1]
+        s.E_commanded[0], s.E_commanded[1] = s.E[0], s.E[1]
     c, cut = circuit(n, now), part
     for k in range(n.n_converters):
         if _may_peak(plant, k, part):
@@ -273,7 +273,8 @@ def _may_peak(plant: PlantRecords, k: int, part: int) -> bool:
         return True
     f, c, o = own(k) + I_F, own(k) + V, own(k) + I_O
     u_r, u_i = now.unit[k, 0], now.unit[k, 1]
-    E_r, E_i = s.E_told[0] * u_r - s.E_told[1] * u_i, s.E_told[0] * u_i + s.E_told[1] * u_r
+    E_d, E_q = s.E_commanded[0], s.E_commanded[1]
+    E_r, E_i = E_d * u_r - E_q * u_i, E_d * u_i + E_q * u_r
     E_r, E_i = E_r - now.w[c, 0], E_i - now.w[c, 1]
     i_r, i_i = now.w[f, 0], now.w[f, 1]
     d_r, d_i = i_r - now.w[o, 0], i_i - now.w[o, 1]
@@ -293,7 +294,7 @@ def _within_peak(plant: PlantRecords, k: int, part: int) -> tuple[float, float]:
     in which the command would have led it.
     """
     n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
-    E_d, E_q, most = s.E_told[0], s.E_told[1], s.E_most
+    E_d, E_q, most = s.E_commanded[0], s.E_commanded[1], s.E_most
     u_r, u_i = now.unit[k, 0], now.unit[k, 1]
     f, c = own(k) + I_F, own(k) + V
     i_r, i_i = now.w[f, 0] * r.current, now.w[f, 1] * r.current
@@ -383,9 +384,9 @@ def _bring(n: Any, now: Any, unit: Any, weight: float) -> None:
     """Add to the energy that a finite grid and the machines get in this tick, when the sources'
     phasors are at ``unit``; ``weight`` is that of Simpson's rule, s."""
     if n.H[0] > 0.0:
-        now.brought[0] += weight * brought(n, now, unit)
+        now.energy[0] += weight * grid_power(n, now, unit)
     for j in range(1, n.n_machines + 1):
-        now.brought[j] -= weight * given(n, now, j, unit)
+        now.energy[j] -= weight * machine_power(n, now, j, unit)
 
 
 @inlined

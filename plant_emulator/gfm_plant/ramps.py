@@ -20,7 +20,7 @@ from gfm_runtime.compiled import compiled
 
 
 @compiled
-def brought(n: Any, now: Any, unit: Any) -> float:
+def grid_power(n: Any, now: Any, unit: Any) -> float:
     """Return the power that reaches the grid, p.u. of the network, when the sources' phasors are at
     ``unit``."""
     g = grid_source(n)
@@ -36,7 +36,7 @@ def brought(n: Any, now: Any, unit: Any) -> float:
 
 
 @compiled
-def given(n: Any, now: Any, j: int, unit: Any) -> float:
+def machine_power(n: Any, now: Any, j: int, unit: Any) -> float:
     """Return the power that machine j gives, p.u. of the network, when the sources' phasors are at
     ``unit``."""
     k, i = machine_source(n, j), n.current_at[j]
@@ -48,10 +48,10 @@ def settle(n: Any, now: Any) -> None:
     """Put a finite grid and the machines at rest at the frequency and power that they have."""
     if n.H[0] > 0.0:
         now.P_load[0] = 1.0
-        _settle(n, now, 0, now.omega_g - 1.0, brought(n, now, now.unit))
+        _settle(n, now, 0, now.omega_g - 1.0, grid_power(n, now, now.unit))
         now.omega_g_slope = 0.0
     for j in range(1, n.n_machines + 1):
-        _settle(n, now, j, now.omega[j] - 1.0, -given(n, now, j, now.unit))
+        _settle(n, now, j, now.omega[j] - 1.0, -machine_power(n, now, j, now.unit))
         now.slope[j] = 0.0
 
 
@@ -69,14 +69,14 @@ def advance_grid(n: Any, now: Any) -> None:
     for j in range(1, n.n_machines + 1):
         w = _swing(n, now, j, now.omega[j] - 1.0)
         now.omega[j] = 1.0 + w
-        power = -given(n, now, j, now.unit) / n.S[j]
+        power = -machine_power(n, now, j, now.unit) / n.S[j]
         now.slope[j], _ = _slopes(n, now, j, w, now.P_turbine[j], power)
     if n.reference > 0:
         now.omega_g, now.omega_g_slope = now.omega[n.reference], now.slope[n.reference]
     if n.H[0] > 0.0:
         w = _swing(n, now, 0, now.omega_g - 1.0)
         now.omega_g = 1.0 + w
-        power = brought(n, now, now.unit) / n.S[0] - now.P_load[0]
+        power = grid_power(n, now, now.unit) / n.S[0] - now.P_load[0]
         now.omega_g_slope, _ = _slopes(n, now, 0, w, now.P_turbine[0], power)
     elif n.reference == 0:
         now.omega_g = _towards(now.omega_g, now.omega_g_to, now.omega_g_rate * T_s)
@@ -93,14 +93,14 @@ def _swing(n: Any, now: Any, j: int, w: float) -> float:
     """Integrate swing equation j over a tick by RK4 under the mean power of that tick, from an
     omega of 1 + w; returns the new w."""
     h = n.T_s
-    power = now.brought[j] / (h * n.S[j]) - now.P_load[j]
+    power = now.energy[j] / (h * n.S[j]) - now.P_load[j]
     P = now.P_turbine[j]
     w_1, P_1 = _slopes(n, now, j, w, P, power)
     w_2, P_2 = _slopes(n, now, j, w + 0.5 * h * w_1, P + 0.5 * h * P_1, power)
     w_3, P_3 = _slopes(n, now, j, w + 0.5 * h * w_2, P + 0.5 * h * P_2, power)
     w_4, P_4 = _slopes(n, now, j, w + h * w_3, P + h * P_3, power)
     now.P_turbine[j] = P + h / 6.0 * (P_1 + 2.0 * (P_2 + P_3) + P_4)
-    now.brought[j] = 0.0
+    now.energy[j] = 0.0
     return w + h / 6.0 * (w_1 + 2.0 * (w_2 + w_3) + w_4)
 
 

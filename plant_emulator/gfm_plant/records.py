@@ -145,7 +145,7 @@ converter_state_dtype = np.dtype(
         # beginning, middle and end; the command's voltage and the largest that v_dc gives
         ("drawn", "f8", (3,)),
         ("seen", "f8", (3, 3)),
-        ("E_told", "f8", (2,)),
+        ("E_commanded", "f8", (2,)),
         ("E_most", "f8"),
         ("before", "f8", (8,)),  # at the last tick: delta, v_dc, DC source (2), sensors (4)
         # protection: ticks in a row that each threshold was crossed, and the latched trip
@@ -289,7 +289,7 @@ def network_dtypes(converters: int) -> tuple[np.dtype[np.void], np.dtype[np.void
             ("omega_g_slope", "f8"),
             ("omega", "f8", (n_swing,)),  # of the machines; that of the grid is omega_g
             ("slope", "f8", (n_swing,)),
-            ("brought", "f8", (n_swing,)),
+            ("energy", "f8", (n_swing,)),
             # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
             # `check_limits`, for how long they have been within, and the time that is left, s;
             # ticks in a row in which both sides were alive

@@ -15,7 +15,7 @@ import pytest
 import gfm_hil.models
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.models import PortMap, Rig, library, open_model
+from gfm_hil.models import BenchContext, PortMap, library, open_model
 from gfm_hil.models.model import ModelError
 from gfm_hil.realtime.priority import processors
 from gfm_hil.results.run import Run
@@ -66,7 +66,7 @@ def test_phases_are_those_of_the_turning_frame(
 ) -> None:
     """A controller that gives a voltage of constant amplitude and speed, and makes up for the delay
     that it is told, is in the frame a constant but for the steps in which it is held."""
-    rig, speed = Rig(1e-4, True, Bases(), delay), 1.01
+    rig, speed = BenchContext(1e-4, True, Bases(), delay), 1.01
     w = speed * rig.bases.omega_b
     V, A = 380.0 * math.sqrt(2 / 3), 4000.0 / (1.5 * 380.0 * math.sqrt(2 / 3))
     fake = Fake(lambda t: phases(0.9 * V, w * (t + fake.setup.delay) + 0.3))
@@ -99,13 +99,13 @@ def test_phases_are_those_of_the_turning_frame(
 @pytest.mark.parametrize(
     ("rig", "ports", "message"),
     [
-        (Rig(inner=False), PortMap(), "choose --inner virtual-stator"),
-        (Rig(inner=True), PortMap(blocks="x"), "of a map it takes step_s only"),
-        (Rig(inner=True), PortMap(step_s=1.5e-4), "must be a multiple of the run's T_s"),
+        (BenchContext(inner=False), PortMap(), "choose --inner virtual-stator"),
+        (BenchContext(inner=True), PortMap(blocks="x"), "of a map it takes step_s only"),
+        (BenchContext(inner=True), PortMap(step_s=1.5e-4), "must be a multiple of the run's T_s"),
     ],
 )
 def test_what_does_not_fit_is_refused(
-    rig: Rig, ports: PortMap, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rig: BenchContext, ports: PortMap, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(library, "_loaded", lambda path: Fake(None))
     with pytest.raises(UserError, match=message):
@@ -231,7 +231,7 @@ def test_in_real_time_a_library_that_takes_too_long_ends_the_run(
 def test_what_is_no_such_library_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = Rig(inner=True)
+    rig = BenchContext(inner=True)
     (tmp_path / "text.so").write_text("no library")
     (tmp_path / "other.c").write_text("int other(void) { return 0; }\n")
     assert cc(tmp_path, *SHARED, "other.c", "-o", "other.so").returncode == 0
@@ -290,7 +290,7 @@ def adapted(folder: Path, firmware: str) -> Path:
 @pytest.mark.apt
 def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path: Path) -> None:
     path = adapted(tmp_path / "tasks", "other.c")
-    rig, ports = Rig(1e-4, True, MEGAWATT), PortMap(step_s=2e-4)
+    rig, ports = BenchContext(1e-4, True, MEGAWATT), PortMap(step_s=2e-4)
     model = library.LibraryModel(path, ports, rig)
     with pytest.raises(UserError, match="refuses this bench"):  # its variables are static
         library.LibraryModel(path, ports, rig)

@@ -11,7 +11,7 @@ import pytest
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.models import Rig, open_model, read_map
+from gfm_hil.models import BenchContext, open_model, read_map
 from gfm_hil.models.ports import PortMap, wire
 from gfm_hil.results import runner
 from gfm_hil.results.run import Run
@@ -305,7 +305,7 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
 def test_a_file_that_is_no_model_is_refused(model: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "text").write_text("no model")
     with pytest.raises(UserError, match=message):
-        open_model(model.format(text=tmp_path / "text"), PortMap(), Rig())
+        open_model(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
 
 
 def test_the_command_refuses_what_makes_no_sense(

@@ -25,7 +25,7 @@ from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
-from gfm_hil.models import FORMS, Rig, open_model, read_map
+from gfm_hil.models import FORMS, BenchContext, open_model, read_map
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, finish, in_use
@@ -60,7 +60,7 @@ def call(options: argparse.Namespace) -> int:
     if options.model is not None:
         ports = read_map(options.map)
         with one_processor(scenario.mode):
-            model = open_model(options.model, ports, _rig(scenario))
+            model = open_model(options.model, ports, _bench_context(scenario))
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
     if options.part is not None:  # of `gfmhil run`, which puts the parts together
@@ -98,10 +98,10 @@ def call(options: argparse.Namespace) -> int:
     return max(exit_code(run.summary) for run in runs.values())
 
 
-def _rig(scenario: Scenario) -> Rig:
+def _bench_context(scenario: Scenario) -> BenchContext:
     """What a model in place of the controller is connected to."""
     delay, bases = scenario.plant.delay, load_converter(scenario.plant.converter).bases
-    return Rig(scenario.T_s, scenario.has_inner, bases, delay.samples + delay.fraction)
+    return BenchContext(scenario.T_s, scenario.has_inner, bases, delay.samples + delay.fraction)
 
 
 def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:

@@ -8,7 +8,7 @@ needs no clock in common with the plant.
 
 from __future__ import annotations
 
-from gfm_hil.engine.loop_records import STOP, WAKE, Why
+from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
 from gfm_hil.engine.tick import answer
 from gfm_hil.links.frame import judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import AHEAD_NS, between_looks, give_way, now_ns, sleep_until
@@ -25,7 +25,7 @@ _EARLIER = 0.05  # of a tick
 
 @compiled
 def controller_ticks(end, records, controller, event):
-    """Answer frames; returns why it came back, a ``Why``.
+    """Answer frames; returns why it came back, a ``ReturnReason``.
 
     Returns EVENT when the next tick is ``event`` or later, after computing the one before; if
     frames were lost on the way there, with that tick's y in hand (``pending``).
@@ -41,12 +41,12 @@ def controller_ticks(end, records, controller, event):
     sent = 0  # when the last answer left, in this call
     while True:
         why = receive(end, records, r, ctl, event, sent)
-        if why != Why.GO_ON:
+        if why != ReturnReason.GO_ON:
             return why
         changes = ctl[0].changes
         answer(ctl, laws, states, est, y, u, end.reader[0].state == SAFE)
         why = reply(end, records, r, controller, event, changes)
-        if why != Why.GO_ON:
+        if why != ReturnReason.GO_ON:
             return why
         sent = times[r.tick, 3]
 
@@ -61,7 +61,7 @@ def receive(end, records, r, ctl, event, sent):
     while not r.pending:
         before = r.tick
         why = _next_frame(end, records, r, ctl, sent)
-        if why != Why.GO_ON:
+        if why != ReturnReason.GO_ON:
             return why
         if r.tick <= before:
             r.tick = before
@@ -70,10 +70,10 @@ def receive(end, records, r, ctl, event, sent):
             continue
         if r.tick >= event:
             r.pending = 1
-            return Why.EVENT
+            return ReturnReason.EVENT
         break
     r.pending = 0
-    return Why.GO_ON
+    return ReturnReason.GO_ON
 
 
 @inlined
@@ -97,8 +97,8 @@ def reply(end, records, r, controller, event, changes):
     progress[0], progress[1] = k + 1, ctl[0].reason
     if ctl[0].state != r.seen or ctl[0].changes != changes:
         r.seen = ctl[0].state
-        return Why.CHANGED
-    return Why.EVENT if k + 1 >= event else Why.GO_ON
+        return ReturnReason.CHANGED
+    return ReturnReason.EVENT if k + 1 >= event else ReturnReason.GO_ON
 
 
 @inlined
@@ -114,7 +114,7 @@ def _next_frame(end, records, r, ctl, sent):
     judge(reader, False, ctl[0].state == SAFE)
     if flags[WAKE] != r.woken:
         r.woken = flags[WAKE]
-        return Why.WOKEN
+        return ReturnReason.WOKEN
     slept = False
     before = now_ns()
     gap = before - sent if r.realtime and sent > 0 else 0
@@ -137,7 +137,7 @@ def _next_frame(end, records, r, ctl, sent):
         if size <= 0 and looks > r.spin_limit and not r.realtime:
             size = end.patient(end.handle, got_bytes)
         if size < 0:
-            return Why.GONE
+            return ReturnReason.GONE
         if size > 0 or looks % r.clock_every == 0 or looks > r.spin_limit:
             now = now_ns()
             gap = max(gap, now - before)
@@ -150,32 +150,32 @@ def _next_frame(end, records, r, ctl, sent):
                     break
             if now - r.heard >= r.patience:
                 judge(reader, True, True)
-                return Why.SILENT
+                return ReturnReason.SILENT
             if r.realtime and r.done > 0:  # before tick 0 nothing can be stale
                 while ctl[0].stale < (now - r.heard) // r.T and ctl[0].state != SAFE:
                     missed(ctl)
                 judge(reader, ctl[0].stale > ctl[0].hold, True)
                 if ctl[0].state != r.seen:
                     r.seen = ctl[0].state
-                    return Why.CHANGED
+                    return ReturnReason.CHANGED
         if flags[STOP] != 0:
-            return Why.STOPPED_HERE
+            return ReturnReason.STOPPED_HERE
         if flags[WAKE] != r.woken:
             r.woken = flags[WAKE]
-            return Why.WOKEN
+            return ReturnReason.WOKEN
         if size <= 0:
             between_looks(looks, end.spins)
-    if reader[0].state == SAFE and not r.goes_on:
-        return Why.PEER_SAFE
+    if reader[0].state == SAFE and not r.survives_trip:
+        return ReturnReason.PEER_SAFE
     if reader[0].state == STOPPED:
-        return Why.PEER_STOPPED
+        return ReturnReason.PEER_STOPPED
     if r.realtime:
         _lock(r, k, now, now - awake > _LOOKED_NS, slept)
     if k > r.tick:
         times[k, 0] = r.t0 + k * r.T
         times[k, 1], times[k, 4] = now, gap
     r.tick = k
-    return Why.GO_ON
+    return ReturnReason.GO_ON
 
 
 @compiled

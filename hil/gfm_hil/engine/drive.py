@@ -20,8 +20,8 @@ from gfm_hil.engine.loop_records import (
     ControllerRecords,
     LinkEnd,
     Records,
+    ReturnReason,
     Side,
-    Why,
     make_loop,
 )
 from gfm_hil.engine.plant_ticks import plant_ticks
@@ -88,13 +88,13 @@ class _End:
         """Plant: the next tick; controller: the last one received."""
         return int(self.loop["tick"][0])
 
-    def checked(self, why: Why) -> Why:
+    def checked(self, why: ReturnReason) -> ReturnReason:
         """Why the loop returned.
 
         Raises:
             PeerLost: the link is gone.
         """
-        if why == Why.GONE:
+        if why == ReturnReason.GONE:
             self.link.receive()  # raises and says more
             raise PeerLost("the link is gone")
         return why
@@ -126,7 +126,7 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
         until = min(ticks, *(timeline.next_tick() for timeline in timelines))
         why = first.checked(plant_ticks(sides, bench.plant.records, until))
         tick = first.tick
-        if why == Why.RESTORE:
+        if why == ReturnReason.RESTORE:
             bench.restore_plant(tick)
             first.keep_u(bench.u)
         for started in follow_trips(bench.plant):
@@ -134,22 +134,26 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
         report_check(bench.plant, timelines, tick)
         for timeline in timelines:
             timeline.look(max(tick - 1, 0))
-            if tick >= ticks and why in (Why.DONE, Why.CHANGED, Why.RESTORE):
+            if tick >= ticks and why in (
+                ReturnReason.DONE,
+                ReturnReason.CHANGED,
+                ReturnReason.RESTORE,
+            ):
                 timeline.finish(tick)
-            elif why == Why.STOPPED_HERE:
+            elif why == ReturnReason.STOPPED_HERE:
                 timeline.end("interrupted", "stopped by the operator", tick)
-            elif why == Why.PEER_SAFE:
+            elif why == ReturnReason.PEER_SAFE:
                 timeline.end("safe", REASONS[first.reader.reason], tick)
-            elif why == Why.PEER_STOPPED:
+            elif why == ReturnReason.PEER_STOPPED:
                 timeline.end("interrupted", CONTROLLER_LEFT, tick)
-            elif why == Why.SILENT:
+            elif why == ReturnReason.SILENT:
                 timeline.end("safe", CONTROLLER_GONE, tick)
-            elif why == Why.LATE:
+            elif why == ReturnReason.LATE:
                 timeline.end("safe", NO_FRESH_U, tick)
     for end, timeline in zip(ends, timelines, strict=True):
         assert timeline.outcome is not None
-        status, goes_on = timeline.outcome.status, end.bench.scenario.survives_trips
-        state = SAFE if status == "tripped" and not goes_on else STOPPED
+        status, survives_trip = timeline.outcome.status, end.bench.scenario.survives_trips
+        state = SAFE if status == "tripped" and not survives_trip else STOPPED
         early = status != "completed" and end.tick < ticks
         if not end.loop["lost"][0]:
             end.last_words(state, int(early), end.bench.y)
@@ -164,17 +168,17 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
     """
     bench, timeline = share.bench, share.timeline
     end, ctl = _End("controller", share, t0_ns, flags), bench.controller.ctl
-    loop, own, goes_on = end.loop[0], _records(bench), bench.scenario.network is not None
-    why, ticks = Why.EVENT, _ticks(bench)
+    loop, own, in_network = end.loop[0], _records(bench), bench.scenario.network is not None
+    why, ticks = ReturnReason.EVENT, _ticks(bench)
     if bench.model is not None:
         bench.model.last_words = lambda: end.last_words(STOPPED, 0, bench.u)
     loop["heard"] = max(time.monotonic_ns(), t0_ns)
-    while timeline.running or goes_on:
+    while timeline.running or in_network:
         event = timeline.next_tick()
         if loop["pending"]:  # the frame of the event's own tick was lost
             timeline.carry_out(end.tick)
             event = timeline.next_tick()
-        elif event <= end.tick + 1 or why == Why.WOKEN:
+        elif event <= end.tick + 1 or why == ReturnReason.WOKEN:
             timeline.carry_out(end.tick + 1)
             event = timeline.next_tick()
         try:
@@ -184,33 +188,33 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
             end.last_words(STOPPED, 0, bench.u)
             break
         tick = end.tick
-        if why in (Why.CHANGED, Why.EVENT) and not loop["pending"]:
+        if why in (ReturnReason.CHANGED, ReturnReason.EVENT) and not loop["pending"]:
             timeline.look(max(tick, 0))
-        if why == Why.STOPPED_HERE:
+        if why == ReturnReason.STOPPED_HERE:
             timeline.end("interrupted", "stopped by the operator", tick)
             end.last_words(STOPPED, 0, bench.u)
             break
-        if why == Why.PEER_SAFE:
+        if why == ReturnReason.PEER_SAFE:
             timeline.end("tripped", REASONS[PLANT_TRIP], tick)
             end.last_words(SAFE, PLANT_TRIP, bench.u)
             break
-        if why == Why.PEER_STOPPED:
+        if why == ReturnReason.PEER_STOPPED:
             if end.reader.reason:
                 timeline.end("interrupted", PLANT_LEFT, tick)
             else:
                 timeline.finish(tick)
             end.last_words(STOPPED, 0, bench.u)
             break
-        if why == Why.SILENT:
+        if why == ReturnReason.SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
             end.last_words(SAFE, LOST_PEER, bench.u)
             break
-        if not timeline.running and not goes_on:  # ``timeline.look`` found a safe state
+        if not timeline.running and not in_network:  # ``timeline.look`` found a safe state
             end.last_words(SAFE, int(ctl["reason"][0]), bench.u)
     return end.reader
 
 
-def _ticks(bench: Bench) -> Callable[..., Why]:
+def _ticks(bench: Bench) -> Callable[..., ReturnReason]:
     return bench.model or controller_ticks
 
 
@@ -221,7 +225,7 @@ def _records(bench: Bench) -> ControllerRecords:
 
 def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
-    nowhere: Any = _Nowhere()
+    nowhere: Any = _NullLink()
     unused: Any = None
     ends = [
         _End(role, Share(bench, nowhere, part, unused), 0, np.ones(FLAGS, np.int64))
@@ -245,7 +249,7 @@ def _nothing(handle, message):
     return 0
 
 
-class _Nowhere:
+class _NullLink:
     """A link without a peer; enough to compile a loop, which is the same for all links."""
 
     @property

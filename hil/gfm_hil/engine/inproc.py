@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.engine.loop_records import ControllerRecords, Why
+from gfm_hil.engine.loop_records import ControllerRecords, ReturnReason
 from gfm_hil.engine.setup import Bench, follow_trips
-from gfm_hil.engine.tick import answer, asks_to_start, obey, sample, take
+from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.parts import Kept, Part
@@ -66,7 +66,7 @@ def stack(benches: Sequence[Bench]) -> Stack:
 
 
 @compiled
-def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, goes_on):
+def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, survives_trip):
     """``run_ticks``; also whether every tick was done and left nothing to see to."""
     ctl, laws, states, est = stack.controllers
     y, u, st = stack.y, stack.u, plant.st
@@ -86,9 +86,9 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, go
             plant_step(plant)
         for i in range(len(ctl)):
             state = ctl[i].state
-            if obey(plant, i, goes_on, state) != Why.GO_ON:
+            if apply_peer_state(plant, i, survives_trip, state) != ReturnReason.GO_ON:
                 return k + 1, False
-            if take(plant, i, u[i], st[i].trip, state, True) != Why.GO_ON:
+            if take(plant, i, u[i], st[i].trip, state, True) != ReturnReason.GO_ON:
                 return k + 1, False
         if not delayed:
             plant_step(plant)
@@ -108,7 +108,7 @@ def run_ticks(
     start: int,
     stop: int,
     first: int = 0,
-    goes_on: bool = False,
+    survives_trip: bool = False,
 ) -> int:
     """Run ticks [start, stop); returns the tick after the last one done.
 
@@ -119,10 +119,10 @@ def run_ticks(
         plant, controllers: at tick ``start``.
         plant_rows, controller_rows: shape (N, ticks, columns), of every tick from ``first`` on,
             columns as ``signals_of`` says.
-        goes_on: the run does after a trip.
+        survives_trip: the run does after a trip.
     """
     rows = plant_rows, controller_rows
-    return int(_run_ticks(plant, controllers, *rows, start, stop, first, goes_on)[0])
+    return int(_run_ticks(plant, controllers, *rows, start, stop, first, survives_trip)[0])
 
 
 def run_inproc(
@@ -135,7 +135,7 @@ def run_inproc(
     """Run a whole scenario: of each converter its bench, its parts of the recording, and its
     timeline. ``go_on`` gets the ticks done and returns whether to go on. Returns the ticks done."""
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
-    goes_on, plant = bench.scenario.survives_trips, bench.plant.records
+    survives_trip, plant = bench.scenario.survives_trips, bench.plant.records
     chunk, piece = max(1, CHUNK // len(benches)), max(1, _PIECE // len(benches))
     controllers = stack(benches)
     plant_rows, controller_rows = rows(len(benches), piece, bench.inner)
@@ -147,7 +147,7 @@ def run_inproc(
         while k < stop and calm:
             end = min(k + piece, stop)
             done, calm = _run_ticks(
-                plant, controllers, plant_rows, controller_rows, k, end, k, goes_on
+                plant, controllers, plant_rows, controller_rows, k, end, k, survives_trip
             )
             for room, parts in sides:
                 for part, recorded in zip(parts, room, strict=True):

@@ -13,7 +13,7 @@ from gfm_runtime.signals import NU_INNER
 from gfm_runtime.states import RUNNING
 
 
-class Why(IntEnum):
+class ReturnReason(IntEnum):
     """Why a compiled loop returned."""
 
     GO_ON = 0  #: only between compiled functions: there is no reason to return
@@ -54,7 +54,7 @@ loop_dtype = np.dtype(
         ("pending", "i8"),  # the controller took a frame and has not computed its tick yet
         ("done", "i8"),  # ticks computed
         ("woken", "i8"),  # ``flags[WAKE]`` as last seen
-        ("goes_on", "i8"),  # after a trip or in SAFE, instead of ending the run
+        ("survives_trip", "i8"),  # after a trip or in SAFE, instead of ending the run
         ("others", "i8"),  # plant: it has other converters, which go on if this controller is lost
         ("came", "i8"),  # plant: whether u[k] came in time, late or not at all
         ("tripped", "i8"),  # plant: the converter's trip when y[k] was measured
@@ -134,7 +134,7 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
     link, policy = scenario.link, scenario.late_policy
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
-    loop["goes_on"], loop["others"] = scenario.survives_trips, scenario.network is not None
+    loop["survives_trip"], loop["others"] = scenario.survives_trips, scenario.network is not None
     loop["seen"], loop["unseen"] = RUNNING, -1
     loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
     loop["T"] = round(scenario.T_s * 1e9)

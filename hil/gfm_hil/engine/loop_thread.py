@@ -74,7 +74,7 @@ def run_loop(
                 model.watch(timelines[0], shares[0].bench.scenario.model_timeout_s)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
-        while thread.is_alive() and not (model is not None and model.given_up):
+        while thread.is_alive() and not (model is not None and model.abandoned):
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
         for timeline in timelines:

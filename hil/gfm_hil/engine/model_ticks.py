@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.engine.controller_ticks import receive, reply
-from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, Why
+from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
 from gfm_hil.engine.retune import Retuned, ready_gains
 from gfm_hil.models import Model, ModelError
 from gfm_hil.recording.columns import kept_of
@@ -62,7 +62,7 @@ class SteppedModel:
         from gfm_hil.models import PilModel  # brings the compilers in, which few runs need
 
         self.name = model.name
-        self.given_up = False
+        self.abandoned = False
         self.last_words: Callable[[], None] = lambda: None
         self._u, self._start = u.copy(), u.copy()
         self._foreign: Model | None = None
@@ -101,7 +101,7 @@ class SteppedModel:
         """End the model: one that is not ours only if it still answers."""
         if self._ours is not None:
             self._ours.close()
-        elif self._foreign is not None and not self.given_up:
+        elif self._foreign is not None and not self.abandoned:
             self._foreign.close()
 
     def _start_model(self) -> None:
@@ -135,7 +135,7 @@ class SteppedModel:
 
     def __call__(
         self, end: LinkEnd, records: Records, controller: ControllerRecords, event: int
-    ) -> Why:
+    ) -> ReturnReason:
         """As ``controller_ticks``.
 
         Raises:
@@ -152,8 +152,8 @@ class SteppedModel:
         receive_one, send_one = self._calls
         while True:
             why, took, changed = receive_one(*given, event, self.has_laws)
-            if why != Why.GO_ON:
-                return Why(why)
+            if why != ReturnReason.GO_ON:
+                return ReturnReason(why)
             self._tick = int(records.loop["tick"][0])
             self._began = time.monotonic_ns()
             if took == RESTARTED:
@@ -161,14 +161,14 @@ class SteppedModel:
             if took != REFUSED:
                 self._find_u(changed, ctl["ref"][0], records)
             self._began = 0
-            if self.given_up:
+            if self.abandoned:
                 raise PeerLost(f"{self.name}: has answered too late")
             why = send_one(*given, event, u, took != REFUSED, changed)
             if not self.has_laws:
                 row = records.rows[self._tick]
                 row[_LAW] = row[_X:] = np.nan
-            if why != Why.GO_ON:
-                return Why(why)
+            if why != ReturnReason.GO_ON:
+                return ReturnReason(why)
 
     def watch(self, timeline: Timeline, patience_s: float) -> None:
         """End the run if the model has not answered for that long; another thread calls this.
@@ -179,7 +179,7 @@ class SteppedModel:
         began = self._began
         silent_s = (time.monotonic_ns() - began) * 1e-9 if began else 0.0
         if silent_s > patience_s:
-            self.given_up = True
+            self.abandoned = True
             problem = f"{self.name}: has not answered for {patience_s:g} s"
             timeline.end("safe", problem, self._tick)
             self.last_words()
@@ -192,7 +192,7 @@ def receive_tick(end, records, controller, event, has_laws):
     change to before, of a model that ``has_laws``; -1 for none."""
     ctl = controller.ctl
     why = receive(end, records, records.loop[0], ctl, event, 0)
-    if why != Why.GO_ON:
+    if why != ReturnReason.GO_ON:
         return why, REFUSED, -1
     before = ctl[0].state
     follow_plant(ctl, end.reader[0].state == SAFE)

@@ -10,8 +10,8 @@ several, a controller that leaves or falls silent trips its converter, and the o
 
 from __future__ import annotations
 
-from gfm_hil.engine.loop_records import STOP, WAKE, Why
-from gfm_hil.engine.tick import asks_to_start, obey, sample, take
+from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
+from gfm_hil.engine.tick import apply_peer_state, asks_to_start, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
@@ -38,7 +38,7 @@ _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 @compiled
 def plant_ticks(sides, plant, last):
-    """Run ticks until ``last``; returns why it came back, a ``Why``.
+    """Run ticks until ``last``; returns why it came back, a ``ReturnReason``.
 
     Args:
         sides: for each converter a ``gfm_hil.engine.loop_records.Side``, in the plant's order.
@@ -54,14 +54,14 @@ def plant_ticks(sides, plant, last):
     delayed = plant_is_delayed(plant)
     # In lockstep a delayed plant sends its next frame right after an answer, so one reading of the
     # clock serves both. A reading stalls the processor: two of them took a tenth of the tick.
-    hurried, why = delayed and not r.realtime, Why.DONE
+    hurried, why = delayed and not r.realtime, ReturnReason.DONE
     while r.tick < last:
         if flags[STOP] != 0:
-            why = Why.STOPPED_HERE
+            why = ReturnReason.STOPPED_HERE
             break
         if flags[WAKE] != r.woken:
             r.woken = flags[WAKE]
-            why = Why.WOKEN
+            why = ReturnReason.WOKEN
             break
         k = r.tick
         due = r.t0 + k * r.T
@@ -75,22 +75,22 @@ def plant_ticks(sides, plant, last):
             plant_step(plant)
         if awaited > 0:
             gap = _await(sides, k, awaited, gap, spins, patience, repeat, hurried)
-        why = Why.GO_ON
+        why = ReturnReason.GO_ON
         for i in range(len(sides)):
             said = _close(sides[i], plant, i, k, gap, hurried)
-            if why == Why.GO_ON:
+            if why == ReturnReason.GO_ON:
                 why = said
-        if why != Why.GO_ON:
+        if why != ReturnReason.GO_ON:
             break
         if not delayed:
             plant_step(plant)
         for i in range(len(sides)):
             why = _judge(sides[i], plant, i, why)
-        if why == Why.GO_ON and plant.now[0].check > WATCHING:
-            why = Why.CHANGED
-        if why != Why.GO_ON:
+        if why == ReturnReason.GO_ON and plant.now[0].check > WATCHING:
+            why = ReturnReason.CHANGED
+        if why != ReturnReason.GO_ON:
             break
-        why = Why.DONE
+        why = ReturnReason.DONE
     for i in range(len(sides)):
         own = sides[i].records.loop[0]
         if own.unseen >= 0:
@@ -232,7 +232,7 @@ def _close(side, plant, i, k, gap, hurried):
     r = records.loop[0]
     came = r.came
     if came == CUT_OFF and r.others == 0:
-        return Why.GONE
+        return ReturnReason.GONE
     if came == FRESH:
         if hurried:
             r.unseen = k
@@ -245,8 +245,8 @@ def _close(side, plant, i, k, gap, hurried):
     record_command(records.rows[k], u)
     records.progress[0] = k + 1
     if r.lost == 0:
-        why = obey(plant, i, r.goes_on, reader[0].state)
-        if why != Why.GO_ON:
+        why = apply_peer_state(plant, i, r.survives_trip, reader[0].state)
+        if why != ReturnReason.GO_ON:
             if r.others == 0:
                 return why
             r.lost = LEFT
@@ -255,9 +255,9 @@ def _close(side, plant, i, k, gap, hurried):
         elif came != FRESH and not r.realtime:
             judge(reader, came == OVERDUE, True)
             if came != OVERDUE:
-                return Why.STOPPED_HERE
+                return ReturnReason.STOPPED_HERE
             if r.others == 0:
-                return Why.SILENT
+                return ReturnReason.SILENT
             r.lost = GONE
     if came != FRESH:
         r.misses += 1
@@ -277,17 +277,17 @@ def _judge(side, plant, i, why):
     r = side.records.loop[0]
     if r.lost != 0:
         trip(plant, i, CONTROLLER, r.lost)
-    elif r.goes_on and reader[0].e2e == INVALID:
+    elif r.survives_trip and reader[0].e2e == INVALID:
         trip(plant, i, CONTROLLER, NOT_HEARD)
     if plant.st[i].trip != r.tripped:
-        return Why.CHANGED
+        return ReturnReason.CHANGED
     if r.lost == 0 and asks_to_start(plant, i, reader[0].state):
-        return Why.CHANGED
+        return ReturnReason.CHANGED
     if r.late * r.T >= r.patience:
         judge(reader, True, True)
         if r.others == 0:
-            return Why.SILENT
+            return ReturnReason.SILENT
         r.lost = GONE
-    if reader[0].e2e == INVALID and not r.goes_on:
-        return Why.LATE
+    if reader[0].e2e == INVALID and not r.survives_trip:
+        return ReturnReason.LATE
     return why

@@ -1,13 +1,13 @@
 """The rules of one tick, written once for the loop in process and the loops over a link.
 
-Plant, tick k: ``sample`` y[k]; then ``obey`` the state that came with u[k] and ``take`` u[k]. The
-plant goes on by one period before it takes u[k] if that is delayed, else after. Controller, tick
-k: ``answer`` y[k] with u[k].
+Plant, tick k: ``sample`` y[k]; then ``apply_peer_state``, the state that came with u[k], and
+``take`` u[k]. The plant goes on by one period before it takes u[k] if that is delayed, else after.
+Controller, tick k: ``answer`` y[k] with u[k].
 """
 
 from __future__ import annotations
 
-from gfm_hil.engine.loop_records import Why
+from gfm_hil.engine.loop_records import ReturnReason
 from gfm_hil.recording.recorder import record_sample
 from gfm_plant import plant_command, plant_sample
 from gfm_plant.names import CONTROLLER, MAY_START, SAFE_STATE
@@ -33,19 +33,19 @@ def answer(ctl, laws, states, est, y, u, plant_tripped):
 
 
 @inlined
-def obey(plant, i, goes_on, state):
+def apply_peer_state(plant, i, survives_trip, state):
     """What the state of converter i's controller asks of the plant: PEER_SAFE or PEER_STOPPED end
     the run.
 
-    A plant that ``goes_on`` trips converter i instead when the controller is in SAFE.
+    A run that ``survives_trip`` trips converter i instead when the controller is in SAFE.
     """
     if state == SAFE:
-        if not goes_on:
-            return Why.PEER_SAFE
+        if not survives_trip:
+            return ReturnReason.PEER_SAFE
         trip(plant, i, CONTROLLER, SAFE_STATE)
     if state == STOPPED:
-        return Why.PEER_STOPPED
-    return Why.GO_ON
+        return ReturnReason.PEER_STOPPED
+    return ReturnReason.GO_ON
 
 
 @inlined
@@ -57,9 +57,9 @@ def take(plant, i, u, tripped, state, fresh):
     ``asks_to_start``.
     """
     if tripped != 0 and state == READY and fresh and plant.net[0].joins == 0:
-        return Why.RESTORE
+        return ReturnReason.RESTORE
     plant_command(plant, i, u)
-    return Why.GO_ON
+    return ReturnReason.GO_ON
 
 
 @inlined

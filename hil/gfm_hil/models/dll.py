@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.model import ModelError, Rig, Wired, run_name, ticks_a_step
+from gfm_hil.models.model import BenchContext, ModelError, Wired, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
 
 _EMT, _ERROR = 1, 2
@@ -106,13 +106,13 @@ class DllModel(Wired):
 
     Args:
         path: of the library.
-        ports, rig: as for ``open_model``.
+        ports, context: as for ``open_model``.
 
     Raises:
         UserError: it cannot be loaded, has not the interface, or its ports do not fit.
     """
 
-    def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
+    def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         where = path.name
         try:
             self._of = c.CDLL(str(path))
@@ -139,7 +139,7 @@ class DllModel(Wired):
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
         self._names = self._out.names
-        self._wiring = wire(where, ports, self._in.names, self._names, rig.inner)
+        self._wiring = wire(where, ports, self._in.names, self._names, context.inner)
         self._parameters = _parameters(where, info, ports)
         declared = info.FixedStepBaseSampleTime
         if ports.step_s and declared and abs(ports.step_s - declared) > 1e-6 * declared:
@@ -147,8 +147,8 @@ class DllModel(Wired):
                 f"{where}: step_s = {ports.step_s:g} in its map, but it declares"
                 f" FixedStepBaseSampleTime = {declared:g} s; leave step_s out"
             )
-        step_s, self._T_s = declared or ports.step_s or rig.T_s, rig.T_s
-        self._every = ticks_a_step(where, step_s, rig.T_s)
+        step_s, self._T_s = declared or ports.step_s or context.T_s, context.T_s
+        self._every = ticks_a_step(where, step_s, context.T_s)
         self._states = (
             np.zeros(max(info.NumIntStates, 1), np.int32),
             np.zeros(max(info.NumFloatStates, 1), np.float32),

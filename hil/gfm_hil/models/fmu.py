@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.models.model import ModelError, Rig, Wired, run_name, ticks_a_step
+from gfm_hil.models.model import BenchContext, ModelError, Wired, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
 from gfm_runtime.signals import carried
 
@@ -23,13 +23,13 @@ class FmuModel(Wired):
 
     Args:
         path: of the .fmu.
-        ports, rig: as for ``open_model``.
+        ports, context: as for ``open_model``.
 
     Raises:
         UserError: FMPy is missing, it cannot read the file, or the ports do not fit.
     """
 
-    def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
+    def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         need("fmpy", "FMPy", f"controller fmu:{path.name}", "fmu")
         import fmpy
         from fmpy.fmi1 import FMICallException
@@ -51,7 +51,7 @@ class FmuModel(Wired):
         inputs = [v for v in variables.values() if v.causality == "input"]
         outputs = [v for v in variables.values() if v.causality == "output"]
         self._names = [v.name for v in outputs]
-        self._wiring = wire(where, ports, [v.name for v in inputs], self._names, rig.inner)
+        self._wiring = wire(where, ports, [v.name for v in inputs], self._names, context.inner)
         self._in, self._out = _by_type(inputs), _by_type(outputs)
         self._fixed: list[tuple[Any, float]] = []
         for name, value in ports.parameters.items():
@@ -59,8 +59,9 @@ class FmuModel(Wired):
                 raise UserError(f"{where}: parameters.{name}: is no parameter of the FMU")
             self._fixed.append((variables[name], value))
         #: of an FMU of ours: where the outputs begin
-        self._begins = [variables.get(f"start.{name}") for name in carried("u", rig.inner)]
-        self._every, self._T_s = ticks_a_step(where, ports.step_s or rig.T_s, rig.T_s), rig.T_s
+        self._begins = [variables.get(f"start.{name}") for name in carried("u", context.inner)]
+        self._T_s = context.T_s
+        self._every = ticks_a_step(where, ports.step_s or self._T_s, self._T_s)
         try:
             self._it = fmpy.instantiate_fmu(unpacked, of, "CoSimulation", logger=self._log)
         except Exception as problem:

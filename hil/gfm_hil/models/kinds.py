@@ -10,14 +10,14 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.models.dll import DllModel
 from gfm_hil.models.fmu import FmuModel
 from gfm_hil.models.library import LibraryModel
-from gfm_hil.models.model import Model, Rig
+from gfm_hil.models.model import BenchContext, Model
 from gfm_hil.models.ports import PortMap
 
 if TYPE_CHECKING:
     from gfm_hil.models.pil import PilModel
 
 PIL = "pil:"
-_KINDS: dict[str, Callable[[Path, PortMap, Rig], Model]] = {
+_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], Model]] = {
     "dll": DllModel,
     "fmu": FmuModel,
     "c": LibraryModel,
@@ -26,14 +26,14 @@ _FILES = "dll:FILE, fmu:FILE or c:FILE"
 FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
 
 
-def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
+def open_model(text: str, ports: PortMap, context: BenchContext) -> Model | PilModel:
     """The model that ``text`` names.
 
     Args:
         text: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` for a library that has the interface of
             ``gfmhil_controller.h``, or ``pil:TARGET`` for the run's own laws.
         ports: which signal each of its ports is.
-        rig: what it is connected to.
+        context: what it is connected to.
 
     Raises:
         UserError: there is no such file, it is no such model, or its ports do not fit.
@@ -43,7 +43,7 @@ def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
             raise UserError(f"controller {text}: has our signals, and takes no map")
         return _pil(text)
     kind, path = model_file(text, FORMS)
-    return _KINDS[kind](path, ports, rig)
+    return _KINDS[kind](path, ports, context)
 
 
 def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.model import ModelError, Rig, check_currents, run_name, ticks_a_step
+from gfm_hil.models.model import BenchContext, ModelError, check_currents, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap
 from gfm_runtime.signals import carried, names
 
@@ -52,7 +52,7 @@ class LibraryModel:
     Args:
         path: of the library.
         ports: of the map only ``step_s``, the time between two calls, s.
-        rig: what it is connected to.
+        context: what it is connected to.
 
     Raises:
         UserError: it cannot be loaded, has not the interface or another version of it, refuses
@@ -61,25 +61,26 @@ class LibraryModel:
 
     real = "float64"
 
-    def __init__(self, path: Path, ports: PortMap, rig: Rig) -> None:
+    def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         if beyond := sorted(ports.model_fields_set - {"step_s"}):
             raise UserError(
                 f"{path.name}: {', '.join(beyond)} in its map: of a map it takes step_s only; its"
                 " ports are fixed"
             )
-        check_currents(f"c:{path.name}", rig.inner)
+        check_currents(f"c:{path.name}", context.inner)
         self._of = _loaded(path)
         said = self._of.gfmhil_name()
         self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)
-        self._rig, self._every = rig, ticks_a_step(path.name, ports.step_s or rig.T_s, rig.T_s)
-        bases = rig.bases
+        self._context = context
+        self._every = ticks_a_step(path.name, ports.step_s or context.T_s, context.T_s)
+        bases = context.bases
         self._phase_V = bases.V_n * math.sqrt(2.0 / 3.0)
         self._phase_A = bases.S_n / (1.5 * self._phase_V)
         self._dc_A = bases.S_n / bases.V_dcref
         # a voltage that is held for several ticks acts on average half of them later
-        self._delay_s = (rig.delay + self._every / 2) * rig.T_s
+        self._delay_s = (context.delay + self._every / 2) * context.T_s
         setup = _Setup(
-            self._every * rig.T_s, self._delay_s,
+            self._every * context.T_s, self._delay_s,
             bases.S_n, bases.V_n, bases.omega_b, bases.V_dcref,
         )  # fmt: skip
         self._self = self._of.gfmhil_new(c.byref(setup))
@@ -114,7 +115,7 @@ class LibraryModel:
             self._call("gfmhil_step")
         held = sum(e * turn for e, turn in zip(self._out.e, (1.0, _A, _A**2), strict=True)) * 2 / 3
         # middle of this tick's share of the time for which e acts
-        acts = self._angle(self._ticks + self._rig.delay + 0.5)
+        acts = self._angle(self._ticks + self._context.delay + 0.5)
         e = held * cmath.exp(-1j * acts) / self._phase_V
         u[:] = self._out.i_dc / self._dc_A, self._speed, e.real, e.imag
         self._ticks += 1
@@ -125,18 +126,20 @@ class LibraryModel:
 
     def _angle(self, ticks: float) -> float:
         """Angle of the plant's frame that many ticks after the start, rad."""
-        cycles = self._speed * self._rig.bases.omega_b * self._rig.T_s / (2 * math.pi) * ticks
+        cycles = (
+            self._speed * self._context.bases.omega_b * self._context.T_s / (2 * math.pi) * ticks
+        )
         return 2 * math.pi * math.fmod(cycles, 1.0)
 
     def _now(self, e: complex, i_u: float) -> None:
         """Let the output begin at what the plant rests under, p.u. in its frame."""
-        turned = e * self._phase_V * cmath.exp(1j * self._angle(self._delay_s / self._rig.T_s))
+        turned = e * self._phase_V * cmath.exp(1j * self._angle(self._delay_s / self._context.T_s))
         self._out.e[:] = _phases(turned)
         self._out.i_dc = i_u * self._dc_A
 
     def _measure(self, ref: NDArray[np.float64], y: NDArray[np.float64]) -> None:
-        bases, turn = self._rig.bases, cmath.exp(1j * self._angle(self._ticks))
-        self._in.t = self._ticks * self._rig.T_s
+        bases, turn = self._context.bases, cmath.exp(1j * self._angle(self._ticks))
+        self._in.t = self._ticks * self._context.T_s
         for name, (d, q) in self._pairs.items():
             base = self._phase_V if name == "v" else self._phase_A
             getattr(self._in, name)[:] = _phases(complex(y[d], y[q]) * turn * base)

@@ -16,7 +16,7 @@ _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 
 @dataclass(frozen=True)
-class Rig:
+class BenchContext:
     """What a model is connected to.
 
     Attributes:
