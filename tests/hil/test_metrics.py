@@ -211,3 +211,20 @@ def test_the_offset_of_the_line_is_no_swing():
     assert (found.hz, found.damping) == (
         pytest.approx(50.0, rel=1e-6), pytest.approx(30 / math.hypot(30, 100 * np.pi), rel=1e-6),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("last", [[math.inf], [math.nan], [-math.inf, 0.0], [1e200, 1e300]])
+def test_what_is_not_finite_has_no_modes(last):
+    p = np.concatenate([0.5 + 0.1 * np.sin(2 * np.pi * 3 * t[:1500]), last])
+    assert swing(p, T_s, F_N) is None
+    assert fast_mode(p, T_s, F_N) is None
+
+
+@pytest.mark.parametrize("first", [(1.0,), (-7.7, -60.3, 37495.7, -0.39, -8.55), (1e-3, -40, 1e6)])
+def test_a_pole_that_grows_beyond_all_numbers_neither_hangs_nor_fails(first):
+    """The least squares got e^(sigma t) = inf: LAPACK did not come back, or did not converge."""
+    for length in range(40, 240, 7):
+        x = np.zeros(length)
+        x[-len(first) :] = first
+        found = fast_mode(x, T_s, F_N), swing(x, T_s, F_N)
+        assert all(one is None or math.isfinite(one.damping) for one in found)

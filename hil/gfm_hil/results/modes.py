@@ -32,6 +32,7 @@ _HALF = 0.5  # periods, at least, in what is looked at
 _RANK = 12  # poles, at most
 _FEW = 40  # samples; fewer tell no modes
 _GONE = 1e-6
+_MOST = 1e100  # p.u.; the squares of more could overflow
 
 
 class Mode(NamedTuple):
@@ -47,7 +48,8 @@ class Mode(NamedTuple):
 
 
 def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
-    """The strongest oscillation below f_n/2 in the first 2 s of x; None without one.
+    """The strongest oscillation below f_n/2 in the first 2 s of x; None without one, or if x is not
+    finite there.
 
     Args:
         x: p.u., shape (ticks,).
@@ -55,6 +57,8 @@ def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
         f_n: nominal frequency, Hz.
     """
     window = x[: round(LONGEST / T_s)]
+    if not np.all(np.abs(window) < _MOST):
+        return None
     slow = _means(window, cycle_ticks(T_s, f_n))
     stride = max(1, len(slow) // _SAMPLES)
     thin = _thinned(slow, stride)
@@ -68,6 +72,8 @@ def fast_mode(x: Vector, T_s: float, f_n: float) -> Mode | None:
     It is sought around the largest line of the spectrum. Args as for ``swing``.
     """
     window = x[: round(LONGEST / T_s)]
+    if not np.all(np.abs(window) < _MOST):
+        return None
     width = cycle_ticks(T_s, f_n)
     rest = _without_means(_without_means(window, width), width)  # a swing leaves 1e-4 of itself
     if len(rest) < _FEW:
@@ -128,7 +134,7 @@ def _strongest(
     x: Vector, h: float, band: tuple[float, float], least: float, share: float
 ) -> Mode | None:
     """The mode in a band [Hz] that contributes the most energy to x, sampled every h s; None if its
-    amplitude is below ``least`` p.u. or its energy below a ``share`` of that of x.
+    amplitude is below ``least`` p.u. or its energy below a ``share`` of that of x,.
 
     Poles are those of the shifted signal subspace (Hua and Sarkar, 1990).
     """
@@ -147,9 +153,12 @@ def _strongest(
     z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
     z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
     s = np.log(z.astype(complex)) / h
-    powers = np.exp(np.outer(np.arange(len(x)) * h, s))
-    amplitude = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
-    energy = np.sum(np.abs(powers * amplitude) ** 2, axis=0) * h
+    t = np.arange(len(x)) * h
+    grown = np.where(s.real > 0, t[-1] * s.real, 0.0)  # until the end, where such a mode is 1
+    powers = np.exp(np.outer(t, s) - grown)
+    largest = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
+    energy = np.sum(np.abs(powers * largest) ** 2, axis=0) * h
+    amplitude = largest * np.exp(-grown)
     hertz = s.imag / (2 * np.pi)
     enough = (np.abs(amplitude) > least) & (2 * energy > share * np.sum(x**2) * h)  # with its twin
     found = np.flatnonzero((hertz > band[0]) & (hertz < band[1]) & enough)
