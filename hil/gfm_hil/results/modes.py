@@ -5,10 +5,15 @@ DC offset (at the nominal frequency in the dq frame) and its harmonics vanish. T
 that, comes from what these means leave. Before a signal is thinned, a filter takes out what the
 thinned signal cannot show. All filters are finite sums over ticks inside the window: they scale a
 damped exponential but leave its pole where it is, so they add no mode and move none.
+
+Exponentials are what a loop does that is left to itself. So the fit begins where no event of the
+scenario acts any more: after the end of a ramp, a course, a sag or a fault.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -16,7 +21,11 @@ import numpy as np
 import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
 from numpy.typing import NDArray
 
+from gfm_hil.recording.columns import Columns
+from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.cycles import cycle_means, cycle_ticks, hann, whole_ticks
+from gfm_hil.scenario.events import FaultClear, GridFrequency, GridVoltage, Reference
+from gfm_hil.scenario.model import Scenario
 
 Vector = NDArray[np.float64]
 
@@ -45,6 +54,66 @@ class Mode(NamedTuple):
 
     damping: float
     hz: float
+
+
+class Acting(NamedTuple):
+    """Until when the events up to one of them act, ticks.
+
+    Attributes:
+        since: when the newest of them happened.
+        held: the end of what is held for a time, as a sag or a fault, or moves.
+        moved: the end of what moves, as a ramp or a course.
+    """
+
+    since: int
+    held: int
+    moved: int
+
+
+def acting(scenario: Scenario, signals: Columns, done: int) -> list[Acting]:
+    """Until when the events of a scenario act, one entry for each in their order.
+
+    Args:
+        scenario: of the run.
+        signals: columns with true_omega_g and true_V_g, p.u.: where a ramp begins.
+        done: ticks recorded; later events are left out.
+    """
+    T_s, f_n = scenario.T_s, nominal_frequency(scenario)
+    ends: dict[object, tuple[int, bool]] = {}  # by what moves; a new event there ends the last
+    found = []
+    for e in scenario.sorted_events():
+        k = e.at(T_s)
+        if k >= done:
+            break
+        match e:
+            case GridFrequency(rate=float(rate)):
+                lasts = abs(e.f_hz - f_n * float(signals["true_omega_g"][k : k + 1][0])) / rate
+            case GridVoltage(rate=float(rate)):
+                lasts = abs(e.V_g - float(signals["true_V_g"][k : k + 1][0])) / rate
+            case _:
+                lasts = e.lasts()
+        end = k + round(lasts / T_s), getattr(e, "duration", None) is None
+        of = [(e.converter, n) for n in e.values()] if isinstance(e, Reference) else [e.type]
+        ends.update(dict.fromkeys(["fault"] if isinstance(e, FaultClear) else of, end))
+        moved = max((tick for tick, moves in ends.values() if moves), default=0)
+        found.append(Acting(k, max(tick for tick, _ in ends.values()), moved))
+    return found
+
+
+def free_from(acts: Sequence[Acting], start: int, stop: int) -> int:
+    """From which tick the modes of the ticks [start, stop) are fitted; ``stop`` if from none.
+
+    What is held over all of the window is a step before it, and so leaves the loop to itself; while
+    something moves there is no mode to be told.
+
+    Args:
+        acts: of the scenario.
+    """
+    before = bisect_right(acts, start, key=lambda act: act.since)
+    if before == 0:
+        return start
+    _, held, moved = acts[before - 1]
+    return max(start, held if held < stop else min(moved, stop))
 
 
 def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
