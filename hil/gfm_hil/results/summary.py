@@ -180,13 +180,14 @@ def _trips(
     log: list[dict[str, Any]], outcome: Outcome, done: int, T_s: float
 ) -> list[dict[str, Any]]:
     """Every trip and safe state of a run: tick, t in s, reason, and the tick ``until`` which it
-    lasted. The reason is that of the side to which it happened."""
+    lasted. Tick and reason are those of the side to which it happened."""
     found: list[dict[str, Any]] = []
     open_roles: set[str] = set()
     for e in log:
         begins = e["event"] in _FAULTS or (e["event"] == "end" and e["status"] in _FAULTS)
         if begins and open_roles:
-            found[-1]["reason"] = cause([found[-1]["reason"], e["reason"]])
+            if cause([found[-1]["reason"], e["reason"]]) != found[-1]["reason"]:
+                found[-1] |= {"tick": e["tick"], "reason": e["reason"]}
         elif begins:
             found.append({"tick": e["tick"], "reason": e["reason"], "until": math.inf})
         if begins:
