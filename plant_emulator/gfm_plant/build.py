@@ -39,6 +39,7 @@ from gfm_plant.records import (
 )
 from gfm_plant.wiring import MAGNETISING, Unit, Wiring
 from gfm_plant.wiring import Machine as MachineParts
+from gfm_runtime.signals import SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
@@ -253,7 +254,7 @@ def _pack_converter_circuit(
     ratio = first.S_n / converter.S_n
     par["current"] = ratio
 
-    per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
+    per_v_dc = {"unlimited": math.inf, "space-vector": SPACE_VECTOR, "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
     par["i_peak"] = math.inf if options.i_peak is None else options.i_peak
 
