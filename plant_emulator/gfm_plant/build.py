@@ -39,6 +39,7 @@ from gfm_plant.records import (
 )
 from gfm_plant.wiring import MAGNETISING, Unit, Wiring
 from gfm_plant.wiring import Machine as MachineParts
+from gfm_runtime.signals import SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
@@ -103,25 +104,20 @@ def make_network(
         if one.X_m is not None:
             inductor = Branch(f"{name}{MAGNETISING}", one.start, GROUND, one.X_m / one.S, 0.0)
             branches.append(inductor)
-    shunts: dict[str, Shunt] = {}
+    shunts = []
     for name, load in parts.loads.items():
         size = load.P**2 + load.Q**2
         if load.Q > 0:
             branches.append(Branch(name, load.node, GROUND, load.Q / size, load.P / size))
-        elif load.node in shunts:
-            raise ValueError(
-                f"network: {shunts[load.node].name} and {name}: two resistors at node {load.node};"
-                " make them one load"
-            )
         else:
-            shunts[load.node] = Shunt(name, load.node, 1 / load.P)
+            shunts.append(Shunt(name, load.node, 1 / load.P))
     banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
     opened = {name for name, line in parts.lines.items() if not line.closed}
     opened |= {name for name, one in parts.transformers.items() if not one.closed}
     opened |= {name for name, load in parts.loads.items() if not load.closed}
     opened |= {name for name, load in parts.constant_power.items() if not load.closed}
     network = _make(
-        converters, T_s, grid, parts.grid, branches, tuple(shunts.values()), banks,
+        converters, T_s, grid, parts.grid, branches, tuple(shunts), banks,
         frozenset(opened), parts.machines, parts.constant_power,
         tuple((name, one.earthed) for name, one in parts.transformers.items()),
     )  # fmt: skip
@@ -258,7 +254,7 @@ def _pack_converter_circuit(
     ratio = first.S_n / converter.S_n
     par["current"] = ratio
 
-    per_v_dc = {"unlimited": math.inf, "space-vector": 1 / math.sqrt(2), "sine": math.sqrt(3 / 8)}
+    per_v_dc = {"unlimited": math.inf, "space-vector": SPACE_VECTOR, "sine": math.sqrt(3 / 8)}
     par["m_max"] = per_v_dc[options.modulation] * bases.V_dcref / bases.V_n
     par["i_peak"] = math.inf if options.i_peak is None else options.i_peak
 

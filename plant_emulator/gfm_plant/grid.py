@@ -22,6 +22,10 @@ from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, Wiring
 LEAST_FAULT_R = 1e-4
 """p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
 
+LEAST_SEGMENT = 1e-3
+"""Of a line: a fault nearer to an end is at that end. The end's voltage would drive a current of
+1/LEAST_SEGMENT times the line's own short-circuit current, or more, through what is left of it."""
+
 
 def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) -> None:
     """Step the frequency of an ideal grid to `omega_g`, or ramp it there at `rate` (p.u./s, > 0).
@@ -103,7 +107,8 @@ def fault(
     Args:
         plant: The plant.
         position: Place on the line: 0 at its start, the filter capacitor, or with a second inductor
-            the point of connection; 1 at its end; None: at a node.
+            the point of connection; 1 at its end, which is a node; `LEAST_SEGMENT` from both at
+            least; None: at a node.
         R: Resistance from each phase to ground, or between the two phases of an LL fault, p.u. of
             the first converter; > 0 at a capacitor.
         duration: Time until the fault is cleared, s; None: `clear_fault` clears it.
@@ -134,7 +139,9 @@ def fault(
         _require("X_0", Z_0.imag, Z_0.imag >= 0, ">= 0 p.u.")
         _require("R_0", Z_0.real, Z_0.real >= 0, ">= 0 p.u.")
     if position is not None:
-        _require("position", position, 0 <= position < 1, "in [0, 1)")
+        inner = LEAST_SEGMENT <= position <= 1 - LEAST_SEGMENT
+        allowed = f"0, or in [{LEAST_SEGMENT:g}, {1 - LEAST_SEGMENT:g}]"
+        _require("position", position, position == 0 or inner, allowed)
         lines = wiring.named_lines()
         for name, _ in wiring.transformers:
             del lines[name]

@@ -6,7 +6,7 @@ A wiring never changes: an event makes another one. Elements are in p.u. of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -378,7 +378,8 @@ class Wiring:
             if seen is not None and seen.imag > 0:
                 through_fault.append(Branch("fault", node, GROUND, seen.imag, seen.real))
             elif seen is not None:
-                shunts = _with_shunt(shunts, Shunt("fault", node, seen.real))
+                shunts.append(Shunt("fault", node, seen.real))
+        shunts = _in_parallel(shunts)
         for k, unit in enumerate(self.units):
             if k not in blocked:
                 i_f = unit.states[0]
@@ -395,14 +396,13 @@ class Wiring:
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
             sources.append(Source(GRID_SOURCE, self.grid))
-        hanging: list[Branch] = []
-        if self.opened or not self.closed:
-            whole = branches
-            held = {GROUND} | {c.node for c in capacitors} | {s.node for s in shunts}
-            branches = _without_ends(branches, held | {source.node for source in sources})
-            met = {node for branch in branches for node in (branch.start, branch.end)}
-            shunts = [s for s in shunts if s.node in met]
-            hanging = [branch for branch in whole if branch not in branches]
+        whole, held = branches, {GROUND} | {part.node for part in (*capacitors, *shunts, *sources)}
+        if self.closed and not self.opened:  # no line may hang, but a converter on an open bus may
+            held |= {node for line in self.branches for node in (line.start, line.end)}
+        branches = _without_ends(branches, held)
+        met = {node for branch in branches for node in (branch.start, branch.end)}
+        shunts = [s for s in shunts if s.node in met]
+        hanging = [branch for branch in whole if branch not in branches]
         return branches, capacitors, sources, shunts, hanging
 
     def _whole(self, branches: Sequence[Branch]) -> Iterator[Branch]:
@@ -418,13 +418,15 @@ class Wiring:
             yield Branch("beyond", "beyond", branch.end, (1 - at) * branch.L, (1 - at) * branch.R)
 
 
-def _with_shunt(shunts: list[Shunt], more: Shunt) -> list[Shunt]:
-    """Add a shunt, in parallel to the one that is at its node already."""
-    for k, there in enumerate(shunts):
-        if there.node == more.node:
-            R = there.R * more.R / (there.R + more.R) if more.R > 0 else 0.0
-            return [*shunts[:k], Shunt(more.name, more.node, R), *shunts[k + 1 :]]
-    return [*shunts, more]
+def _in_parallel(shunts: Iterable[Shunt]) -> list[Shunt]:
+    """One shunt a node in place of all that are there; a metallic fault, R = 0, wins."""
+    found: dict[str, Shunt] = {}
+    for one in shunts:
+        if (there := found.get(one.node)) is not None:
+            R = there.R * one.R / (there.R + one.R) if one.R > 0 else 0.0
+            one = Shunt(one.name, one.node, R)
+        found[one.node] = one
+    return list(found.values())
 
 
 def _without_ends(branches: list[Branch], held: set[str]) -> list[Branch]:

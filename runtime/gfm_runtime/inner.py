@@ -37,13 +37,14 @@ import numpy as np
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.errors import LawError, Mistakes
+from gfm_runtime.signals import SPACE_VECTOR
 
 KINDS = {"none": 0, "virtual-stator": 1, "cascaded": 2, "threshold-impedance": 3}
 NONE, STATOR = KINDS["none"], KINDS["virtual-stator"]
 PRIORITIES = {"circular": 0, "d": 1, "q": 2, "angle": 3}
 _D, _Q, _ANGLE = 1, 2, 3
 
-SPACE_VECTOR = 1.3025508
+PAPER_M = SPACE_VECTOR * 700.0 / 380.0
 """Largest |e| over v_dc by space-vector modulation for the paper's 700 V and 380 V, p.u."""
 
 NEGLIGIBLE = 2.0**-100  # p.u.; decaying values below it become 0; exact in float32 too
@@ -99,7 +100,7 @@ class Inner:
     k_thr: float = 0.67
     sigma: float = 2.0
     f_i: float = 10.0
-    m: float = SPACE_VECTOR
+    m: float = PAPER_M
     freeze: bool = True
     P_max: float = math.inf
     P_min: float = -math.inf

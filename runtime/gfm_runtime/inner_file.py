@@ -16,7 +16,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from gfm_runtime.errors import LawError, meant
 from gfm_runtime.expressions import evaluate
-from gfm_runtime.inner import SPACE_VECTOR, Inner
+from gfm_runtime.inner import PAPER_M, Inner
 from gfm_runtime.mistakes import lines
 from gfm_runtime.toml_file import Number, Table, parse_toml, read_text
 
@@ -33,7 +33,7 @@ class PowerLimiter(Table):
 
 
 class _Stage(Table):
-    m: Number = Field(SPACE_VECTOR, description="limit of abs(e) over v_dc, p.u.")
+    m: Number = Field(PAPER_M, description="limit of abs(e) over v_dc, p.u.")
     freeze: bool = Field(
         True,
         description="while the current is limited, hold the states of the law's E_u row if they "

@@ -17,6 +17,7 @@ sides of a link compare before they start.
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import astuple, dataclass
 from typing import Literal
 
@@ -112,6 +113,11 @@ SIGNALS: tuple[Signal, ...] = (
         "q component of the bridge's voltage",
     ),
 )
+
+SPACE_VECTOR = 1 / math.sqrt(2)
+"""Largest line-to-line RMS voltage of a bridge over its DC voltage, both in V, with space-vector
+modulation: the circle within the hexagon of vectors has a phase amplitude of v_dc / sqrt(3), and
+line-to-line RMS is sqrt(3/2) times the phase amplitude."""
 
 NY, NU = 5, 3  # of Phi
 NY_INNER, NU_INNER = 11, 4  # of a run with an inner stage

@@ -263,6 +263,16 @@ def test_a_window_that_cannot_be_judged_says_why(ramp: Scenario) -> None:
         assert found.verdict == CANNOT and why in found.text
 
 
+def test_damping_is_judged_after_the_ramp(ramp: Scenario) -> None:
+    t = np.arange(50_000) * 1e-4
+    p = 0.5 + 0.5 * np.clip((t - 2.0) / 0.5, 0.0, 1.0) + 0.05 * answer(t - 2.5, 0.3, 3.0, 0.0)
+    run = run_of(ramp, p=p)
+    (found,) = judge(run, [one("damped", ratio=0.29)], UNDER)
+    assert found.verdict == PASS and found.value == pytest.approx(0.3, abs=1e-3)
+    (found,) = judge(run, [one("damped", ratio=0.29, window=[0.0, 0.45])], UNDER)
+    assert found.verdict == CANNOT and "not over within the window" in found.text
+
+
 SWING = """
 name = "swing"
 title = "A swing equation at a constant voltage"

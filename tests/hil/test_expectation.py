@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.runner import run_scenario
@@ -145,3 +146,26 @@ def test_an_expectation_that_cannot_be_met_is_refused(case):
 def test_every_name_of_the_lists_is_accepted(status, make):
     for name in END_REASONS[status]:
         assert make(expect=status, expect_reason=name).expect_reason == name
+
+
+@pytest.mark.parametrize("after_trip", ["end", "wait"])
+def test_a_trip_has_one_time(after_trip):
+    """The log and the summary said a tick less than the reason."""
+    run = gfmhil.run(
+        {
+            "title": "", "duration": 0.2, "law": "vsg-2", "after_trip": after_trip,
+            "plant": {"grid": {"scr": 3.0, "x_over_r": 6.0}},
+            "events": [{"t": 0.1, "type": "grid-phase-jump", "degrees": 60.0}],
+        }
+    )  # fmt: skip
+    (trip,) = run.summary["trips"]
+    tick, t = trip["tick"], trip["t"]
+    assert f"at tick {tick} (t = {t:g} s)" in trip["reason"]
+    first = next(e for e in run.events if "reason" in e)
+    assert (first["tick"], first["t"]) == (tick, t)
+    assert run.summary["events"][0]["cut_short"] == f"over-current at {t:g} s"
+    assert run.summary["events"][0]["i_peak"] == run.signals["i"][1000:tick].max()
+    if after_trip == "wait":
+        assert (run.signals["trip"][:] > 0).argmax() == tick
+    else:
+        assert run.ticks == tick

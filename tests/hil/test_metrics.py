@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gfmhil
 from gfm_hil.results.cycles import cycle_means
 from gfm_hil.results.metrics import METRICS, event_metrics
-from gfm_hil.results.modes import fast_mode, swing
+from gfm_hil.results.modes import Acting, acting, fast_mode, free_from, swing
+from gfm_hil.scenario.model import check_scenario
+from gfm_hil.studies.law import as_law
 
 T_s, F_N = 1e-3, 50.0
 COLUMNS = ("true_p", "true_omega_u", "true_V", "true_i")
@@ -211,3 +214,80 @@ def test_the_offset_of_the_line_is_no_swing():
     assert (found.hz, found.damping) == (
         pytest.approx(50.0, rel=1e-6), pytest.approx(30 / math.hypot(30, 100 * np.pi), rel=1e-6),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("last", [[math.inf], [math.nan], [-math.inf, 0.0], [1e200, 1e300]])
+def test_what_is_not_finite_has_no_modes(last):
+    p = np.concatenate([0.5 + 0.1 * np.sin(2 * np.pi * 3 * t[:1500]), last])
+    assert swing(p, T_s, F_N) is None
+    assert fast_mode(p, T_s, F_N) is None
+
+
+@pytest.mark.parametrize("first", [(1.0,), (-7.7, -60.3, 37495.7, -0.39, -8.55), (1e-3, -40, 1e6)])
+def test_a_pole_that_grows_beyond_all_numbers_neither_hangs_nor_fails(first):
+    """The least squares got e^(sigma t) = inf: LAPACK did not come back, or did not converge."""
+    for length in range(40, 240, 7):
+        x = np.zeros(length)
+        x[-len(first) :] = first
+        found = fast_mode(x, T_s, F_N), swing(x, T_s, F_N)
+        assert all(one is None or math.isfinite(one.damping) for one in found)
+
+
+@pytest.mark.parametrize(
+    ("law", "to_hz", "rate", "then"),
+    [
+        ("vsg-2", 49.8, 0.2, None),
+        ("vsg-2", 49.7, 0.5, None),
+        ("droop-5", 49.7, 0.5, None),
+        ("droop-5", 50.1, 0.05, 2.5),  # the window of the step has the end of the ramp in it
+    ],
+)
+def test_after_a_ramp_of_the_grid_the_swing_is_that_of_the_linear_loop(law, to_hz, rate, then):
+    """Fitted over ramp and corner it was 0.64 at 0.40 Hz, 0.28 at 1.05 Hz, 0.71 at 0.97 Hz."""
+    events = [{"t": 1.0, "type": "grid-frequency", "f_hz": to_hz, "rate": rate}]
+    events += [{"t": then, "type": "reference", "P_ref": 0.45}] if then else []
+    grid = {"scr": 3.0, "x_over_r": 6.0}
+    content = {"title": "", "duration": 7.0, "law": law, "events": events, "plant": {"grid": grid}}
+    content["references"] = {"P_ref": 0.5}
+    modes = as_law(law).closed_loop(check_scenario(content, "test")).modes()
+    (mode,) = [m for m in modes if 0.3 < m.frequency_hz < 5.0]
+    found = gfmhil.run(content).summary["events"][-1]
+    assert found["damping_ratio"] == pytest.approx(mode.ratio, abs=0.005)
+    assert found["oscillation_hz"] == pytest.approx(mode.frequency_hz, rel=0.02)
+
+
+def until(*events, done=9000, omega_g=1.0, V_g=1.0):
+    """What acts after the newest of these events, in ticks of 1 ms."""
+    content = {"title": "", "duration": 9.0, "T_s": T_s, "events": [*events]}
+    signals = {"true_omega_g": np.full(done, omega_g), "true_V_g": np.full(done, V_g)}
+    return acting(check_scenario(content, "test"), signals, done)
+
+
+RAMP = {"t": 1.0, "type": "grid-frequency", "f_hz": 49.0, "rate": 0.5}
+SAG = {"t": 1.0, "type": "grid-voltage", "V_g": 0.5, "duration": 3.0}
+
+
+def test_how_long_an_event_acts():
+    assert until(RAMP) == [Acting(1000, 3000, 3000)]
+    assert until(RAMP, omega_g=0.99) == [Acting(1000, 2000, 2000)]
+    assert until({"t": 1.0, "type": "grid-voltage", "V_g": 0.5, "rate": 0.1}, V_g=0.9)[0].moved == (
+        5000
+    )
+    assert until(SAG) == [Acting(1000, 4000, 0)]
+    step = {"t": 2.0, "type": "reference", "P_ref": 0.4}
+    assert until(RAMP, step)[-1] == Acting(2000, 3000, 3000)
+    assert until(RAMP, {**RAMP, "t": 2.0, "rate": 5.0})[-1].moved == 2200  # in place of the first
+    ramps = [{**step, "ramp_s": 4.0}, {"t": 3.0, "type": "reference", "V_ref": 1.01}]
+    assert until(*ramps)[-1].moved == 6000  # V_ref does not end that of P_ref
+    fault = {"t": 1.0, "type": "fault", "position": 0.5, "R": 0.1, "duration": 5.0}
+    assert until(fault, {"t": 2.0, "type": "fault-clear"})[-1].held == 2000
+    assert until(RAMP, {**step, "t": 5.0}, done=4000) == [Acting(1000, 3000, 3000)]
+
+
+def test_a_window_is_fitted_from_where_nothing_acts_any_more():
+    assert free_from(until(RAMP), 1000, 6000) == 3000
+    assert free_from(until(RAMP), 1000, 2500) == 2500  # nothing is left of it
+    assert free_from(until(RAMP), 500, 1000) == 500
+    assert free_from(until(SAG), 1000, 6000) == 4000
+    assert free_from(until(SAG), 1000, 3500) == 1000  # all of it within the sag
+    assert free_from([], 1000, 3500) == 1000

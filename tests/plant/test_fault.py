@@ -97,7 +97,9 @@ def test_fault_on_a_tripped_plant_and_a_new_line(rest: Callable[..., Any]) -> No
 @pytest.mark.parametrize(
     ("at", "R", "duration", "message"),
     [
-        (1.0, 0.1, None, r"position = 1.0: must be in \[0, 1\)"),
+        (1.0, 0.1, None, r"position = 1.0: must be 0, or in \[0.001, 0.999\]"),
+        (0.999999999, 0.1, None, r"position = 0.999999999: must be 0, or in \[0.001, 0.999\]"),
+        (1e-9, 0.1, None, r"position = 1e-09: must be 0, or in \[0.001, 0.999\]"),
         (0.0, 0.0, None, "R = 0.0: must be >= 0.0001 p.u. at position 0"),
         (0.5, -1.0, None, "R = -1.0: must be >= 0"),
         (0.5, 0.1, 0.0, "duration = 0.0: must be > 0 s"),

@@ -195,7 +195,7 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
             end.last_words(STOPPED, 0, bench.u)
             break
         if why == ReturnReason.PEER_SAFE:
-            timeline.end("tripped", REASONS[PLANT_TRIP], tick)
+            timeline.end("tripped", REASONS[PLANT_TRIP], max(tick, end.reader.tick))
             end.last_words(SAFE, PLANT_TRIP, bench.u)
             break
         if why == ReturnReason.PEER_STOPPED:

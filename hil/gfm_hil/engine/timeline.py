@@ -186,10 +186,14 @@ class Timeline:
             )
         found = self._found(ctl, st)
         if found is not None and self._fault is None:
+            mine = st[self._bench.place]
+            tripped = "plant" in self._roles and mine["trip"] not in (0, CONTROLLER)
+            # the one time of a trip: when the bridge blocks, in the state that is beyond its limit
+            at = int(mine["trip_tick"]) if tripped else tick
             if self._bench.scenario.after_trip == "end":
-                self.end(*found, tick)
+                self.end(*found, at)
                 return
-            self.write(tick, found[0], reason=found[1], role="+".join(self._roles))
+            self.write(at, found[0], reason=found[1], role="+".join(self._roles))
         elif found is None and self._fault is not None:
             self.write(tick, "recovered", role="+".join(self._roles))
         self._fault = found

@@ -31,7 +31,7 @@ _FEW = 20  # samples; a shorter window has no metrics
 
 
 def event_metrics(
-    signals: Columns, start: int, stop: int, T_s: float, f_n: float, lasts: int = 0
+    signals: Columns, start: int, stop: int, T_s: float, f_n: float, free: int = 0
 ) -> dict[str, float | None]:
     """Metrics of the ticks [start, stop) after an event at ``start``.
 
@@ -41,7 +41,7 @@ def event_metrics(
         start, stop: ticks.
         T_s: sampling time, s.
         f_n: nominal frequency, Hz.
-        lasts: ticks over which the event acts, as a sag or a ramp; modes are those of what follows.
+        free: from which tick modes are fitted, if not from ``start`` (``modes.free_from``).
 
     Returns:
         By the names of ``METRICS``, with the units of their names, p.u. without one:
@@ -87,8 +87,8 @@ def event_metrics(
     has_law = "law" not in signals or not np.isnan(signals["law"][start : start + 1][0])
     tells = has_law or nadir != top
     v_low, v_high = _extremes(pieces(V, start, stop))
-    free = start + lasts if stop - start - lasts >= _FEW else start
-    first = p[free : min(stop, free + round(LONGEST / T_s))]
+    free = max(start, free)
+    first = p[free : max(free, min(stop, free + round(LONGEST / T_s)))]
     slow, fast = swing(first, T_s, f_n), fast_mode(first, T_s, f_n)
     found: dict[str, float | None] = dict.fromkeys(METRICS)
     found |= {

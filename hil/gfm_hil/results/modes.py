@@ -5,10 +5,15 @@ DC offset (at the nominal frequency in the dq frame) and its harmonics vanish. T
 that, comes from what these means leave. Before a signal is thinned, a filter takes out what the
 thinned signal cannot show. All filters are finite sums over ticks inside the window: they scale a
 damped exponential but leave its pole where it is, so they add no mode and move none.
+
+Exponentials are what a loop does that is left to itself. So the fit begins where no event of the
+scenario acts any more: after the end of a ramp, a course, a sag or a fault.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -16,7 +21,11 @@ import numpy as np
 import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
 from numpy.typing import NDArray
 
+from gfm_hil.recording.columns import Columns
+from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.cycles import cycle_means, cycle_ticks, hann, whole_ticks
+from gfm_hil.scenario.events import FaultClear, GridFrequency, GridVoltage, Reference
+from gfm_hil.scenario.model import Scenario
 
 Vector = NDArray[np.float64]
 
@@ -32,6 +41,7 @@ _HALF = 0.5  # periods, at least, in what is looked at
 _RANK = 12  # poles, at most
 _FEW = 40  # samples; fewer tell no modes
 _GONE = 1e-6
+_MOST = 1e100  # p.u.; the squares of more could overflow
 
 
 class Mode(NamedTuple):
@@ -46,8 +56,69 @@ class Mode(NamedTuple):
     hz: float
 
 
+class Acting(NamedTuple):
+    """Until when the events up to one of them act, ticks.
+
+    Attributes:
+        since: when the newest of them happened.
+        held: the end of what is held for a time, as a sag or a fault, or moves.
+        moved: the end of what moves, as a ramp or a course.
+    """
+
+    since: int
+    held: int
+    moved: int
+
+
+def acting(scenario: Scenario, signals: Columns, done: int) -> list[Acting]:
+    """Until when the events of a scenario act, one entry for each in their order.
+
+    Args:
+        scenario: of the run.
+        signals: columns with true_omega_g and true_V_g, p.u.: where a ramp begins.
+        done: ticks recorded; later events are left out.
+    """
+    T_s, f_n = scenario.T_s, nominal_frequency(scenario)
+    ends: dict[object, tuple[int, bool]] = {}  # by what moves; a new event there ends the last
+    found = []
+    for e in scenario.sorted_events():
+        k = e.at(T_s)
+        if k >= done:
+            break
+        match e:
+            case GridFrequency(rate=float(rate)):
+                lasts = abs(e.f_hz - f_n * float(signals["true_omega_g"][k : k + 1][0])) / rate
+            case GridVoltage(rate=float(rate)):
+                lasts = abs(e.V_g - float(signals["true_V_g"][k : k + 1][0])) / rate
+            case _:
+                lasts = e.lasts()
+        end = k + round(lasts / T_s), getattr(e, "duration", None) is None
+        of = [(e.converter, n) for n in e.values()] if isinstance(e, Reference) else [e.type]
+        ends.update(dict.fromkeys(["fault"] if isinstance(e, FaultClear) else of, end))
+        moved = max((tick for tick, moves in ends.values() if moves), default=0)
+        found.append(Acting(k, max(tick for tick, _ in ends.values()), moved))
+    return found
+
+
+def free_from(acts: Sequence[Acting], start: int, stop: int) -> int:
+    """From which tick the modes of the ticks [start, stop) are fitted; ``stop`` if from none.
+
+    What is held over all of the window is a step before it, and so leaves the loop to itself; while
+    something moves there is no mode to be told.
+
+    Args:
+        acts: of the scenario.
+    """
+    before = bisect_right(acts, start, key=lambda act: act.since)
+    if before == 0:
+        return start
+    _, held, moved = acts[before - 1]
+    return max(start, held if held < stop else min(moved, stop))
+
+
 def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
-    """The strongest oscillation below f_n/2 in the first 2 s of x; None without one.
+    """The strongest oscillation below f_n/2 in the first 2 s of x; None without one, or if x is not
+    finite there.
 
     Args:
         x: p.u., shape (ticks,).
@@ -55,6 +126,8 @@ def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
         f_n: nominal frequency, Hz.
     """
     window = x[: round(LONGEST / T_s)]
+    if not np.all(np.abs(window) < _MOST):
+        return None
     slow = _means(window, cycle_ticks(T_s, f_n))
     stride = max(1, len(slow) // _SAMPLES)
     thin = _thinned(slow, stride)
@@ -68,6 +141,8 @@ def fast_mode(x: Vector, T_s: float, f_n: float) -> Mode | None:
     It is sought around the largest line of the spectrum. Args as for ``swing``.
     """
     window = x[: round(LONGEST / T_s)]
+    if not np.all(np.abs(window) < _MOST):
+        return None
     width = cycle_ticks(T_s, f_n)
     rest = _without_means(_without_means(window, width), width)  # a swing leaves 1e-4 of itself
     if len(rest) < _FEW:
@@ -128,7 +203,7 @@ def _strongest(
     x: Vector, h: float, band: tuple[float, float], least: float, share: float
 ) -> Mode | None:
     """The mode in a band [Hz] that contributes the most energy to x, sampled every h s; None if its
-    amplitude is below ``least`` p.u. or its energy below a ``share`` of that of x.
+    amplitude is below ``least`` p.u. or its energy below a ``share`` of that of x,.
 
     Poles are those of the shifted signal subspace (Hua and Sarkar, 1990).
     """
@@ -147,9 +222,12 @@ def _strongest(
     z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
     z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
     s = np.log(z.astype(complex)) / h
-    powers = np.exp(np.outer(np.arange(len(x)) * h, s))
-    amplitude = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
-    energy = np.sum(np.abs(powers * amplitude) ** 2, axis=0) * h
+    t = np.arange(len(x)) * h
+    grown = np.where(s.real > 0, t[-1] * s.real, 0.0)  # until the end, where such a mode is 1
+    powers = np.exp(np.outer(t, s) - grown)
+    largest = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
+    energy = np.sum(np.abs(powers * largest) ** 2, axis=0) * h
+    amplitude = largest * np.exp(-grown)
     hertz = s.imag / (2 * np.pi)
     enough = (np.abs(amplitude) > least) & (2 * energy > share * np.sum(x**2) * h)  # with its twin
     found = np.flatnonzero((hertz > band[0]) & (hertz < band[1]) & enough)

@@ -20,6 +20,7 @@ from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.recording.timing import ROUND_TRIP, Spread, count_misses
 from gfm_hil.results.doctor import verdict
 from gfm_hil.results.metrics import event_metrics
+from gfm_hil.results.modes import acting, free_from
 from gfm_hil.results.ripple import remaining_ripple
 from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
@@ -31,7 +32,9 @@ _FAULTS = ("tripped", "safe")
 #: metrics of where a response ends, which a response that a trip cuts short does not have
 END_METRICS = ("p_final", "settling_s", "overshoot_pct")
 #: the recorded columns that the summary of a run in memory reads
-READ = frozenset({"true_p", "true_omega_u", "true_V", "true_i", "true_omega_g", "law", "ref_P_ref"})
+READ = frozenset(
+    {"true_p", "true_omega_u", "true_V", "true_i", "true_omega_g", "true_V_g", "law", "ref_P_ref"}
+)
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
 
 
@@ -100,9 +103,8 @@ def summarise(
     bumps = {e["tick"]: e["bump_pu"] for e in changes}
     starts = np.array([e["tick"] for e in happened])  # in order, as the log is
     ends = [*np.searchsorted(starts, starts, side="right").tolist()]
-    f_n = nominal_frequency(scenario)
-    T_s = scenario.T_s
-    lasting = {(e.at(T_s), e.type): round(e.lasts() / T_s) for e in scenario.events}
+    T_s, f_n = scenario.T_s, nominal_frequency(scenario)
+    acts = acting(scenario, signals, done) if plant else []
     laws = [scenario.law, *[e["law"] for e in changes]]
     events = []
     for k, e in enumerate(happened):
@@ -116,8 +118,8 @@ def summarise(
             if trip is not None and (trip["tick"] < stop or stop == done):
                 stop = min(stop, trip["tick"])
                 entry["cut_short"] = f"{reason_name(trip['reason'])} at {trip['t']:g} s"
-            over = lasting.get((e["tick"], e["event"]), 0)
-            entry.update(event_metrics(signals, e["tick"], stop, scenario.T_s, f_n, over))
+            free = free_from(acts, e["tick"], stop)
+            entry.update(event_metrics(signals, e["tick"], stop, T_s, f_n, free))
             if "cut_short" in entry:
                 entry.update(dict.fromkeys(END_METRICS))
             if e["event"] not in _STEPS:
@@ -178,13 +180,14 @@ def _trips(
     log: list[dict[str, Any]], outcome: Outcome, done: int, T_s: float
 ) -> list[dict[str, Any]]:
     """Every trip and safe state of a run: tick, t in s, reason, and the tick ``until`` which it
-    lasted. The reason is that of the side to which it happened."""
+    lasted. Tick and reason are those of the side to which it happened."""
     found: list[dict[str, Any]] = []
     open_roles: set[str] = set()
     for e in log:
         begins = e["event"] in _FAULTS or (e["event"] == "end" and e["status"] in _FAULTS)
         if begins and open_roles:
-            found[-1]["reason"] = cause([found[-1]["reason"], e["reason"]])
+            if cause([found[-1]["reason"], e["reason"]]) != found[-1]["reason"]:
+                found[-1] |= {"tick": e["tick"], "reason": e["reason"]}
         elif begins:
             found.append({"tick": e["tick"], "reason": e["reason"], "until": math.inf})
         if begins:

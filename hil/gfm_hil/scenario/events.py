@@ -293,7 +293,7 @@ class Fault(_Event):
         ge=0,
         lt=1,
         description="place on the line: 0 at its start, which for a converter's line is the filter "
-        "capacitor, with plant.lcl the point of connection; 1 at its end",
+        "capacitor, with plant.lcl the point of connection; else 0.001 to 0.999, 1 being its end",
     )
     line: str | None = Field(
         None, description="in a network: name of the line, or of the converter whose line it is"

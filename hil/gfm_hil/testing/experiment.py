@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results import checks
+from gfm_hil.results.modes import acting, free_from
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps
 
@@ -74,11 +76,16 @@ class Experiment(Steps):
     def assert_damped(
         self, min_ratio: float, signal: str = "p", since: float | None = None
     ) -> None:
-        """The swing after the last step (below half the nominal frequency) has at least this
-        damping ratio, and no faster oscillation grows."""
+        """The swing after the last step and the end of its ramp (below half the nominal frequency)
+        has at least this damping ratio, and no faster oscillation grows."""
         __tracebackhide__ = True
         w = self._window(signal, since)
-        scenario = self.setting.scenario
+        scenario = self.result.scenario
+        first, ran = round(w.since / scenario.T_s), self.result.ticks
+        free = free_from(acting(scenario, self.result.columns, ran), first, ran) - first
+        if free >= len(w.x):
+            raise UserError("assert_damped: a ramp is not over at the end of the run")
+        w = replace(w, t=w.t[free:], x=w.x[free:])
         found = checks.damped(w, min_ratio, scenario.T_s, nominal_frequency(scenario))
         self._judge(w.name, "damped", found)
 

@@ -19,7 +19,7 @@ from gfm_hil.recording.columns import unit_of
 from gfm_hil.recording.run import RecordedRun, nominal_frequency
 from gfm_hil.results import checks
 from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
-from gfm_hil.results.modes import swing
+from gfm_hil.results.modes import acting, free_from, swing
 from gfm_hil.results.ripple import remaining_ripple
 from gfm_hil.scenario.events import GridFrequency, GridImpedance, PhaseJump
 from gfm_hil.scenario.expectation import reason_name
@@ -381,6 +381,10 @@ class _Judge:
 
     def _damped(self, c: Damped) -> Verdict:
         w = self._window("p")
+        acts = acting(self.run.scenario, self.run.columns, self.run.ticks)
+        self.first = free_from(acts, self.first, self.last)
+        if self.last - self.first < 2 * whole_ticks(self.width):
+            return self._cannot("what the event does to the grid is not over within the window")
         raw = replace(
             w,
             x=self._raw("p")[self.first : self.last],
