@@ -425,7 +425,7 @@ class ClosedLoop:
         return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
 
     def modes(self) -> list[Mode]:
-        """Modes of a single loop, the least damped (largest sigma) first."""
+        """Modes of a single loop, the slowest to decay (largest sigma) first."""
         upper = [Mode.of(s) for s in self.poles() if s.imag >= 0.0]
         return sorted(upper, key=lambda mode: -mode.sigma)
 

@@ -276,7 +276,7 @@ class NetworkLoop:
         return np.asarray(np.log(values[np.abs(values) > _GONE]) / self.T_s)
 
     def modes(self) -> list[NetworkMode]:
-        """The modes and the parts that take part in each, the least damped (largest sigma) first.
+        """The modes and the parts that take part in each, the largest sigma first.
 
         The eigenvectors of equal poles are not determined: such modes get the mean of their
         participations.
