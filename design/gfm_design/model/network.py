@@ -203,7 +203,7 @@ class NetworkLoop:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs: the references of each converter, as A.P_ref, and the grid."""
+        """Names of the inputs, the references of each converter as A.P_ref and the grid's."""
         return (*(f"{m.name}.{ref}" for m in self.members for ref in INPUTS[:NY]), *_D)
 
     def converter(self, name: str) -> ClosedLoop:

@@ -64,7 +64,7 @@ class Conformity:
 
     @cached_property
     def matrix(self) -> dict[tuple[str, str], Outcome]:
-        """The verdict by law and test: the worst of its parts."""
+        """The verdict by law and test, the worst of its parts."""
         return {
             (law, case.id): worst([found.verdict for found in self.of(law, case.id)])
             for law in self.laws
@@ -80,7 +80,7 @@ class Conformity:
 
     @property
     def failures(self) -> list[str]:
-        """One line for each part that does not pass: law, test, verdict and why."""
+        """One line for each part that does not pass, with law, test, verdict and why."""
         return [
             f"{f.law}, {'/'.join(x for x in (f.test, f.part) if x)}: {f.verdict}: {f.words}"
             for law in self.laws
