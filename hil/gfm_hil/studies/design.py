@@ -90,7 +90,7 @@ class Tuning:
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """The free gains that lie at a bound of theirs, and that bound: gamma may fall further
+        """The free gains that lie at one of their bounds, by that bound; gamma may fall further
         beyond it."""
         return {
             gain.name: bound
