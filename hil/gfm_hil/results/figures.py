@@ -191,9 +191,6 @@ _IN_A_PAGE: Any = {
     "svg.hashsalt": "gfmhil", "svg.fonttype": "none", "path.simplify_threshold": 0.4,
 }  # fmt: skip
 _PANEL = (4.6, 2.3)  # inches, of a panel in a page: its text is readable on a phone
-_SVG = "{http://www.w3.org/2000/svg}"
-ElementTree.register_namespace("", _SVG[1:-1])
-ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
 
 
 def panels(figure: Figure) -> list[str]:
@@ -216,12 +213,15 @@ def panels(figure: Figure) -> list[str]:
     with matplotlib.rc_context(_IN_A_PAGE):
         figure.savefig(whole, format="svg", metadata={"Date": None})
     root = ElementTree.fromstring(whole.getvalue())
-    shared = root.findall(f"{_SVG}defs")  # the paths that clip curves
+    for element in root.iter():  # a page knows SVG without namespaces
+        element.tag = element.tag.partition("}")[2]
+        element.attrib = {k.rpartition("}")[2]: v for k, v in element.attrib.items()}
+    shared = root.findall("defs")  # the paths that clip curves
     points, height = 72 / figure.dpi, 72 * figure.get_figheight()
     boxes = {a: a.get_tightbbox() for a in axes}
     found = []
     for k, (a, box) in enumerate(boxes.items()):
-        drawn = root.find(f".//{_SVG}g[@id='panel{k}']")
+        drawn = root.find(f".//g[@id='panel{k}']")
         assert drawn is not None and box is not None
         del drawn.attrib["id"]  # which would be there once a figure
         below = [b for b in boxes.values() if b is not None and abs(b.x0 - box.x0) < box.width / 2]
@@ -229,7 +229,7 @@ def panels(figure: Figure) -> list[str]:
         width = points * max(b.x1 for b in below) + 2 - left  # the same scale for a whole column
         top = height - points * box.y1 - 2
         view = f"{left:.1f} {top:.1f} {width:.1f} {points * box.height + 4:.1f}"
-        svg = ElementTree.Element(f"{_SVG}svg", {"viewBox": view, "role": "img"})
+        svg = ElementTree.Element("svg", {"viewBox": view, "role": "img"})
         svg.set("aria-label", a.get_title(loc="left"))
         svg.extend([*shared, drawn])
         found.append(ElementTree.tostring(svg, encoding="unicode"))
