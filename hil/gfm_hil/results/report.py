@@ -30,7 +30,7 @@ h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
 table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
 border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums}
 .scroll :is(th,td):not(:first-child){text-align:right}
-.scroll{overflow-x:auto;white-space:nowrap}
+.scroll{overflow-x:auto} .scroll th{white-space:nowrap}
 .panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,28rem),1fr));
 gap:1rem;align-items:end;margin:1.5rem 0} .panels svg{width:100%}
 .status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
