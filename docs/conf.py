@@ -18,6 +18,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "_ext.generated",
+    "_ext.thumbnails",
 ]
 exclude_patterns = ["_build", "_ext", "_figures", "examples", "tables"]
 

@@ -161,7 +161,7 @@ def overview() -> str:
             *(_mode_text(worst_mode(name, rig)) for rig in (False, True)),
         ])  # fmt: skip
     heads = ("law", "elements", "states", "errors", "grid")
-    return markdown([*heads, "least damped, ideal", "least damped, rig"], rows)
+    return markdown([*heads, "slowest swing, ideal", "slowest swing, rig"], rows)
 
 
 def _set_points(file: LawFile) -> str:

@@ -116,7 +116,7 @@ def switchover() -> None:
     with tempfile.TemporaryDirectory() as place:
         shown = {**one.signals, **window(one, 0.8, 4.0)}
         drawn = draw_run(Path(place), case, shown, {}, one.summary)
-        shutil.move(drawn[0], FIGURES / "switchover.png")
+        shutil.move(drawn[0].path, FIGURES / "switchover.png")
     s = one.summary
     mantissa, exponent = f"{s['bump_pu'][0]:.1e}".split("e")
     write_table(

@@ -337,11 +337,25 @@ def test_command_as_json(
     assert np.shape(out["region"]["sigma"]) == (3, 3)
 
 
-def test_unstable_loop_has_no_margins(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_names_the_least_damped_mode_by_its_ratio(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert command("--law", "vsg-2") == 0  # on pref_step, as bode, nyquist, poles and step
+    said = capsys.readouterr().out
+    assert "P_ref steps from 0.5 to 1 p.u." in said
+    assert "least damped: damping ratio 0.00148 at 1075 Hz" in said  # of filter and line
+
+
+def test_unstable_loop_has_no_margins(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert command("--law", "vsg-2", "--scenario", "rig_pref_step", "--json") == 3
     out = json.loads(capsys.readouterr().out)
     assert out["stable"] is False and "delay_us" not in out
     assert out["mode"]["frequency_hz"] == pytest.approx(49.5, abs=0.1)
+    figures = ("--figures", str(tmp_path / "none"))
+    assert command("--law", "vsg-2", "--scenario", "rig_pref_step", *figures) == 3
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "grows with sigma" in line and "--figures: there is none to draw" in line
+    assert not (tmp_path / "none").exists()
     # a regulated source holds v_dc, from which this law takes its frequency: an open integrator
     assert command("--law", "matching-1", "--scenario", "rig_pref_step") == 3
     assert "neither grows nor decays" in " ".join(capsys.readouterr().out.split())

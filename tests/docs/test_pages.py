@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import gfmhil
+import gfmhil.design
+import gfmhil.envelopes
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.norms.performance import PAPER_WEIGHTS
 from gfm_design.norms.weights import read_weights
@@ -58,6 +63,22 @@ def test_modes_of_the_example_law_are_looked_at_as_the_page_says(
     rates = [float(line.split()[0]) for line in capsys.readouterr().out.splitlines()]
     assert len(rates) == 4
     assert max(rates) < 0
+
+
+def test_no_property_of_the_api_begins_with_a_colon_sentence() -> None:
+    """Sphinx reads what stands before a colon of a property's first line as its type."""
+    rooms = (gfmhil, gfmhil.design, gfmhil.envelopes)
+    names = {getattr(room, name) for room in rooms for name in room.__all__ if name != "design"}
+    classes = {x for x in names if isinstance(x, type)}
+    said = {
+        f"{cls.__name__}.{name}": inspect.getdoc(member) or ""
+        for cls in classes
+        for name, member in inspect.getmembers(cls)
+        if isinstance(member, (property, cached_property)) and not name.startswith("_")
+    }
+    assert len(said) > 20
+    first = {name: re.sub(r"`.*?`", "", doc.partition("\n")[0]) for name, doc in said.items()}
+    assert [name for name, line in first.items() if ":" in line] == []
 
 
 def test_readme_names_pages_that_there_are() -> None:

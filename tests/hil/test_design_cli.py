@@ -73,6 +73,22 @@ def test_tune(capsys: Capture, tmp_path: Path) -> None:
     assert law_file(str(path)).parameters["k_22"].value == out["gains"]["k_22"]
 
 
+def test_tune_names_the_gain_at_its_bound(capsys: Capture) -> None:
+    options = ("--starts", "1", "--evaluations", "40", "--quiet")
+    assert main(["design", "tune", "--law", "vsg-5", *options]) == 0
+    assert "k_qp is at its bound 0.1" in capsys.readouterr().out
+    out = said(capsys, "tune", "--law", "vsg-5", *options)
+    assert out["at_bounds"] == {"k_qp": 0.1}
+
+
+def test_a_weight_that_is_largest_at_infinite_frequency_is_named(capsys: Capture) -> None:
+    assert main(["design", "gamma", "--law", "droop-5"]) == 0  # P_ref acts on omega_u at once
+    out = capsys.readouterr().out
+    assert "W_31 T_31 is largest at infinite frequency" in out and "inf\n" not in out
+    assert main(["design", "gamma", "--law", "vsg-2"]) == 0
+    assert "infinite" not in capsys.readouterr().out
+
+
 def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
     options = ("--starts", "1", "--evaluations", "320", "--quiet")
     out = said(capsys, "tune", "--law", "droop-1", *options, code=3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from matplotlib.figure import Figure
@@ -93,6 +94,24 @@ def test_a_network_at_a_finite_grid(make: Make) -> None:
     at = {text.get_text(): text.get_position()[0] for text in axes.texts}
     assert at["farm"] < at["town"] < at["grid, S 20, H 4 s\n$V_g$ 1 p.u., 50 Hz"]
     assert at["farm"] < at["bank\nQ 0.1 p.u."] and breakers(scenario) == [True, True]
+
+
+def test_a_part_that_the_diagram_does_not_know_is_a_box_with_its_name() -> None:
+    scenario = load_scenario("three_share_a_load")
+    assert scenario.network is not None
+    node = scenario.network.converters["A"].node
+    other = {
+        "reactors": {"shunt": SimpleNamespace(node=node)},
+        "cables": {"sea": SimpleNamespace(start=node, end="platform")},
+    }
+    network = scenario.network.model_copy(update=other)
+    axes = fill_diagram(Figure(), scenario.model_copy(update={"network": network}))
+    shown = [text.get_text() for text in axes.texts]
+    assert {"shunt\nreactors", "sea\ncables", "platform"} <= {*shown}
+    boxes = [p for p in axes.patches if isinstance(p, Rectangle) and p.get_width() == 0.7]
+    known = fill_diagram(Figure(), scenario).patches
+    assert len(boxes) == len([p for p in known if isinstance(p, Rectangle)
+                              and p.get_width() == 0.7]) + 2  # fmt: skip
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())

@@ -33,8 +33,8 @@ def test_a_run_of_any_length_is_drawn_without_a_warning(ticks, make, tmp_path):
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ResourceWarning)  # from another test
         pictures = draw_run(tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)})
-    assert [p.name for p in pictures] == ["signals.png"]
-    assert pictures[0].stat().st_size > 20_000
+    assert [p.path.name for p in pictures] == ["signals.png"]
+    assert pictures[0].path.stat().st_size > 20_000 and len(pictures[0].panels) == 6
 
 
 def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):

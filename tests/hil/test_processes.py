@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -119,9 +120,11 @@ def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
         late_policy={"hold": 1_000_000},
         link={"peer_timeout_s": 60.0},
     )
-    code, out, _ = end(start("run", scenario, "--out", "run", "--json"))
+    code, out, err = end(start("run", scenario, "--out", "run", "--json"))
     found = json.loads(out)
     assert code == 0, found
+    # when it ends, and how to end it before
+    assert re.search(r": 0\.3 s in real time, to about \d\d:\d\d:\d\d; Ctrl-C ends it …", err)
     assert (found["status"], found["mode"], found["ticks"]) == ("completed", "realtime", 3000)
     assert (tmp_path / "run" / "timing.png").stat().st_size > 10_000
     with np.load(tmp_path / "run" / "timing.npz") as file:

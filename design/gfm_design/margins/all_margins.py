@@ -50,7 +50,7 @@ class LoopMargins:
     """The margins of a loop at one operating point.
 
     Attributes:
-        worst: the mode that is damped least, its sigma the largest.
+        worst: the mode that is damped least, its damping ratio the smallest.
         u, y: each channel that the loop uses.
         disk_u, disk_y: all channels of u, of y at once.
         delay: additional delay of all of u; the scan ended at ``longest``, s.
@@ -92,12 +92,12 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     """
     if loop.T_s is None:
         raise ValueError("the margins are those of a sampled loop; sample it first")
-    mode = loop.modes()[0]
-    if mode.sigma > -_AT_REST:
-        raise UnstableLoop(mode)
+    modes = loop.modes()
+    if modes[0].sigma > -_AT_REST:
+        raise UnstableLoop(modes[0])
     at_u, at_y, delays = locus_at_u(loop), locus_at_y(loop), DelayMargins(loop)
     return LoopMargins(
-        mode,
+        min(modes, key=lambda mode: mode.ratio),
         _channels(delays, at_u, True),
         _channels(delays, at_y, False),
         disk_margin(at_u),

@@ -315,19 +315,19 @@ class ClosedLoop:
 
     @property
     def dc_control(self) -> bool:
-        """Whether i_u acts: the DC source does not regulate itself."""
+        """Whether i_u acts, since the DC source does not regulate itself."""
         return bool(self.plant.B[..., 0].any())
 
     # matrices
 
     @cached_property
     def controller(self) -> LinearLaw:
-        """What lies between the sensors and the bridge: the law, and the inner stage if any."""
+        """The law, and the inner stage if any, between the sensors and the bridge."""
         return self.law if self.stage is None else self.stage.around(self.law)
 
     @cached_property
     def held(self) -> LinearPlant:
-        """The plant as the law meets it: from tick to tick with its delay lines, or continuous."""
+        """The plant as the law meets it, from tick to tick with its delay lines or continuous."""
         T_s = self.T_s
         if T_s is None:
             return self.plant
@@ -394,7 +394,7 @@ class ClosedLoop:
 
     @cached_property
     def commands(self) -> tuple[int, ...]:
-        """Those of u that act: i_u does not where the DC source regulates itself."""
+        """Those of u that act; i_u does not where the DC source regulates itself."""
         c = self.controller
         acts = self.plant.B.any(axis=0) & (c.C.any(axis=1) | c.D.any(axis=1))
         return tuple(int(j) for j in np.flatnonzero(acts))
@@ -425,7 +425,7 @@ class ClosedLoop:
         return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
 
     def modes(self) -> list[Mode]:
-        """Modes of a single loop, the least damped (largest sigma) first."""
+        """Modes of a single loop, the slowest to decay (largest sigma) first."""
         upper = [Mode.of(s) for s in self.poles() if s.imag >= 0.0]
         return sorted(upper, key=lambda mode: -mode.sigma)
 

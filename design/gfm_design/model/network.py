@@ -203,7 +203,7 @@ class NetworkLoop:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs: the references of each converter, as A.P_ref, and the grid."""
+        """Names of the inputs, the references of each converter as A.P_ref and the grid's."""
         return (*(f"{m.name}.{ref}" for m in self.members for ref in INPUTS[:NY]), *_D)
 
     def converter(self, name: str) -> ClosedLoop:
@@ -276,7 +276,7 @@ class NetworkLoop:
         return np.asarray(np.log(values[np.abs(values) > _GONE]) / self.T_s)
 
     def modes(self) -> list[NetworkMode]:
-        """The modes and the parts that take part in each, the least damped (largest sigma) first.
+        """The modes and the parts that take part in each, the largest sigma first.
 
         The eigenvectors of equal poles are not determined: such modes get the mean of their
         participations.

@@ -33,7 +33,7 @@ _PATIENCE_S = 1.0  # how long the checks may go on without a word
 def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", help="campaign file, or the name of a shipped one")
     command.add_argument("-o", "--out", help="folder; runs/<campaign>-<time> by default")
-    command.add_argument("--resume", action="store_true", help="run what --out has not got yet")
+    command.add_argument("--resume", action="store_true", help="run only what is missing in --out")
     command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
     command.add_argument("--dask", metavar="ADDRESS", help="run on a cluster, e.g. tcp://host:8786")
     command.add_argument("--x", metavar="PATH", help="drawn path of the figure, or a sum a+b")

@@ -14,7 +14,7 @@ from gfm_hil.results.doctor import examine, worst
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    command.description = "Judge this machine for real time; it only looks, for about a second."
+    command.description = "Judge this machine for real time, in about a second; it changes nothing."
     command.add_argument("--json", action="store_true", help="all facts and findings as JSON")
     command.add_argument("--strict", action="store_true", help="exit code 3 if a line is red")
 

@@ -30,7 +30,7 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--anyone-may-command", action="store_true",
-        help="listen without TLS where whoever reaches the port can command the bench",
+        help="listen without TLS: every client that reaches the port can command the bench",
     )  # fmt: skip
     command.add_argument(
         "--heartbeat", type=int, default=5000, metavar="MS",

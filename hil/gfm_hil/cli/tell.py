@@ -15,7 +15,7 @@ from gfm_runtime.signals import REF_NAMES
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    command.description = "Without anything to tell: the newest tick as JSON."
+    command.description = "Without a command it prints the newest tick as JSON."
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument(
         "references", nargs="*", metavar="NAME=VALUE", help=f"one of {', '.join(REF_NAMES)}, p.u."

@@ -156,7 +156,11 @@ class Processes:
                 " than with one for each"
             )
         which = f"{loops - 1} controllers" if loops > 2 else "controller"
-        self.notice(f"starting {which} and plant …")
+        lasts = ""
+        if self.scenario.mode == "realtime":
+            end = time.strftime("%H:%M:%S", time.localtime(time.time() + self.scenario.duration))
+            lasts = f": {self.scenario.duration:g} s in real time, to about {end}; Ctrl-C ends it"
+        self.notice(f"starting {which} and plant{lasts} …")
 
     def _ours(self, role: Role, folder: Path) -> list[str]:
         """The command of a role of ours without its endpoints."""

@@ -290,6 +290,11 @@ def unit_of(name: str) -> str:
     return row.unit.partition(" (")[0]
 
 
+def printed(name: str) -> str:
+    """A signal's name as people write it: f for ``f_hz``, ω_u for ``omega_u``, δ for ``delta``."""
+    return "f" if name == HERTZ else name.replace("omega", "ω").replace("delta", "δ")
+
+
 def named(
     role: Role, signals: NDArray[Any], times: NDArray[Any] | None = None
 ) -> dict[str, NDArray[Any]]:

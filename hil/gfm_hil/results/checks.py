@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import unit_of
+from gfm_hil.recording.columns import printed, unit_of
 from gfm_hil.results.modes import fast_mode, swing
 
 Vector = NDArray[np.float64]
@@ -41,6 +41,11 @@ class Window:
     def show(self, value: float) -> str:
         """A value with its unit."""
         return f"{value:.4g} {unit_of(self.name)}".rstrip()
+
+    @property
+    def symbol(self) -> str:
+        """The signal's name in a message."""
+        return printed(self.name)
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,7 @@ def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | 
     ending = w.x[-max(1, round(_TAIL * len(w.x))) :]
     how = "it had not at the end of the run" if took is None else f"it took {took:.4g} s"
     text = (
-        f"{w.name} should settle at {w.show(to)} ± {tolerance:g} within {within:g} s, but {how}: "
+        f"{w.symbol} should settle at {w.show(to)} ± {tolerance:g} within {within:g} s, but {how}: "
         f"after these {within:g} s it was as far off as {w.show(w.x[worst])} "
         f"(at t = {w.t[worst]:.4f} s); the end of the run lies in "
         f"[{ending.min():.4g}, {ending.max():.4g}]."
@@ -112,7 +117,7 @@ def overshoot(w: Window, percent: float, to: float | None) -> Finding | None:
     limit = np.full(len(w.t), final + percent / 100 * step)
     none = np.full(len(w.t), np.nan)
     text = (
-        f"{w.name} should overshoot its step from {w.before:.4g} to {w.show(final)} by at most "
+        f"{w.symbol} should overshoot its step from {w.before:.4g} to {w.show(final)} by at most "
         f"{percent:g} %, but it went to {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, "
         f"{beyond[worst]:.3g} %."
     )
@@ -143,7 +148,7 @@ def envelope(w: Window, low: Vector, high: Vector, longest: float = 0.0) -> Find
     first, worst = int(np.flatnonzero(beyond)[0]), int(np.argmax(beyond))
     side, limit = ("below", low) if w.x[worst] < low[worst] else ("above", high)
     text = (
-        f"{w.name} should stay within its envelope, but it left it at t = {w.t[first]:.4f} s and "
+        f"{w.symbol} should stay within its envelope, but it left it at t = {w.t[first]:.4f} s and "
         f"was {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, {beyond[worst]:.3g} {side} the limit "
         f"of {limit[worst]:.4g}."
     )
@@ -165,7 +170,7 @@ def damped(w: Window, min_ratio: float, T_s: float, f_n: float) -> Finding | Non
         return None
     none = np.full(len(w.t), np.nan)
     text = (
-        f"{w.name} should be damped with a ratio of at least {min_ratio:g}, but its strongest "
+        f"{w.symbol} should be damped with a ratio of at least {min_ratio:g}, but its strongest "
         f"oscillation after the step, at {f:.3g} Hz, has {ratio:.3g}"
         + (": it grows." if ratio < 0 else ".")
     )

@@ -25,7 +25,11 @@ from gfm_plant import Plant, load_converter
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
 _ROW = 1.75
-_Side = Literal["load", "bank", "machine", "grid"]
+_Side = Literal["load", "bank", "machine", "grid", "box"]
+#: the tables of a network whose parts have a symbol; one of another table is a box with its name
+_DRAWN = {
+    "converters", "lines", "transformers", "loads", "constant_power", "machines", "capacitors"
+}  # fmt: skip
 
 
 @dataclass
@@ -80,10 +84,13 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
     for name, (row, start, end, text, closed) in lines.items():
         (left, right), y = sorted((_at(bars[start]), _at(bars[end]))), -_ROW * row
         _wire(axes, (left, y), (right, y))
-        if scenario.network is not None and name in scenario.network.transformers:
+        network = scenario.network
+        if network is not None and name in network.transformers:
             _windings(axes, (left + right) / 2, y)
-        else:
+        elif network is not None and name in network.lines:
             _inductor(axes, (left + right) / 2 - 0.4, y)
+        else:
+            _box(axes, (left + right) / 2 - 0.35, y)
         _breaker(axes, left + 0.5, y, closed)
         axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
         spots[name] = (y, left, right) if _at(bars[start]) == left else (y, right, left)
@@ -130,6 +137,16 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
             text = f"S {one.S:g}, X {one.X:.3g}, R {one.R:.2g}"
             text += "" if one.X_m is None else f", $X_m$ {one.X_m:g}"
             lines[name] = 0, one.start, one.end, text, one.closed
+        others = {
+            name: (f"{name}\n{kind}", one)
+            for kind, parts in network
+            if kind not in _DRAWN and isinstance(parts, dict)
+            for name, one in parts.items()
+        }
+        for name, (text, other) in others.items():
+            if hasattr(other, "start") and hasattr(other, "end"):
+                kind = text.partition("\n")[2]  # its name is written above
+                lines[name] = 0, other.start, other.end, kind, getattr(other, "closed", True)
         for _, start, end, *_ in lines.values():
             for node in (start, end):
                 bars.setdefault(node, _Bar())
@@ -145,6 +162,10 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
         for name, bank in network.capacitors.items():
             text = f"{name}\nQ {bank.Q:g} p.u."
             bars.setdefault(bank.node, _Bar()).right.append(("bank", text, True))
+        for text, other in others.values():
+            if hasattr(other, "node"):
+                closed = getattr(other, "closed", True)
+                bars.setdefault(other.node, _Bar()).right.append(("box", text, closed))
     if at_grid is not None:
         kind = "ideal" if grid.finite is None else f"S {grid.finite.S:g}, H {grid.finite.H:g} s"
         f_g = grid.omega_g * nominal_frequency(scenario)
@@ -220,6 +241,11 @@ def _capacitor(axes: Axes, x: float, y: float) -> None:
         _wire(axes, (x - half, y - 0.6 - 0.06 * k), (x + half, y - 0.6 - 0.06 * k))
 
 
+def _box(axes: Axes, x: float, y: float) -> None:
+    """A part without a symbol, 0.7 wide, in place of the wire below it."""
+    axes.add_patch(Rectangle((x, y - 0.25), 0.7, 0.5, fc="white", ec=_INK, lw=1.2, zorder=3))
+
+
 def _breaker(axes: Axes, x: float, y: float, closed: bool) -> None:
     """A square, filled while it is closed, as IEEE Std 315 has breakers of single-line diagrams."""
     axes.add_patch(
@@ -264,7 +290,8 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
 
 
 def _hang(axes: Axes, x: float, y: float, kind: _Side, text: str, closed: bool) -> None:
-    """What hangs on the right of a bar: a load, a bank of capacitors, a machine or the grid."""
+    """What hangs on the right of a bar: a load, a bank of capacitors, a machine, the grid, or what
+    has no symbol."""
     _wire(axes, (x, y), (x + 1.2, y))
     if kind == "bank":
         _capacitor(axes, x + 1.2, y)
@@ -273,6 +300,8 @@ def _hang(axes: Axes, x: float, y: float, kind: _Side, text: str, closed: bool) 
     if kind == "load":
         style = {"arrowstyle": "-|>", "color": _INK, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", (x + 1.2, y - 0.55), (x + 1.2, y), arrowprops=style)
+    if kind == "box":
+        _box(axes, x + 1.2, y)
     if kind in ("grid", "machine"):
         axes.add_patch(Circle((x + 1.5, y), 0.3, fc="white", ec=_INK, lw=1.2))
         sign, size = ("~", 13) if kind == "grid" else ("SM", 8)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -124,10 +127,13 @@ def _mark(
         a.add_collection(lines, autolim=False)
         a.update_datalim([(e["t"], 0) for e in events], updatey=False)
         a.autoscale_view(scaley=False)
+    first, last = axes[0].get_xlim()
     for k, event in enumerate(events[:: -(-len(events) // _LABELS)]):
+        late = event["t"] > first + 0.6 * (last - first)  # its label would be cut at the right
         axes[0].annotate(
-            event["label"], (event["t"], 1.0), (3, above + 10 * (k % 3)),
+            event["label"], (event["t"], 1.0), (-3 if late else 3, above + 10 * (k % 3)),
             xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
+            ha="right" if late else "left",
             color="#444444" if colour == _GREY else colour,
         )  # fmt: skip
 
@@ -169,8 +175,71 @@ def _legend(axes: Axes, columns: int) -> None:
     for a free place among many points."""
     axes.legend(
         fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), borderpad=0.2,
-        borderaxespad=0, ncols=columns,
+        borderaxespad=0, ncols=columns, handlelength=1.6, columnspacing=1.2, handletextpad=0.5,
     )  # fmt: skip
+
+
+class Picture(NamedTuple):
+    """A figure in a file, and its panels for a page, see ``panels``."""
+
+    path: Path
+    panels: list[str]
+
+
+# the same bytes for the same run; text as text; curves without steps that no eye sees
+_IN_A_PAGE: Any = {
+    "svg.hashsalt": "gfmhil", "svg.fonttype": "none", "path.simplify_threshold": 0.4,
+}  # fmt: skip
+_PANEL = (4.6, 2.3)  # inches, of a panel in a page: its text is readable on a phone
+
+
+def panels(figure: Figure) -> list[str]:
+    """The panels of a figure as SVG elements, which a page sets side by side or in one column.
+
+    Each has its own axis of time; titles of the whole figure are left to the page. Sizes of the
+    figure are changed.
+    """
+    axes = figure.axes
+    grid = axes[0].get_gridspec()
+    assert grid is not None
+    figure.set_size_inches(_PANEL[0] * grid.ncols, _PANEL[1] * grid.nrows)
+    figure.suptitle("")
+    for k, a in enumerate(axes):
+        a.set_gid(f"panel{k}")
+        if a.get_shared_x_axes().joined(a, axes[-1]):
+            a.tick_params(labelbottom=True)
+            a.set_xlabel(axes[-1].get_xlabel(), fontsize=9)
+    whole = io.BytesIO()
+    with matplotlib.rc_context(_IN_A_PAGE):
+        figure.savefig(whole, format="svg", metadata={"Date": None})
+    root = ElementTree.fromstring(whole.getvalue())
+    for element in root.iter():  # a page knows SVG without namespaces
+        element.tag = element.tag.partition("}")[2]
+        element.attrib = {k.rpartition("}")[2]: v for k, v in element.attrib.items()}
+    shared = root.findall("defs")  # the paths that clip curves
+    points, height = 72 / figure.dpi, 72 * figure.get_figheight()
+    boxes = {a: a.get_tightbbox() for a in axes}
+    found = []
+    for k, (a, box) in enumerate(boxes.items()):
+        drawn = root.find(f".//g[@id='panel{k}']")
+        assert drawn is not None and box is not None
+        del drawn.attrib["id"]  # which would be there once a figure
+        below = [b for b in boxes.values() if b is not None and abs(b.x0 - box.x0) < box.width / 2]
+        left = points * min(b.x0 for b in below) - 2
+        width = points * max(b.x1 for b in below) + 2 - left  # the same scale for a whole column
+        top = height - points * box.y1 - 2
+        view = f"{left:.1f} {top:.1f} {width:.1f} {points * box.height + 4:.1f}"
+        svg = ElementTree.Element("svg", {"viewBox": view, "role": "img"})
+        svg.set("aria-label", a.get_title(loc="left"))
+        svg.extend([*shared, drawn])
+        found.append(ElementTree.tostring(svg, encoding="unicode"))
+    return found
+
+
+def headline(figure: Figure, text: str, size: float = 11) -> None:
+    """The title of a whole figure, in as many lines as it needs."""
+    letters = int(figure.get_figwidth() * 72 / (0.58 * size))  # mean width of a letter
+    figure.suptitle(textwrap.fill(text, letters), fontsize=size, x=0.01, ha="left")
 
 
 def _panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
@@ -201,7 +270,7 @@ def draw_run(
     signals: Columns,
     timing: Columns,
     summary: dict[str, Any],
-) -> list[Path]:
+) -> list[Picture]:
     """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png."""
     pictures = []
     if "true_p" in signals:
@@ -209,13 +278,13 @@ def draw_run(
         path = folder / "signals.png"
         draw_signals(figure, scenario, signals, summary)
         _save(figure, path)
-        pictures.append(path)
+        pictures.append(Picture(path, panels(figure)))
     if signals.keys() >= {*NEEDS}:
         figure = Figure(figsize=SIZE_WAVES, layout="constrained")
         if draw_waveforms(figure, scenario, signals, summary):
             path = folder / "waveforms.png"
             _save_small(figure, path)
-            pictures.append(path)
+            pictures.append(Picture(path, panels(figure)))
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
         pictures.append(draw_timing(folder, scenario, timing, summary))
     return pictures
@@ -273,8 +342,7 @@ def _mark_run(
         if first <= x["t"] <= last
     ]
     _mark(axes, trips, COLOURS[1], above=20 + 10 * min(3, len(events)))
-    title = f"{scenario.title} — {controlled_by(summary)}"
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    headline(figure, f"{scenario.title} — {controlled_by(summary)}")
 
 
 def draw_waveforms(
@@ -303,12 +371,12 @@ def draw_waveforms(
     if not len(t):
         return []
     axes = _panels(figure, 3, 1)
-    V, A = (f"1 p.u. = {np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
+    V, A = (f"{np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
     for a, name, title in zip(
         axes,
         ("v", "i", "i_o"),
-        (f"voltages of the filter capacitor v_abc [p.u.], {V} V",
-         f"currents of the bridge i_abc [p.u.], {A} A", "currents of the line i_o,abc [p.u.]"),
+        (f"capacitor voltages [p.u. of {V} V]", f"bridge currents [p.u. of {A} A]",
+         "line currents [p.u.]"),
         strict=True,
     ):  # fmt: skip
         curves = [
@@ -326,7 +394,9 @@ def draw_waveforms(
     return axes
 
 
-def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict[str, Any]) -> Path:
+def draw_timing(
+    folder: Path, scenario: Scenario, timing: Columns, summary: dict[str, Any]
+) -> Picture:
     """Draw into timing.png how long the round trips took, and when the plant had no fresh u."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -353,7 +423,7 @@ def draw_timing(folder: Path, scenario: Scenario, timing: Columns, summary: dict
     right.set_xlabel("t [s]", fontsize=9)
     path = folder / "timing.png"
     _save(figure, path)
-    return path
+    return Picture(path, panels(figure))
 
 
 def draw_laws(
@@ -385,7 +455,7 @@ def draw_laws(
                 a.plot(t[len(t) - 1 :], x[len(t) - 1 :] * factor, "x", color=colour)
     _legend(axes[0], min(4, len(runs)))
     _mark(axes, events)
-    figure.suptitle(scenario.title, fontsize=11, x=0.01, ha="left")
+    headline(figure, scenario.title)
     return axes
 
 

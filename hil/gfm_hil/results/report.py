@@ -6,26 +6,37 @@ import base64
 import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.summary import END_METRICS
 from gfm_hil.scenario.model import Scenario
 
+if TYPE_CHECKING:
+    from gfm_hil.results.figures import Picture
+
 #: of every page that this program writes
 STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}
+:root{color-scheme:light dark;--ink:#222;--paper:#fff;--line:#e4e4e4;--soft:#f6f6f6;--wrong:#b34500}
+@media (prefers-color-scheme:dark){
+:root{--ink:#ddd;--paper:#1a1a1a;--line:#3a3a3a;--soft:#262626;--wrong:#ff9d66}
+a{color:#8ab4f8} svg,img{filter:invert(.9) hue-rotate(180deg)}}
+body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;
+color:var(--ink);background:var(--paper);overflow-wrap:break-word}
 h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
 table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
-border-bottom:1px solid #e4e4e4;font-variant-numeric:tabular-nums}
+border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums}
 .scroll :is(th,td):not(:first-child){text-align:right}
-img{max-width:100%} .scroll{overflow-x:auto;white-space:nowrap}
+.scroll{overflow-x:auto} .scroll th{white-space:nowrap}
+.panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,28rem),1fr));
+gap:1rem;align-items:end;margin:1.5rem 0} .panels svg{width:100%}
 .status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
 .completed,.expected{background:#00734f} .oscillating,.tripped,.safe{background:#b34500}
-.unmet{color:#b34500}
-pre{background:#f6f6f6;padding:1rem;overflow-x:auto;font-size:13px}
+.unmet{color:var(--wrong)}
+pre{background:var(--soft);padding:1rem;overflow-x:auto;font-size:13px}
 """
 
 EVENT_COLUMNS = (
@@ -119,16 +130,15 @@ def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str
 
 
 def write_report(
-    folder: Path, scenario: Scenario, summary: dict[str, Any], pictures: Sequence[Path]
+    folder: Path,
+    scenario: Scenario,
+    summary: dict[str, Any],
+    pictures: Sequence[Picture],
+    diagram: Path,
 ) -> Path:
     """Write report.html into the run folder; returns its path."""
     status = html.escape(summary["status"])
     look, expected = ("expected", ", as expected:") if as_expected(summary) else (status, "")
-    columns = event_rows(summary["events"])
-    events = html_table(
-        [title for _, title in columns],
-        [[cell(event.get(name)) for name, _ in columns] for event in summary["events"]],
-    )
     facts = [
         ("controlled by", controlled_by(summary)),
         *([("inner stage", inner_stages(summary))] if staged(summary) else []),
@@ -147,17 +157,23 @@ def write_report(
     if "instructions" in summary:
         counts = ", ".join(f"{k} {v}" for k, v in summary["instructions"].items())
         facts.append(("instructions of a step", counts))
-    facts.append(("date, version", f"{summary['date']}, gfmhil {summary['version']}"))
+    date = datetime.fromisoformat(summary["date"]).strftime("%Y-%m-%d %H:%M:%S UTC")
+    facts.append(("date, version", f"{date}, gfmhil {summary['version']}"))
     for machine, found in summary["machines"].items():
         judged = f", doctor: {found['worst']} ({'; '.join(found['findings'])})" if found else ""
         facts.append(("machine", machine + judged))
     if any(summary["faults"].values()):
-        facts.append(("frames refused or lost", str(summary["faults"])))
+        missing = (
+            f"{role}: {', '.join(f'{number} {name}' for name, number in counted.items()) or 'none'}"
+            for role, counted in summary["faults"].items()
+        )
+        facts.append(("frames refused or lost", "; ".join(missing)))
     if summary["e2e"]:
         states = ", ".join(f"{role} {state}" for role, state in summary["e2e"].items())
         facts.append(("end-to-end protection", states))
     rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
-    images = "".join(f'<img alt="{p.stem}" src="{inline(p)}">' for p in pictures)
+    images = "".join(figure(picture.path.stem, picture.panels) for picture in pictures)
+    images += f'<p class="scroll"><img alt="network" src="{inline(diagram)}"></p>'
     unmet = "".join(
         f'<p class="unmet">not as expected: {html.escape(part)}</p>' for part in summary["unmet"]
     )
@@ -174,11 +190,25 @@ def write_report(
 <p>{html.escape(scenario.description)}</p>
 <table>{rows}</table>
 {images}
-<h2>Events</h2>{events}
+<h2>Events</h2>{_events(summary["events"])}
 <h2>Scenario as resolved</h2><pre>{resolved}</pre></html>
 """,
     )
     return path
+
+
+def _events(events: Sequence[dict[str, Any]]) -> str:
+    """What each event brought: a column each, or a row each if there are many."""
+    columns = event_rows(events)
+    rows = [[title, *(cell(event.get(name)) for event in events)] for name, title in columns]
+    if len(events) > len(columns):
+        rows = [list(row) for row in zip(*rows, strict=True)]
+    return html_table(rows[0], rows[1:]) if rows else "<p>None.</p>"
+
+
+def figure(name: str, panels: Sequence[str]) -> str:
+    """A figure of which a page sets as many panels side by side as are readable there."""
+    return f'<figure class="panels" aria-label="{html.escape(name)}">{"".join(panels)}</figure>'
 
 
 def inline(picture: Path) -> str:

@@ -143,8 +143,8 @@ class Run(RecordedRun):
             lines = "".join(json.dumps(event) + "\n" for event in self.events)
             write_text(folder / "events.jsonl", lines)
             pictures = draw_run(folder, self.scenario, arrays, {}, self.summary)
-            pictures.append(draw_diagram(folder, self.scenario))
-            write_report(folder, self.scenario, self.summary, pictures)
+            diagram = draw_diagram(folder, self.scenario)
+            write_report(folder, self.scenario, self.summary, pictures, diagram)
             write_text(folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None

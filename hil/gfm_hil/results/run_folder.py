@@ -298,8 +298,7 @@ def _conclude(run: Run, figures: bool) -> None:
         from gfm_hil.results.report import write_report
 
         pictures = draw_run(folder, scenario, run.columns, run.timing, summary)
-        pictures.append(draw_diagram(folder, scenario))
-        write_report(folder, scenario, summary, pictures)
+        write_report(folder, scenario, summary, pictures, draw_diagram(folder, scenario))
     sync_folder(folder)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     sync_folder(folder)

@@ -209,7 +209,7 @@ def _trips(
 def clock_drift(timing: Columns, T_s: float) -> float | None:
     """How fast the plant's clock runs against the controller's, ppm; None if that is unknown.
 
-    The slope of the earliest arrivals: what is late was late on the way, the earliest was not.
+    The slope of the earliest arrivals, which the link did not delay.
     """
     received = timing.get("controller_received")
     if received is None:

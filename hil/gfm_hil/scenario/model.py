@@ -299,7 +299,7 @@ class Scenario(_Model):
 
     @property
     def survives_trips(self) -> bool:
-        """Whether plant and controllers go on after a trip: they wait for a reset, or there may be
+        """Whether plant and controllers go on after a trip; they wait for a reset, or there may be
         other converters."""
         return self.after_trip == "wait" or self.network is not None
 
@@ -366,7 +366,7 @@ class Scenario(_Model):
 
     @cached_property
     def has_inner(self) -> bool:
-        """Whether a law of the run has an inner stage: frames and recording then carry its
+        """Whether a law of the run has an inner stage; frames and recording then carry its
         signals."""
         each = [self.of(name) for name in self.converters] or [self]
         return any(

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 Weights = str | Path | Sequence[Weight] | None
 
+_AT = 1e-4  # relative: a gain this close to its bound is at it
+
 
 @dataclass(frozen=True)
 class Gamma:
@@ -85,6 +87,17 @@ class Tuning:
     seconds: float
     seed: int
     problem: PaperProblem
+
+    @property
+    def at_bounds(self) -> dict[str, float]:
+        """The free gains that lie at one of their bounds, by that bound; gamma may fall further
+        beyond it."""
+        return {
+            gain.name: bound
+            for gain in self.problem.gains
+            for bound in (gain.low, gain.high)
+            if abs(self.gains[gain.name] - bound) <= _AT * (abs(bound) or gain.high - gain.low)
+        }
 
     def bound(self) -> FullOrder | None:
         """A gamma below which no controller of any order comes; None if the solver found none.

@@ -111,7 +111,7 @@ class Identification:
 
     @cached_property
     def deviation(self) -> Vector | None:
-        """Of Y from the model: Frobenius norm of the difference over that of the model, (K,)."""
+        """Frobenius norm of Y minus the model over that of the model, shape (K,)."""
         if self.model is None:
             return None
         norm = np.linalg.norm(self.model, axis=(1, 2))
@@ -119,7 +119,7 @@ class Identification:
 
     @property
     def passivity(self) -> Vector:
-        """The least eigenvalue of Y + Y^H, p.u., shape (K,): negative where Y is not passive."""
+        """The least eigenvalue of Y + Y^H, p.u., shape (K,), negative where Y is not passive."""
         return passivity(self.Y)
 
     def grid(self, scr: float, x_over_r: float) -> Response:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.results.figures import COLOURS, dress
+from gfm_hil.results.figures import COLOURS, dress, headline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,9 +79,10 @@ def draw_nfp(of: Identification, figure: Figure | None = None) -> list[Axes]:
         from matplotlib import pyplot
 
         figure = pyplot.figure(figsize=(7.6, 5.6), layout="constrained")
+        headline(figure, f"{of.name}: network frequency perturbation", 9.5)
     gain, phase = figure.subplots(2, 1, sharex=True)
     _bode(gain, phase, of.frequency, of.nfp, of.nfp_model)
-    dress(gain, f"{of.name}: network frequency perturbation, |Δp / Δω_g| [p.u./p.u.]")
+    dress(gain, "|Δp / Δω_g| [p.u./p.u.]")
     dress(phase, "phase [°]")
     gain.legend(fontsize=8, frameon=False)
     phase.set_xlabel("frequency of the perturbation [Hz]", fontsize=9.5)

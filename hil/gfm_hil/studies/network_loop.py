@@ -81,7 +81,7 @@ class NetworkLoop(_NetworkLoop):
         return axes
 
     def participations(self, most: int = _SHOWN) -> Axes:
-        """Draw who takes part in the modes, the least damped ones first: a bar for each, with the
+        """Draw who takes part in the modes, the slowest to decay first: a bar for each, with the
         participations of ``modes()``.
 
         Args:

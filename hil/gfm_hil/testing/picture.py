@@ -80,7 +80,7 @@ def draw(
 
 def draw_times(path: Path, run: Run, scenario: Scenario) -> None:
     """Draw when a run in real time was late, as in its report."""
-    draw_timing(path.parent, scenario, run.timing, run.summary).rename(path)
+    draw_timing(path.parent, scenario, run.timing, run.summary).path.rename(path)
 
 
 def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:

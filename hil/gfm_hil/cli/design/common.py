@@ -154,11 +154,24 @@ def singular_is_users(
     return checked
 
 
+#: what a channel leads from and to, by its j and i
+_W = {1: "P_ref", 2: "ω_g"}
+_Z = {1: "P_ref − p", 2: "p", 3: "ω_u", 4: "q + V/D_q"}
+
+
 def print_channels(name: str, channels: Sequence[Channel]) -> None:
     """gamma and its channels as a table."""
     table = Table("channel", "‖W T‖∞", "at \\[rad/s]", box=None, pad_edge=False, title=None)
     for c in channels:
-        table.add_row(f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", cell(c.omega))
+        at = "∞" if np.isinf(c.omega) else cell(c.omega)
+        table.add_row(f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", at)
     console = terminal(highlight=False)
     console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}")
     console.print(table)
+    for c in channels:
+        if np.isinf(c.omega):
+            console.print(
+                f"W_{c.i}{c.j} T_{c.i}{c.j} is largest at infinite frequency: {_W[c.j]} acts on "
+                f"{_Z[c.i]} at once, and W_{c.i}{c.j} does not fall there",
+                soft_wrap=True,
+            )

@@ -79,7 +79,8 @@ def call(options: argparse.Namespace) -> int:
     try:
         content, table = options.find(loop, options)
     except UnstableLoop as problem:
-        return no_margins(label, scenario.title, problem, options.json)
+        drawn = f"figure: {options.out}" if options.out else ""
+        return no_margins(label, scenario.title, problem, options.json, drawn)
     if options.json:
         print(json.dumps({"law": label, "scenario": scenario.title} | content, indent=2))
     else:

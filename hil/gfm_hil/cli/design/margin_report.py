@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gfm_design.margins.all_margins import ChannelMargins, LoopMargins, Margins, UnstableLoop
@@ -49,14 +50,17 @@ def margins_as_json(
     return dict(finite(out))
 
 
-def no_margins(law: str, scenario: str, problem: UnstableLoop, as_json: bool) -> int:
-    """Say that an unstable loop has none; returns the exit code."""
+def no_margins(
+    law: str, scenario: str, problem: UnstableLoop, as_json: bool, figures: str = ""
+) -> int:
+    """Say that an unstable loop has none, and what became of the figures; returns the exit code."""
     if as_json:
         found = {"law": law, "scenario": scenario, "stable": False}
         found |= {"mode": problem.mode.plain(), "reason": str(problem)}
         print(json.dumps(found, indent=2))
     else:
-        terminal(highlight=False).print(f"{law}: no margins, {problem}")
+        said = f"{law}: no margins, {problem}" + (f"; {figures}" if figures else "")
+        terminal(highlight=False).print(escape(said), soft_wrap=True)
     return EXIT_OTHERWISE
 
 
@@ -109,7 +113,8 @@ def print_margins(
     """Everything on a terminal; arguments as for ``margins_as_json``."""
     console.print(
         f"[bold]{law}[/] · {scenario}\n"
-        f"least damped: sigma = {loop.worst.sigma:.4g} 1/s at {loop.worst.frequency_hz:.4g} Hz"
+        f"least damped: damping ratio {loop.worst.ratio:.3g} at {loop.worst.frequency_hz:.4g} Hz, "
+        f"sigma = {loop.worst.sigma:.4g} 1/s"
     )
     delay = (
         f"more than {1e6 * loop.longest:g} µs"

@@ -30,8 +30,11 @@ def add(kinds: Any) -> None:
     command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
     add_inner_option(command)
     add_converter_option(command)
-    where = command.add_mutually_exclusive_group(required=True)
-    where.add_argument("--scenario", help="scenario file, or the name of a shipped one")
+    where = command.add_mutually_exclusive_group()
+    where.add_argument(
+        "--scenario", default="pref_step",
+        help="scenario file or shipped name: plant, references, T_s; pref_step by default",
+    )  # fmt: skip
     where.add_argument("--run", type=Path, metavar="DIR", help="run folder: its scenario and delay")
     command.add_argument(
         "--figures", type=Path, metavar="DIR", help="draw region.png and delay.png into DIR"
@@ -54,7 +57,8 @@ def call(options: argparse.Namespace) -> int:
         ranges = margins(loop) if scenario.network is None else None
         found = loop.margins() if ranges is None else ranges.loop
     except UnstableLoop as problem:
-        return no_margins(label, scenario.title, problem, options.json)
+        none = "--figures: there is none to draw" if options.figures else ""
+        return no_margins(label, scenario.title, problem, options.json, none)
     margin = found.delay.seconds
     set_s = float(loop.u_delay[0])
     measured = None if run is None else loop_delay(run, set_s, margin)

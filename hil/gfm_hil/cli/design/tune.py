@@ -78,6 +78,7 @@ def call(options: argparse.Namespace) -> int:
         **channels_as_json(channels),
         "gamma_full_order": None,
         "gains": named,
+        "at_bounds": found.at_bounds,
         "seconds": found.seconds,
         "evaluations": found.evaluations,
         "seed": found.seed,
@@ -94,6 +95,7 @@ def call(options: argparse.Namespace) -> int:
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
         + (f"; law file: {options.out}" if options.out else ""),
+        *(f"{n} is at its bound {x:g}: γ may fall beyond it" for n, x in found.at_bounds.items()),
         said,
     ]
     terminal(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))

@@ -9,6 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
@@ -31,6 +32,9 @@ from gfm_hil.studies.envelopes import measure_unit
 from gfm_hil.studies.identification import identify
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
+
+if TYPE_CHECKING:
+    from gfm_hil.results.figures import Picture
 
 _POLL_S = 0.2
 
@@ -106,7 +110,7 @@ class Found:
         status, reason: how the run ended; ``none`` if it did not take place.
         verdicts: one a clause and time.
         again: the command that repeats the run; empty if no scenario was written.
-        figure: file, or None.
+        figure: if one was drawn.
     """
 
     law: str
@@ -116,7 +120,7 @@ class Found:
     reason: str
     verdicts: list[Verdict]
     again: str = ""
-    figure: Path | None = None
+    figure: Picture | None = None
 
     @property
     def verdict(self) -> Outcome:
@@ -302,8 +306,7 @@ def run_part(job: Job) -> Found:
             if job.figures and run.ticks:
                 from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
 
-                figure = place / "figure.png"
-                draw_part(figure, _title(job, scenario), run, verdicts)
+                figure = draw_part(place / "figure.png", _title(job, scenario), run, verdicts)
         reason = str(run.summary["reason"])
         return Found(*names, run.status, reason, verdicts, again, figure)
 
@@ -345,8 +348,7 @@ def _plot(job: Job, asked: Nfp) -> Found:
         if job.figures:
             from gfm_hil.studies.conformity.figure import draw_plot
 
-            figure = place / "figure.png"
-            draw_plot(figure, _title(job, scenario), found, asked)
+            figure = draw_plot(place / "figure.png", _title(job, scenario), found, asked)
     verdicts = judge_nfp(found.frequency, found.nfp, asked)
     return Found(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
 

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.columns import unit_of
+from gfm_hil.recording.columns import printed, unit_of
 from gfm_hil.recording.run import RecordedRun, nominal_frequency
 from gfm_hil.results.cycles import cycle_means, cycle_ticks
-from gfm_hil.results.figures import COLOURS, draw_panel
+from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Verdict, judge_nfp
 from gfm_hil.studies.conformity.model import Nfp
 from gfm_hil.studies.identification import Identification
@@ -27,17 +27,17 @@ _TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "fre
 _LIGHT = "#c9d6e2"
 
 
-def draw_part(path: Path, title: str, run: RecordedRun, verdicts: Sequence[Verdict]) -> None:
+def draw_part(path: Path, title: str, run: RecordedRun, verdicts: Sequence[Verdict]) -> Picture:
     """Draw one run: every tick in light grey, one-cycle means in blue, the limits that were judged
     in the colour of their verdict, and below each panel the windows without limits."""
     judged = [v.signal for v in verdicts if v.signal and v.signal != "omega_u"]
     names = list(dict.fromkeys([*_ALWAYS, *judged]))
     figure = Figure(figsize=(9.0, 0.6 + 1.45 * len(names)), layout="constrained")
-    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     t = np.asarray(run.columns["t"][:])
     T_s = run.scenario.T_s
     width = cycle_ticks(T_s, nominal_frequency(run.scenario))
-    for axes, name in zip(panels, names, strict=True):
+    for axes, name in zip(rows, names, strict=True):
         x = np.asarray(run.signals[name])
         curves = [(t, x, _LIGHT, "every tick")]
         means = np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), width)])
@@ -47,18 +47,21 @@ def draw_part(path: Path, title: str, run: RecordedRun, verdicts: Sequence[Verdi
         shown, factor = (unit_of(name) or "–"), 1.0
         if shown == "rad":
             shown, factor = "°", 180 / np.pi
-        draw_panel(axes, f"{_TITLES.get(name, name)} [{shown}]", curves, factor, styles=("-",))
+        draw_panel(
+            axes, f"{_TITLES.get(name, printed(name))} [{shown}]", curves, factor, styles=("-",)
+        )
         _limits(axes, [v for v in verdicts if v.signal == name])
         for event in run.summary["events"]:
             axes.axvline(event["t"], color="#888888", lw=0.7, ls=(0, (4, 3)), zorder=0)
-    panels[0].legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
-    panels[-1].set_xlim(0, run.scenario.duration)
-    panels[-1].set_xlabel("t [s]", fontsize=9)
-    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    rows[0].legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
+    rows[-1].set_xlim(0, run.scenario.duration)
+    rows[-1].set_xlabel("t [s]", fontsize=9)
+    headline(figure, title, 10)
     _save(figure, path)
+    return Picture(path, panels(figure))
 
 
-def draw_plot(path: Path, title: str, found: Identification, asked: Nfp) -> None:
+def draw_plot(path: Path, title: str, found: Identification, asked: Nfp) -> Picture:
     """Draw the network-frequency-perturbation plot with the limits of its bands."""
     figure = Figure(figsize=(7.6, 5.6), layout="constrained")
     gain, phase = draw_nfp(found, figure)
@@ -73,8 +76,9 @@ def draw_plot(path: Path, title: str, found: Identification, asked: Nfp) -> None
             for limit in limits:
                 span = [band.from_hz, band.to_hz]
                 axes.plot(span, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))
-    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    headline(figure, title, 10)
     _save(figure, path)
+    return Picture(path, panels(figure))
 
 
 def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:

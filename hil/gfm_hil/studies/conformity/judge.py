@@ -303,7 +303,7 @@ class _Judge:
         if c.longest_s:
             band += f", but for {c.longest_s:g} s"
         beyond = checks.longest_beyond(w, below, above)
-        stay = f"The one-cycle mean of {c.signal} stays between {least:.4g} and {w.show(most)}"
+        stay = f"The one-cycle mean of {w.symbol} stays between {least:.4g} and {w.show(most)}"
         if found is not None and beyond > 0:
             text = f"{found.text} It was beyond for {beyond:.3g} s in one piece."
         elif beyond > 0:
@@ -333,11 +333,11 @@ class _Judge:
         found = checks.settles(w, to, c.within, c.tolerance)
         took = checks.settled_after(w, to, c.tolerance)
         if found is None:
-            text = f"{c.signal} settles at {w.show(to)} ({why}) after {took:.3g} s."
+            text = f"{w.symbol} settles at {w.show(to)} ({why}) after {took:.3g} s."
         else:
             text = found.text.replace(
-                f"{w.name} should settle at {w.show(to)}",
-                f"The one-cycle mean of {w.name} should settle at {w.show(to)} ({why})",
+                f"{w.symbol} should settle at {w.show(to)}",
+                f"The one-cycle mean of {w.symbol} should settle at {w.show(to)} ({why})",
                 1,
             )
         return self._made(

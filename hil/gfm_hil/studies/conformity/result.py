@@ -15,7 +15,8 @@ from xml.etree import ElementTree
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.results.report import STYLE, cell, finite, inline
+from gfm_hil.recording.columns import printed
+from gfm_hil.results.report import STYLE, cell, figure, finite
 from gfm_hil.studies.conformity.execute import Found, slug
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Outcome, Verdict, worst
 from gfm_hil.studies.conformity.model import KNOWN, UnderTest
@@ -25,9 +26,14 @@ _STYLE = """
 .pass{background:#00734f} .fail{background:#b34500} .cannot{background:#777}
 td .status{padding:0 .4rem;white-space:nowrap}
 .scroll.text :is(th,td):not(:first-child){text-align:left;white-space:normal}
-.matrix td,.matrix th{padding:.1rem .35rem;text-align:center}
-.matrix th:first-child{text-align:left} .matrix a{color:inherit;text-decoration:none}
-.matrix th.tall{writing-mode:vertical-rl;transform:rotate(180deg);text-align:left}
+.scroll .matrix :is(td,th){padding:.1rem;text-align:center;border:0} .matrix a{color:inherit;
+text-decoration:none} .matrix .status{padding:0;width:1.5rem}
+.scroll .matrix th:first-child{position:sticky;left:0;background:var(--paper);text-align:left;
+white-space:normal;min-width:9rem;padding-right:.6rem}
+.matrix th.tall{writing-mode:vertical-rl;transform:rotate(180deg);text-align:left!important}
+@media (max-width:45rem){.text :is(table,tbody,tr,td){display:block} .text th{display:none}
+.text tr{padding:.4rem 0;border-bottom:1px solid var(--line)} .text td{padding:0;border:0}
+.text td:not(:has(.status))::before{content:attr(data-head) ": ";opacity:.6}}
 """
 
 
@@ -58,7 +64,7 @@ class Conformity:
 
     @cached_property
     def matrix(self) -> dict[tuple[str, str], Outcome]:
-        """The verdict by law and test: the worst of its parts."""
+        """The verdict by law and test, the worst of its parts."""
         return {
             (law, case.id): worst([found.verdict for found in self.of(law, case.id)])
             for law in self.laws
@@ -74,7 +80,7 @@ class Conformity:
 
     @property
     def failures(self) -> list[str]:
-        """One line for each part that does not pass: law, test, verdict and why."""
+        """One line for each part that does not pass, with law, test, verdict and why."""
         return [
             f"{f.law}, {'/'.join(x for x in (f.test, f.part) if x)}: {f.verdict}: {f.words}"
             for law in self.laws
@@ -143,7 +149,7 @@ class Conformity:
             draw_matrix(folder / "matrix.png", self.laws, [c.id for c in self.cases], self.matrix)
             for law in self.laws:
                 write_text(folder / f"report-{slug(law)}.html", self._page(law))
-            write_text(folder / "report.html", self._overview(folder / "matrix.png"))
+            write_text(folder / "report.html", self._overview())
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
@@ -179,17 +185,22 @@ class Conformity:
         body += [self._section(law, case) for case in self.cases]
         return document(f"{law}: conformity", "\n".join(body))
 
-    def _overview(self, picture: Path) -> str:
-        heads = "".join(f'<th class="tall">{html.escape(c.id)}</th>' for c in self.cases)
+    def _overview(self) -> str:
+        pages = {law: f"report-{slug(law)}.html" for law in self.laws}
+        heads = "".join(
+            f'<th class="tall"><a href="{page}">{html.escape(law)}</a></th>'
+            for law, page in pages.items()
+        )
         rows = ""
-        for law in self.laws:
-            page = f"report-{slug(law)}.html"
+        for c in self.cases:
             cells = "".join(
-                f'<td><a href="{page}#{slug(c.id)}" title="{html.escape(c.test.title)}">'
+                f'<td><a href="{page}#{slug(c.id)}">'
                 f"{status(self.matrix[law, c.id], short=True)}</a></td>"
-                for c in self.cases
+                for law, page in pages.items()
             )
-            rows += f'<tr><th><a href="{page}">{html.escape(law)}</a></th>{cells}</tr>'
+            rows += (
+                f'<tr><th title="{html.escape(c.test.title)}">{html.escape(c.id)}</th>{cells}</tr>'
+            )
         matrix = f'<div class="scroll"><table class="matrix"><tr><th></th>{heads}</tr>{rows}'
         sources = table(
             ["test", "source", "known"],
@@ -200,7 +211,6 @@ class Conformity:
             ],
         )  # fmt: skip
         body = f"{self._head('Conformity of laws')}{matrix}</table></div><h2>Sources</h2>{sources}"
-        body += f'<h2>Figure</h2><img alt="matrix" src="{inline(picture)}">'
         return document("Conformity of laws", body)
 
     def _head(self, title: str) -> str:
@@ -230,8 +240,7 @@ class Conformity:
             else:
                 text.append(f"<p>{html.escape(f.reason)}</p>")
             if f.figure is not None:
-                alt = html.escape(f"{f.test} {f.part}")
-                text.append(f'<img alt="{alt}" src="{inline(f.figure)}">')
+                text.append(figure(f"{f.test} {f.part}".rstrip(), f.figure.panels))
             if f.again:
                 text.append(f"<p><code>{html.escape(f.again)}</code> repeats the run.</p>")
         return "\n".join(text)
@@ -248,7 +257,7 @@ _HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "wha
 def _row(v: Verdict) -> list[str]:
     measured = "–" if v.value is None else f"{cell(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
-    plain = (v.clause, v.signal or "–", window, measured, v.limit, v.text)
+    plain = (v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text)
     return [status(v.verdict), *map(html.escape, plain)]
 
 
@@ -266,7 +275,10 @@ def _link(case: Case) -> str:
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table whose cells are HTML already."""
     top = "".join(f"<th>{head}</th>" for head in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in rows)
+    body = ""
+    for row in rows:  # each cell with its head, for where there is no room for columns
+        cells = (f'<td data-head="{h}">{c}</td>' for h, c in zip(heads, row, strict=True))
+        body += f"<tr>{''.join(cells)}</tr>"
     return f'<div class="scroll text"><table><tr>{top}</tr>{body}</table></div>'
 
 
