@@ -21,7 +21,6 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
@@ -43,7 +42,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u",
     )  # fmt: skip
     add_map(command, "--model")
-    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
+    command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -61,8 +60,7 @@ def call(options: argparse.Namespace) -> int:
         model = open_model(options.model, ports, _rig(scenario))
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
-    if options.part is not None:  # of `gfmhil run`, which puts the parts together
-        end_with_parent(options.part)
+    if options.part:  # of `gfmhil run`, which puts the parts together
         with _all_in_use(places):
             run_role(role, scenario, folder, given, lambda text: None, model)
         return 0

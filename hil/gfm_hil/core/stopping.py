@@ -1,15 +1,10 @@
-"""Stopping: Ctrl-C and similar signals set a flag; a process ends with its parent."""
+"""Stopping: Ctrl-C and similar signals set a flag."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import os
 import signal
-import sys
 from typing import Any
-
-_SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
 class Interrupt:
@@ -44,14 +39,3 @@ class Interrupt:
     def __exit__(self, *_: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)
-
-
-def end_with_parent(parent: int | None = None, by: signal.Signals = signal.SIGTERM) -> None:
-    """Have Linux send this process a signal when its parent is gone, even if it was killed.
-
-    ``parent`` is its process id, to check whether it has already ended.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, by)
-        if parent not in (None, os.getppid()):
-            os.kill(os.getpid(), by)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt
 from gfm_hil.models.ports import PortMap
 from gfm_plant import Bases
 
@@ -20,7 +24,10 @@ PIL = "pil:"
 KINDS = ("dll", "fmu", "c")
 _FILES = "dll:FILE, fmu:FILE or c:FILE"
 FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
+_LOOK_S = 0.05
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -85,7 +92,8 @@ def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
         rig: what it is connected to.
 
     Raises:
-        UserError: there is no such file, it is no such model, or its ports do not fit.
+        UserError: there is no such file, it is no such model, its ports do not fit, or a signal
+            came while its code kept us.
     """
     if text.startswith(PIL):
         from gfm_hil.models.pil import PilModel
@@ -94,6 +102,34 @@ def open_model(text: str, ports: PortMap, rig: Rig) -> Model | PilModel:
             raise UserError(f"controller {text}: has our signals, and takes no map")
         return PilModel(text.removeprefix(PIL))
     kind, path = model_file(text, FORMS)
+    where = "gfmhil_new" if kind == "c" else "being opened"
+    return until_signal(f"{path.name}: {where}", lambda: _open(kind, path, ports, rig))
+
+
+def until_signal(what: str, work: Callable[[], T]) -> T:
+    """What ``work`` gives, in a thread of its own: foreign code that does not come back would keep
+    signals from acting.
+
+    Raises:
+        UserError: SIGINT, SIGTERM or SIGHUP came first; it says ``what`` did not come back.
+    """
+    found: Future[T] = Future()
+
+    def call() -> None:
+        try:
+            found.set_result(work())
+        except BaseException as problem:  # the caller's thread raises it
+            found.set_exception(problem)
+
+    with Interrupt() as interrupt:
+        threading.Thread(target=call, daemon=True).start()
+        while not wait([found], _LOOK_S).done:
+            if interrupt.came:
+                raise UserError(f"{what} does not come back")
+    return found.result()
+
+
+def _open(kind: str, path: Path, ports: PortMap, rig: Rig) -> Model:
     if kind == "dll":
         from gfm_hil.models.dll import DllModel
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import time
@@ -97,7 +96,7 @@ def model_command(model: str, ports: Path | None) -> list[str]:
     """
     command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
     command += ["--endpoint", "{endpoint}", "--out", "{folder}", "--quiet"]
-    command += ["--part", str(os.getpid()), "--model", model]
+    command += ["--part", "--model", model]
     return command + (["--map", str(ports.absolute())] if ports else [])
 
 
