@@ -26,7 +26,7 @@ from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
 from gfm_hil.models import FORMS, Rig, open_model, read_map
 from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run_folder import check_free, finish, in_use
+from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 from gfm_runtime.errors import meant
@@ -77,7 +77,7 @@ def call(options: argparse.Namespace) -> int:
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    with _all_in_use(places):
+    with _all_in_use(places), cut_short(folder):
         run_role(role, scenario, folder, given, notice, model)
         wall_s = time.monotonic() - began
         runs = {

@@ -10,11 +10,12 @@ from typing import Any
 class Interrupt:
     """Context in which Ctrl-C, SIGTERM and a closed terminal only set ``came``.
 
-    A second signal raises KeyboardInterrupt, so that a user need not wait for an orderly end.
+    A second signal raises KeyboardInterrupt, so that a user need not wait for an orderly end; the
+    first one does so if it is to act ``at_once``.
     """
 
-    def __init__(self) -> None:
-        self.came = False
+    def __init__(self, at_once: bool = False) -> None:
+        self.came, self._at_once = False, at_once
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupt:
@@ -28,7 +29,7 @@ class Interrupt:
         return self
 
     def _note(self, number: int, frame: Any) -> None:
-        if self.came:
+        if self.came or self._at_once:
             raise KeyboardInterrupt
         self.came = True
 

@@ -102,13 +102,15 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         forkserver.ensure_running()
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        yield pool
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
     except KeyboardInterrupt:
         for process in multiprocessing.active_children():
             process.kill()
         raise
     finally:
-        pool.shutdown(cancel_futures=True)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
