@@ -22,6 +22,7 @@ from gfm_hil.xcp.memory import (
 
 MOST = 255  # bytes of a command and of a response, at most: MAX_CTO
 _HEADER = struct.Struct("<HH")  # LEN and CTR of XCP on Ethernet
+_LARGEST, _SHORT = 65507, 32  # bytes: what UDP carries, and a few short answers
 _MOST_TOLD = 1000  # lines about refusals
 _IDLE_S = 30.0  # after so long without a command another master may connect
 
@@ -74,21 +75,24 @@ class Slave:
     def take(self, datagram: bytes, peer: Any) -> bytes:
         """The answer to a datagram from a peer's socket address; empty for none.
 
-        Of the datagram that connects only the first packet is answered: its sender's address may be
-        forged, and one datagram must not bring many times its size to another machine.
+        That to a datagram which connects is no longer than the datagram, or than a few short
+        answers: its sender's address may be forged, and belong to a machine that asked nothing.
         """
-        out, rest, connected = b"", datagram, peer == self._master
+        out, rest = b"", datagram
+        room = _LARGEST if peer == self._master else max(len(datagram), _SHORT)
         while len(rest) >= _HEADER.size:
             length, _ = _HEADER.unpack_from(rest)
             packet = rest[_HEADER.size : _HEADER.size + length]
             rest = rest[_HEADER.size + length :]
             whole = 1 <= length <= self._most and len(packet) == length
             response = self.packet(packet if whole else b"", peer)
+            if len(out) + _HEADER.size + len(response) > room:
+                break
             if response:
                 out += _HEADER.pack(len(response), self._counter) + response
                 self._counter = (self._counter + 1) % 2**16
-            if not whole or not connected:  # nobody knows where the next packet begins
-                break
+            if not whole:
+                break  # nobody knows where the next packet begins
         return out
 
     def packet(self, packet: bytes, peer: Any) -> bytes:
