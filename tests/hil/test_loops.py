@@ -291,6 +291,22 @@ def test_extrapolation_is_a_straight_line_through_the_last_two_and_then_hold(inn
     assert plant.said[-1] == (23, STOPPED, 1)
 
 
+@pytest.mark.attack(
+    "23.5", "a second u for a tick already answered, with other values",
+    "the plant holds and records it in the next tick",
+)  # fmt: skip
+def test_the_first_u_of_a_tick_stands(place, make, attack_now):
+    scenario = make(mode="lockstep", link={**LIVE, "peer_timeout_s": 0.3, "repeat_s": 0.1})
+    heard = frames("u", 0, 1)
+    plant = alone("plant", scenario, place, after(heard, "u", 1, RUNNING))
+    u = plant.part.signals[
+        :, [signals_of("plant", False).index(f"u_{n}") for n in carried("u", False)]
+    ]
+    assert (u[1] == ONES["u"] + 0.001 * np.arange(3)).all()
+    assert u[2].tobytes() == u[1].tobytes()  # tick 2 has no u, and the plant holds the last one
+    attack_now("the plant holds and records the first one")
+
+
 @pytest.mark.parametrize("hold", [0, 30])
 def test_a_controller_whose_plant_falls_silent_is_safe_after_hold_and_one_more(hold, place, make):
     scenario = make(**REALTIME, late_policy={"hold": hold})

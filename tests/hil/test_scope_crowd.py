@@ -137,12 +137,12 @@ def test_a_page_that_never_reads_is_dropped(port, scope, monkeypatch, caplog, at
 
 
 @pytest.mark.attack(
-    "4.2", "16 mute pages, then the operator with the token", "503, locked out for good"
+    "4.2", "16 pages that look, then the operator with the token", "503, locked out for good"
 )
-def test_the_token_s_holder_gets_in_among_mute_pages(port, scope, attack_now) -> None:
+def test_the_token_s_holder_gets_in_among_pages_that_look(port, scope, attack_now) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(16):
-            stack.enter_context(mute(port))
+            stack.enter_context(connect(address(port)))
         wait_for(lambda: len(scope._sessions) == 16)
         with pytest.raises(InvalidStatus), connect(address(port)):
             pass
@@ -154,7 +154,26 @@ def test_the_token_s_holder_gets_in_among_mute_pages(port, scope, attack_now) ->
             say(page, kind="hello", token="wrong")
             assert words(page, "control")["granted"] is False
             assert gone(page)
-    attack_now("the holder gets in beside 16 mute pages, a wrong token does not")
+    attack_now("the holder gets in beside 16 pages, a wrong token does not")
+
+
+@pytest.mark.attack(
+    "23.5", "16 pages that never read, then a page that looks", "503 until their pings time out"
+)
+@pytest.mark.parametrize("query", ["", "?control"])
+def test_pages_that_never_read_make_room_for_a_newcomer(query, port, scope, attack_now) -> None:
+    with contextlib.ExitStack() as stack:
+        reader = stack.enter_context(connect(address(port)))
+        for _ in range(15):
+            stack.enter_context(mute(port))
+        wait_for(lambda: len(scope._sessions) == 16)
+        with connect(address(port, query)) as page:
+            say(page, kind="hello", token="none")
+            assert words(page, "about")["title"] == "test"
+            assert len(scope._sessions) == 2
+            say(reader, kind="hello", token="none")
+            assert words(reader, "control")["granted"] is False
+    attack_now("the 15 that do not answer a ping in 1 s are dropped; the one that does stays")
 
 
 @pytest.mark.attack(

@@ -328,3 +328,20 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
     assert sent == ticks
     assert "Too many open files" in caplog.text and "a mistake of ours" in caplog.text
     attack_now(f"2 of 2 reported; {sent} of {ticks} ticks sent on")
+
+
+def test_a_side_that_begins_while_the_news_are_read_is_in_the_next(tmp_path, monkeypatch):
+    """The plant's parts appear between two looks at them of one call."""
+    (tmp_path / "scenario.toml").write_text("T_s = 1e-4\n", encoding="utf-8")
+    controller, plant = (Part.create(tmp_path, role, 10) for role in ROLES)
+    find = Part.open
+    hidden = iter([True] * 3)  # from two looks of the constructor, and from the first of the news
+
+    def begun(folder: Path, role: Role) -> Part | None:
+        return None if role == "plant" and next(hidden, False) else find(folder, role)
+
+    monkeypatch.setattr(Part, "open", begun)
+    follower = Follower(tmp_path)
+    controller.progress[0], plant.progress[0] = 5, 7
+    assert [(rows.role, len(rows.signals)) for rows in follower.news()] == [("controller", 4)]
+    assert [(rows.role, len(rows.signals)) for rows in follower.news()] == [("plant", 6)]

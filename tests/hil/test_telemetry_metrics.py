@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import socket
 import struct
+import threading
+import time
 import urllib.request
 from pathlib import Path
 
@@ -143,3 +145,47 @@ def test_a_client_that_hangs_up_is_not_worth_a_traceback(capfd, attack_now):
         assert scraped(port) == {}
     assert capfd.readouterr().err == ""
     attack_now(f"{gone} such clients: nothing is printed, and the next one is served")
+
+
+_FLOOD = """
+import socket, sys, threading
+port, ask = int(sys.argv[1]), b"GET /metrics HTTP/1.1\\r\\nHost: x\\r\\n\\r\\n"
+silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(int(sys.argv[2]))]
+def flood():
+    while True:
+        try:
+            with socket.create_connection(("127.0.0.1", port), 10) as one:
+                one.sendall(ask)
+                while one.recv(65536):
+                    pass
+        except OSError:
+            pass
+for _ in range(40):
+    threading.Thread(target=flood, daemon=True).start()
+print("on", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.attack(
+    "23.5", "a scraper of the metrics that asks on 40 connections without a pause, and holds 300",
+    "each scrape is computed anew, 308 threads; another scraper waits 1.2 s for its connection",
+)  # fmt: skip
+def test_one_scraper_s_flood_leaves_room_for_another(recorded, spawn, monkeypatch, attack_now):
+    times, computed = RunCollector._times, []
+    monkeypatch.setattr(
+        RunCollector, "_times", lambda *given: computed.append(time.monotonic()) or times(*given)
+    )
+    with serve_metrics(RunCollector(recorded), "127.0.0.1", 0) as port:
+        flood = spawn("-c", _FLOOD, str(port), "300")
+        assert flood.stdout is not None and flood.stdout.readline() == "on\n"
+        time.sleep(1.0)
+        took = []
+        for _ in range(10):
+            began = time.monotonic()
+            assert scraped(port)["gfmhil_misses_total", ""] == 500
+            took.append(time.monotonic() - began)
+        threads = threading.active_count()
+    assert threads < 64 + 40 + 30
+    assert (np.diff(computed) > 0.19).all()
+    attack_now(f"another scraper waits {max(took):.2f} s at most; {threads} threads")

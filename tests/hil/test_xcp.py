@@ -8,7 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,37 @@ def test_the_answers_of_a_session_are_those_of_the_tables(run: MadeUpRun) -> Non
     assert line(b"\xfe") == b"\xff"  # DISCONNECT
     assert line(b"\xfd") == b""
     assert Line(run, writes=False)(CONNECT)[1] == 0  # no CAL
+
+
+@pytest.mark.attack(
+    "23.5", "a datagram of 1.5 kB from a forged address that connects and uploads",
+    "16.5 kB to that address",
+)  # fmt: skip
+def test_a_datagram_that_connects_brings_no_more_than_its_answer(
+    run: MadeUpRun, attack_now: Callable[[str], None]
+) -> None:
+    made = slave(run)
+    file, piece = datagram(b"\xfa\x04"), datagram(b"\xf5\xf0")
+    asked = datagram(CONNECT) + file + 240 * piece
+    said = made.take(asked, MASTER)
+    assert said[4:12] == bytes.fromhex("ff 01 80 ff ff00 01 01")
+    assert len(said) <= len(asked)
+    assert len(made.take(file + 2 * piece, MASTER)) > 2 * 0xF0  # it has connected
+    forged = made.take(asked, ("192.0.2.1", 1))
+    assert forged[4:] == b"\xfe\x33"  # one master at a time
+    attack_now(f"{len(said)} bytes, and {len(forged)} beside a master")
+
+
+@pytest.mark.attack("23.5", "a master that asks for what there is not, for ever", "a line for each")
+def test_the_log_of_refusals_is_bounded(run: MadeUpRun, attack_now: Callable[[str], None]) -> None:
+    told: list[str] = []
+    line = Line(run, notice=told.append)
+    line(CONNECT)
+    for _ in range(3000):
+        assert line(b"\xf8\x00\x01") == b"\xfe\x20"
+    assert len(told) == 1000
+    assert told[-1].endswith("; further refusals are not told")
+    attack_now(f"{len(told)} lines, the last of which says so")
 
 
 def test_the_file_is_uploaded_in_pieces_and_a_parser_reads_it(line: Line, tmp_path: Path) -> None:

@@ -38,6 +38,11 @@ void *gfmhil_new(const gfmhil_setup *setup)
     pthread_t thread;
     if (!strcmp(what, "where") && !pthread_create(&thread, NULL, look, &of_thread))
         pthread_join(thread, NULL);
+    if (!strcmp(what, "fork") && !fork())  /* a process of its own, in a session of its own */
+        setsid();
+    if (!strcmp(what, "block") || !strcmp(what, "fork"))
+        for (;;)
+            sleep(1);
     return strcmp(what, "refuse") ? &rated : NULL;
 }
 
@@ -58,6 +63,9 @@ int gfmhil_step(void *self, const gfmhil_input *in, gfmhil_output *out)
     out->e[0] = c * a - s * (b - d);
     out->e[1] = c * b - s * (d - a);
     out->e[2] = c * d - s * (a - b);
+    if (!strcmp(what, "talk"))
+        for (int k = 0; k < 1000; k++)
+            puts("a line of sixty-four bytes, which a controller prints at each step");
     if (steps++ < AT)
         return 0;
     if (!strcmp(what, "crash"))

@@ -19,6 +19,8 @@ are added to w and z. They can only raise gamma_j: the bound holds up to a part 
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -31,6 +33,7 @@ from gfm_design.model.linear import LinearPlant
 from gfm_design.norms.hinf import balance
 from gfm_design.norms.performance import D_Q, StateSpace, Weight
 from gfm_plant.names import SENSED
+from gfm_runtime.children import end_with_parent
 
 Matrix = NDArray[np.float64]
 
@@ -118,7 +121,7 @@ def _in_time(systems: list[StateSpace], seconds: float) -> list[float | None]:
     """The least norms of the first systems, up to the first that took longer than ``seconds``."""
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_solve, args=(systems, there), daemon=True)
+    process = spawn.Process(target=_solve, args=(systems, there, os.getpid()), daemon=True)
     process.start()
     there.close()
     done: list[float | None] = []
@@ -132,7 +135,8 @@ def _in_time(systems: list[StateSpace], seconds: float) -> list[float | None]:
     return done
 
 
-def _solve(systems: list[StateSpace], out: Connection) -> None:
+def _solve(systems: list[StateSpace], out: Connection, parent: int) -> None:
+    end_with_parent(parent, signal.SIGKILL)
     import control
 
     for A, B, C, D in systems:

@@ -79,6 +79,8 @@ def call(options: argparse.Namespace) -> int:
                 run(missing, folder, options.jobs, tell, keep, lambda: interrupt.came)
             except WorkerLost as problem:
                 lost = problem
+            except KeyboardInterrupt:  # a second signal: the runs under way are lost
+                interrupt.ask()
     order = ranked(list(rows.values()))
     left_out = {name: why for name, why in LEFT_OUT.items() if not options.laws}
     result = {"seed": options.seed, "laws": order, "left_out": left_out}

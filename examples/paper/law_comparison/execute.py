@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from multiprocessing import get_context
+from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
+from gfm_runtime.children import end_with_parent
 from law_comparison.row import Job, Row, make_row
 
 _POLL_S = 0.2
@@ -50,7 +54,7 @@ def run(
     Raises:
         WorkerLost: a worker died or a row raised an error; rows made so far are kept.
     """
-    with get_context("spawn").Manager() as manager, processes(workers) as pool:
+    with _manager() as manager, processes(workers) as pool:
         said, stop = manager.Queue(), manager.Event()
         left = {pool.submit(_work, job, folder, said, stop): job for job in jobs}
         try:
@@ -62,6 +66,12 @@ def run(
                     _finish(future, left.pop(future), done)
         finally:
             stop.set()
+
+
+def _manager() -> SyncManager:
+    manager = SyncManager(ctx=get_context("spawn"))
+    manager.start(end_with_parent, (os.getpid(), signal.SIGKILL))
+    return manager
 
 
 def _pass_on(said: Any, tell: Callable[[str, int, float], None]) -> None:

@@ -16,7 +16,7 @@ LOADS: tuple[Load, ...] = ("idle", "busy")
 
 _COMPUTE = (
     "import os, signal, sys\n"
-    "from gfm_hil.core.stopping import end_with_parent\n"
+    "from gfm_runtime.children import end_with_parent\n"
     # a stopped process takes no other signal
     "end_with_parent(int(sys.argv[2]), signal.SIGKILL)\n"
     "os.sched_setaffinity(0, {int(sys.argv[1])})\n"

@@ -86,6 +86,8 @@ def call(options: argparse.Namespace) -> int:
                     execute(campaign, jobs, executor, workers, keep, lambda: interrupt.came)
                 except WorkerLost as problem:
                     lost = problem
+                except KeyboardInterrupt:  # a second signal: the runs under way are lost
+                    interrupt.ask()
     found = CampaignResult(campaign, store.sorted(campaign), store_at)
     result = write_result(found, store_at, axes, options.dask or workers, time.monotonic() - began)
     if options.json:

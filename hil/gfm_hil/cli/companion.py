@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
+from gfm_runtime.children import guarded
 
 _GRACE_S = 5.0
 
@@ -26,7 +26,7 @@ def companion(
     ends.
 
     Args:
-        command: one that takes a folder, ``--wait``, ``--port`` and ``--part``.
+        command: one that takes a folder, ``--wait`` and ``--port``.
         folder: where the run will be recorded.
         port: to serve at; the command's own choice if None.
         ready: how many lines it prints once it serves, which this function waits for; 0 if it
@@ -39,9 +39,11 @@ def companion(
     if port:
         _check_free(command, port)
     argv = [sys.executable, "-P", "-m", "gfm_hil", command, str(folder.absolute()), "--wait"]
-    argv += ["--part", str(os.getpid()), *([] if port is None else ["--port", str(port)])]
+    argv += [] if port is None else ["--port", str(port)]
     # own session: the first Ctrl-C is for the run
-    process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        guarded(argv), stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     try:
         for _ in range(ready):
             if not _pass_on_line(process):

@@ -141,6 +141,8 @@ def call(options: argparse.Namespace) -> int:
             execute(jobs, workers, keep, lambda: interrupt.came, above(bar))
         except WorkerLost as problem:
             lost = problem
+        except KeyboardInterrupt:  # a second signal: the runs under way are lost
+            interrupt.ask()
     if len(found) < len(jobs):
         why = str(lost) if lost else "interrupted"
         done = f"{len(found)} of {len(jobs)} runs were done; there is no report"

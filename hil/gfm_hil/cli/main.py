@@ -102,7 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(_unknown(top, options.command, unknown))
     try:
         return int(options.call(options))
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        if stop.args:  # what is left, and how to complete it
+            print(f"gfmhil: {stop}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # a reader such as head that has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to flush

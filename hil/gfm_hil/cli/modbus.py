@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.stopping import end_with_parent
 
 PORT = 5020
 _LOOK_S = 0.1
@@ -43,15 +42,12 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--vendor-model", action="store_true", help="print the vendor model's file, and end"
     )
-    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
     from gfm_hil.modbus.image import vendor_model
     from gfm_hil.modbus.serve import LOCAL, Address, begun, serve
 
-    if options.part is not None:
-        end_with_parent(options.part)
     if options.vendor_model:
         print(vendor_model(), end="")
         return 0

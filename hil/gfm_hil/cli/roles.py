@@ -21,14 +21,13 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
 from gfm_hil.models import FORMS, BenchContext, open_model, read_map
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run_folder import check_free, finish, in_use
+from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 from gfm_runtime.errors import meant
@@ -44,7 +43,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u",
     )  # fmt: skip
     add_map(command, "--model")
-    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
+    command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -63,8 +62,7 @@ def call(options: argparse.Namespace) -> int:
             model = open_model(options.model, ports, _bench_context(scenario))
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
-    if options.part is not None:  # of `gfmhil run`, which puts the parts together
-        end_with_parent(options.part)
+    if options.part:  # of `gfmhil run`, which puts the parts together
         with _all_in_use(places):
             run_role(role, scenario, folder, given, lambda text: None, model)
         return 0
@@ -81,7 +79,7 @@ def call(options: argparse.Namespace) -> int:
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    with _all_in_use(places):
+    with _all_in_use(places), cut_short(folder):
         run_role(role, scenario, folder, given, notice, model)
         wall_s = time.monotonic() - began
         runs = {

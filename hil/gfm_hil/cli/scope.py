@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.links.zeromq.options import beyond_loopback
 
 PORT = 8470
@@ -42,7 +41,6 @@ def add(command: argparse.ArgumentParser) -> None:
         help="print an address with control for NAME, under which the run's log has what is "
         "commanded with it; may be repeated",
     )  # fmt: skip
-    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -52,8 +50,6 @@ def call(options: argparse.Namespace) -> int:
     from gfm_hil.scope.record import begun, open_record
     from gfm_hil.scope.server import Scope, run_scope
 
-    if options.part is not None:
-        end_with_parent(options.part)
     while options.wait and not begun(options.folder):
         time.sleep(_LOOK_S)
     os.nice(_NICENESS)

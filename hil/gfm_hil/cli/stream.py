@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.stopping import Interrupt, end_with_parent
+from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links.zeromq.options import beyond_loopback
 
 PORT = 9872  # what PlotJuggler's ZeroMQ subscriber connects to unless told otherwise
@@ -41,7 +41,6 @@ def add(command: argparse.ArgumentParser) -> None:
         "--plain", action="store_true",
         help="listen beyond this machine: everybody there can read, nobody can command",
     )  # fmt: skip
-    command.add_argument("--part", type=int, metavar="PID", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -50,8 +49,6 @@ def call(options: argparse.Namespace) -> int:
     from gfm_hil.telemetry.follow import Follower
     from gfm_hil.telemetry.publish import Ports, Publisher
 
-    if options.part is not None:
-        end_with_parent(options.part)
     follower = None if options.wait and not begun(options.folder) else Follower(options.folder)
     following = options.port + 1 if options.port else 0
     blocks = following if options.blocks is None else options.blocks

@@ -1,25 +1,21 @@
-"""Stopping: Ctrl-C and similar signals set a flag; a process ends with its parent."""
+"""Stopping: Ctrl-C and similar signals set a flag."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import os
 import signal
-import sys
 from typing import Any
-
-_SET_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
 class Interrupt:
     """Context in which Ctrl-C, SIGTERM and a closed terminal only set ``came``.
 
-    A second signal raises KeyboardInterrupt, so that a user need not wait for an orderly end.
+    A second signal raises KeyboardInterrupt, so that a user need not wait for an orderly end; the
+    first one does so if it is to act ``at_once``.
     """
 
-    def __init__(self) -> None:
-        self.came = False
+    def __init__(self, at_once: bool = False) -> None:
+        self.came, self._at_once = False, at_once
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupt:
@@ -33,7 +29,7 @@ class Interrupt:
         return self
 
     def _note(self, number: int, frame: Any) -> None:
-        if self.came:
+        if self.came or self._at_once:
             raise KeyboardInterrupt
         self.came = True
 
@@ -44,14 +40,3 @@ class Interrupt:
     def __exit__(self, *_: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)
-
-
-def end_with_parent(parent: int | None = None, by: signal.Signals = signal.SIGTERM) -> None:
-    """Have Linux send this process a signal when its parent is gone, even if it was killed.
-
-    ``parent`` is its process id, to check whether it has already ended.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, by)
-        if parent not in (None, os.getppid()):
-            os.kill(os.getpid(), by)

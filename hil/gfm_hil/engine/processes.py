@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import subprocess
 import sys
@@ -21,11 +20,13 @@ from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.scenario.model import Scenario
+from gfm_runtime.children import END_NOW, guarded
 
 #: told (ticks done, misses so far); may be called a few times a second
 Progress = Callable[[int, int], None]
 
 _LOOK_S = 0.05
+_SHOWN = 2000  # characters of what a foreign controller prints that refuses to start
 _GRACE_S = 2.0  # time that a side gets to end, beyond link.peer_timeout_s
 
 
@@ -50,20 +51,12 @@ class _Process:
         return self.folder / f"{self.role}.log"
 
     def start(self) -> None:
-        """Start it.
-
-        Raises:
-            UserError: that is not possible.
-        """
+        """Start it, behind a guard that ends it with us and keeps its log short."""
         with self.log.open("wb") as log:
-            try:
-                # a session of its own: Ctrl-C reaches the process through us, once
-                self.popen = subprocess.Popen(
-                    self.command, stdout=log, stderr=log, start_new_session=True
-                )
-            except OSError as problem:
-                text = f"{self.command[0]}: cannot be started: {problem.strerror}"
-                raise UserError(text) from None
+            # a session of its own: Ctrl-C reaches the process through us, once
+            self.popen = subprocess.Popen(
+                guarded(self.command, bounded=True), stdout=log, stderr=log, start_new_session=True
+            )
 
     def send(self, number: signal.Signals) -> None:
         """Send it a signal while it lives."""
@@ -144,7 +137,7 @@ class Processes:
             finally:
                 for process in started:
                     if process.popen.poll() is None:
-                        process.popen.kill()
+                        process.send(END_NOW)
                         process.popen.wait()
         return began, self._judge()
 
@@ -167,7 +160,7 @@ class Processes:
         folder = folder.absolute()  # a name such as "--" must not look like an option
         # -P: a file of the operator's folder must not stand in for a module
         command = [sys.executable, "-P", "-m", "gfm_hil", role, str(folder / "scenario.toml")]
-        return [*command, "--out", str(folder), "--quiet", "--part", str(os.getpid())]
+        return [*command, "--out", str(folder), "--quiet", "--part"]
 
     def _plant_command(self, endpoints: dict[str, str]) -> list[str]:
         command = self._ours("plant", self.folder)
@@ -216,7 +209,7 @@ class Processes:
                 self._send(signal.SIGINT)
                 told, kill_at = True, now + _GRACE_S
             if now >= kill_at:
-                self._send(signal.SIGKILL)
+                self._send(END_NOW)
         return began
 
     def _ends_all(self, ended: _Process, part: Part | None) -> tuple[bool, bool]:
@@ -232,10 +225,13 @@ class Processes:
             process.send(number)
 
     def _judge(self) -> dict[str, Outcome]:
-        said = [(process, process.log.read_text("utf-8").strip()) for process in self._all]
+        said = [
+            (process, process.log.read_text("utf-8", "replace").strip()) for process in self._all
+        ]
         refused = [text for process, text in said if process.popen.returncode == 2]
         if refused:
-            raise UserError("\n".join(text.removeprefix("gfmhil: ") for text in refused))
+            last = (f"\n{text}".rpartition("\ngfmhil: ")[2].strip() for text in refused)
+            raise UserError("\n".join(text[-_SHOWN:] for text in last))
         for process, text in said:
             if not text:
                 process.log.unlink()

@@ -138,7 +138,8 @@ def unpack(reader, data_id, frame, message, size, values):
         data_id: of the expected frame.
         frame, message: a buffer as one record of ``wire_dtype`` and as bytes.
         size: bytes received, which may be more than the buffer holds.
-        values: written only if the frame is good.
+        values: written only if the frame is good and its tick newer: the first good frame of a
+            tick stands.
 
     Returns:
         The frame's tick, or -1 if it was refused and counted.
@@ -170,14 +171,14 @@ def unpack(reader, data_id, frame, message, size, values):
     r.next = (np.int64(f.sequence) + 1) % _WRAP
     tick = np.int64(f.tick)
     if tick > r.tick:
+        for j in range(len(values)):
+            values[j] = f.values[j]
         r.repeats = 0
         if r.e2e == INITIAL:
             r.e2e = VALID
     else:
         r.repeats += 1
     r.tick, r.state, r.reason = tick, f.state, f.reason
-    for j in range(len(values)):
-        values[j] = f.values[j]
     return tick
 
 
@@ -316,7 +317,7 @@ class FrameReader:
         return E2E[int(self.record["e2e"][0])]
 
     def unpack(self, message: bytes, values: NDArray[np.float64]) -> int:
-        """Write the values of a good frame into ``values``; returns its tick.
+        """Write the values of a good frame with a newer tick into ``values``; returns its tick.
 
         Raises:
             FrameError: the frame failed a check; the reader has counted it, and ``values`` is

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt
 from gfm_hil.models.dll import DllModel
 from gfm_hil.models.fmu import FmuModel
 from gfm_hil.models.library import LibraryModel
@@ -24,6 +27,9 @@ _KINDS: dict[str, Callable[[Path, PortMap, BenchContext], Model]] = {
 }
 _FILES = "dll:FILE, fmu:FILE or c:FILE"
 FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
+_LOOK_S = 0.05
+
+T = TypeVar("T")
 
 
 def open_model(text: str, ports: PortMap, context: BenchContext) -> Model | PilModel:
@@ -36,14 +42,39 @@ def open_model(text: str, ports: PortMap, context: BenchContext) -> Model | PilM
         context: what it is connected to.
 
     Raises:
-        UserError: there is no such file, it is no such model, or its ports do not fit.
+        UserError: there is no such file, it is no such model, its ports do not fit, or a signal
+            came while its code kept us.
     """
     if text.startswith(PIL):
         if ports != PortMap():
             raise UserError(f"controller {text}: has our signals, and takes no map")
         return _pil(text)
     kind, path = model_file(text, FORMS)
-    return _KINDS[kind](path, ports, context)
+    where = "gfmhil_new" if kind == "c" else "being opened"
+    return until_signal(f"{path.name}: {where}", lambda: _KINDS[kind](path, ports, context))
+
+
+def until_signal(what: str, work: Callable[[], T]) -> T:
+    """What ``work`` gives, in a thread of its own: foreign code that does not come back would keep
+    signals from acting.
+
+    Raises:
+        UserError: SIGINT, SIGTERM or SIGHUP came first; it says ``what`` did not come back.
+    """
+    found: Future[T] = Future()
+
+    def call() -> None:
+        try:
+            found.set_result(work())
+        except BaseException as problem:  # the caller's thread raises it
+            found.set_exception(problem)
+
+    with Interrupt() as interrupt:
+        threading.Thread(target=call, daemon=True).start()
+        while not wait([found], _LOOK_S).done:
+            if interrupt.came:
+                raise UserError(f"{what} does not come back")
+    return found.result()
 
 
 def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:

@@ -15,7 +15,6 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,10 +23,10 @@ from numpy.typing import NDArray
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import our_controller_on
-from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.models.model import ModelError
 from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
+from gfm_runtime.children import END_NOW, guarded
 from gfm_runtime.firmware.check import TARGETS, need_tools
 from gfm_runtime.firmware.golden import SHIPPED, Golden, golden
 from gfm_runtime.firmware.loop import CHANGE, CHECK, FROM, START, TICK, TO, LoopProgram, build_loop
@@ -122,9 +121,8 @@ class PilModel:
         self._log = self._ends.enter_context((folder / "log").open("w+b"))
         try:
             self._process = subprocess.Popen(
-                program.target.run, cwd=folder, stdin=subprocess.DEVNULL, stdout=self._log,
-                stderr=self._log, start_new_session=True,
-                preexec_fn=partial(end_with_parent, os.getpid(), signal.SIGKILL),
+                guarded(program.target.run, bounded=True), cwd=folder, stdin=subprocess.DEVNULL,
+                stdout=self._log, stderr=self._log, start_new_session=True,
             )  # fmt: skip
         except OSError as problem:
             raise ModelError(f"{self.name}: cannot be started: {problem.strerror}") from None
@@ -271,7 +269,7 @@ class PilModel:
             raise ModelError(f"{self.name}: refuses: {_SAID[result]}: {names[channel]}")
 
     def _end(self) -> None:
-        self._process.kill()
+        self._process.send_signal(END_NOW)
         self._process.wait()
 
 

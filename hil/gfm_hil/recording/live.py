@@ -6,6 +6,8 @@ Reading does not disturb the loops, which only append rows to memory-mapped file
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,9 +25,9 @@ class LiveRun:
     """The growing recording of a run. A role that has not begun to record has no ticks."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._parts: dict[Role, Part] = {}
-        self._columns: dict[str, NDArray[Any]] = {}
+        self.folder, self._opening = folder, threading.Lock()
+        self._parts: Mapping[Role, Part] = {}
+        self._columns: Mapping[str, NDArray[Any]] = {}
 
     @cached_property
     def T_s(self) -> float:
@@ -43,13 +45,15 @@ class LiveRun:
         return T_s
 
     @property
-    def parts(self) -> dict[Role, Part]:
-        """The arrays of the sides that have begun to record."""
-        for role in ROLES:
-            if role not in self._parts and (part := Part.open(self.folder, role)) is not None:
-                self._parts[role] = part
-                self._columns = {**self._columns, **named(role, part.signals, part.times)}
-        return self._parts
+    def parts(self) -> Mapping[Role, Part]:
+        """The arrays of the sides that have begun to record by now; a side that begins later is in
+        the next one."""
+        with self._opening:  # by any of the threads that read
+            for role in ROLES:
+                if role not in self._parts and (part := Part.open(self.folder, role)) is not None:
+                    self._parts = {**self._parts, role: part}
+                    self._columns = {**self._columns, **named(role, part.signals, part.times)}
+            return self._parts
 
     @property
     def columns(self) -> Columns:

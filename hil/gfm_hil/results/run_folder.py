@@ -24,13 +24,14 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.files import sync_folder, unfinished, write_text
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import Columns, bytes_per_tick
 from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.parts import remove_parts
-from gfm_hil.recording.run import read_recording
+from gfm_hil.recording.run import converters_of, read_recording
 from gfm_hil.results.run import Run
 from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
@@ -85,6 +86,7 @@ def finish(
 
     Raises:
         Unfinished: a file cannot be written; ``recover`` completes the folder.
+        KeyboardInterrupt: SIGINT, SIGTERM or SIGHUP came; the message says the same.
     """
     ended = {"wall_s": wall_s, "figures": figures, "outside": outside and asdict(outside)}
     with _kept(folder):
@@ -161,10 +163,23 @@ def _open_lock(folder: Path) -> int:
 
 
 @contextlib.contextmanager
-def _kept(folder: Path) -> Iterator[None]:
-    """Say what to do where a file cannot be written."""
+def cut_short(folder: Path) -> Iterator[None]:
+    """Say in an interrupt what is left in a folder and how to complete it."""
     try:
         yield
+    except KeyboardInterrupt:
+        there = (folder / "parts").is_dir() or (folder / "signals.npz").is_file()
+        left = f"all that was recorded is kept: gfmhil recover {folder} completes the folder"
+        text = left if there or converters_of(folder) else "nothing was recorded"
+        raise KeyboardInterrupt(f"{folder}: interrupted; {text}") from None
+
+
+@contextlib.contextmanager
+def _kept(folder: Path) -> Iterator[None]:
+    """Say what to do where a file cannot be written, or a signal comes."""
+    try:
+        with cut_short(folder), Interrupt(at_once=True):
+            yield
     except OSError as problem:
         raise Unfinished(
             f"{folder}: {problem.strerror or problem}; all that was recorded is kept: make room, "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import time
@@ -26,7 +25,7 @@ from gfm_hil.recording.merge import known_laws, laws_used
 from gfm_hil.recording.parts import Kept, Part, remove_parts
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
-from gfm_hil.results.run_folder import check_free, finish, in_use
+from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
 from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
@@ -64,7 +63,7 @@ def run_scenario(
     # here, so that two processes do not compile the same at a time
     bench = compiled_bench(scenario, notice, ("plant",) if controller_command else ROLES)
     folder.mkdir(parents=True, exist_ok=True)
-    with in_use(folder):
+    with in_use(folder), cut_short(folder):
         outside: dict[str, Outcome] = {}
         try:
             with Interrupt() as interrupt:
@@ -97,7 +96,7 @@ def model_command(model: str, ports: Path | None) -> list[str]:
     """
     command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
     command += ["--endpoint", "{endpoint}", "--out", "{folder}", "--quiet"]
-    command += ["--part", str(os.getpid()), "--model", model]
+    command += ["--part", "--model", model]
     return command + (["--map", str(ports.absolute())] if ports else [])
 
 
@@ -124,6 +123,7 @@ def run_network(
     write_scenario(folder, scenario)
     places = [folder / name for name in names]
     with ExitStack() as stack:
+        stack.enter_context(cut_short(folder))
         for place, bench in zip(places, benches, strict=True):
             place.mkdir(parents=True, exist_ok=True)
             stack.enter_context(in_use(place))

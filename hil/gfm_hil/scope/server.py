@@ -115,15 +115,14 @@ class Scope:
                     supervised("the scope's connections", lambda: _reap(listener)),
                 )
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a request for a file; None for the WebSocket."""
         refusal = self.access.refusal(request.headers)
         if refusal:
             return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", refusal)
         path, _, query = request.path.partition("?")
         if path == _SOCKET:
-            full = self._full(control=False)
-            if query == _CONTROL or not full:
+            if query == _CONTROL or not (full := await self._full(control=False)):
                 return None
             return _response(http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", full)
         if path not in self._static:
@@ -131,9 +130,15 @@ class Scope:
         kind, content = self._static[path]
         return _response(http.HTTPStatus.OK, kind, content)
 
-    def _full(self, control: bool) -> str:
-        """Why there is no room for another page that controls, or that only looks; or ""."""
-        if sum(bool(s.operator) == control for s in self._sessions) < _PAGES:
+    async def _full(self, control: bool) -> str:
+        """Why there is no room for another page that controls, or that only looks; or "". Pages
+        that do not read make room."""
+        same = [s for s in self._sessions if bool(s.operator) == control]
+        if len(same) < _PAGES:
+            return ""
+        read = await asyncio.gather(*(session.reads() for session in same))
+        self._sessions -= {s for s, reads in zip(same, read, strict=True) if not reads}
+        if not all(read):
             return ""
         return f"{_PAGES} pages {'control' if control else 'look'} already"
 
@@ -146,7 +151,7 @@ class Scope:
             request = connection.request
             if request is not None and request.path.partition("?")[2] == _CONTROL:
                 await session.hear(await connection.recv())
-            if full := self._full(bool(session.operator)):
+            if full := await self._full(bool(session.operator)):
                 await connection.close(CloseCode.TRY_AGAIN_LATER, full)
                 return
             listener.keep(connection.transport.get_extra_info("socket").fileno())

@@ -25,6 +25,7 @@ from gfm_hil.scope.view import Look, View
 Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
 
 SEND_S = 5.0  # timeout of a page that does not read a message
+ANSWER_S = 1.0  # timeout of a page's answer to a ping where another page wants its place
 PER_S, BURST = 20.0, 40  # rate limit of a page's commands
 
 _LOG = logging.getLogger("gfmhil.scope")
@@ -104,6 +105,16 @@ class Session:
         start, speed, since = self._played
         gone = (time.monotonic() - since) * speed / self._pyramid.record.T_s
         return min(self._pyramid.done, int(start + gone))
+
+    async def reads(self) -> bool:
+        """Whether the page answers a ping, as every browser does by itself; else it is dropped."""
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                await (await self._socket.ping())
+        except (TimeoutError, ConnectionClosed):
+            self._socket.transport.abort()
+            return False
+        return True
 
     def picture(self) -> None:
         """Queue the next frame, unless there is none or the page has not read the last one yet: a

@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
+from socketserver import BaseServer, ThreadingMixIn
 from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.listener import Listener
 from gfm_hil.operator import Operator
 from gfm_hil.recording.timing import ROUND_TRIP, SLACK, Spread
 from gfm_hil.telemetry.follow import Follower
 from gfm_hil.telemetry.metrics import METRICS
 from gfm_runtime.states import STATES
 
+_FRESH_S = 0.2  # for so long all scrapes get the same metrics
+_HALF_OPEN, _HALF_OPEN_S = 64, 5.0  # connections that have not asked yet, and how long they may
+_QUEUE = 128  # connections that the kernel keeps until they are accepted
 _WINDOW_S = 10.0  # window of the quantiles, in the run's time
 _SLACK = (0.0, 0.001, 0.01, 0.5)  # low slack is bad
 _ROUND_TRIP = (0.5, 0.99, 0.999, 1.0)  # long round trips are bad
 
 
 class RunCollector(Collector):
-    """The metrics of one run.
+    """The metrics of one run, for scrapes in any thread.
 
     Attributes:
         follower: of the run; None before the run begins: there is nothing to collect.
@@ -32,6 +40,9 @@ class RunCollector(Collector):
     def __init__(self, follower: Follower | None = None) -> None:
         self.follower = follower
         self._operator: Operator | None = None
+        self._lock = threading.Lock()
+        self._found: list[Metric] = []
+        self._until = 0.0
 
     def close(self) -> None:
         """Close what ``collect`` has opened."""
@@ -39,11 +50,13 @@ class RunCollector(Collector):
             self._operator.close()
 
     def collect(self) -> Iterator[Metric]:
-        """The present metrics."""
-        if self.follower is not None:
-            yield from self._counts(self.follower)
-            yield from self._times(self.follower)
-            yield from self._words(self.follower)
+        """The metrics, at most ``_FRESH_S`` old."""
+        with self._lock:
+            if self.follower is not None and time.monotonic() > self._until:
+                of = self.follower
+                self._found = [*self._counts(of), *self._times(of), *self._words(of)]
+                self._until = time.monotonic() + _FRESH_S
+            yield from self._found
 
     def _counts(self, follower: Follower) -> Iterator[Metric]:
         ticks, misses = _metric("gfmhil_ticks_total"), _metric("gfmhil_misses_total")
@@ -105,8 +118,42 @@ def _quantiles(name: str, found: Spread, quantiles: tuple[float, ...]) -> Metric
     return metric
 
 
-def _say_nothing(*_: object) -> None:
-    """Print nothing about a failed connection."""
+class _Request(WSGIRequestHandler):
+    server: _Server
+
+    def parse_request(self) -> bool:
+        self.server.socket.keep(self.connection.fileno())  # it has asked
+        return super().parse_request()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Print nothing about a request."""
+
+
+class _Server(ThreadingMixIn, WSGIServer):
+    """A thread for each connection. Any number of them that ask nothing, or ask at once, leaves
+    room for another.
+
+    Raises:
+        OSError: the port cannot be bound.
+    """
+
+    daemon_threads = True
+    socket: Listener
+
+    def __init__(self, host: str, port: int, app: Callable[..., Any]) -> None:
+        self.socket = Listener(host, port, _HALF_OPEN, _HALF_OPEN_S, _HALF_OPEN_S)
+        BaseServer.__init__(self, self.socket.getsockname(), _Request)
+        self.socket.listen(_QUEUE)
+        self.server_name, self.server_port = host, self.socket.port
+        self.setup_environ()
+        self.set_app(app)
+
+    def service_actions(self) -> None:
+        """End the connections that have asked nothing for too long."""
+        self.socket.reap()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that disconnects is not an error."""
 
 
 @contextlib.contextmanager
@@ -119,11 +166,11 @@ def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int
     registry = CollectorRegistry()
     registry.register(collector)
     try:
-        server, thread = start_http_server(port, addr=host, registry=registry)
+        server = _Server(host, port, make_wsgi_app(registry))
     except OSError as problem:
         raise UserError(f"--prometheus {port}: {host}: {problem.strerror}") from None
-    # A client that disconnects is not an error; socketserver would print a traceback.
-    setattr(server, "handle_error", _say_nothing)  # noqa: B010 (mypy takes it for a method)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
     try:
         yield int(server.server_port)
     finally:

@@ -22,6 +22,8 @@ from gfm_hil.xcp.memory import (
 
 MOST = 255  # bytes of a command and of a response, at most: MAX_CTO
 _HEADER = struct.Struct("<HH")  # LEN and CTR of XCP on Ethernet
+_LARGEST, _SHORT = 65507, 32  # bytes: what UDP carries, and a few short answers
+_MOST_TOLD = 1000  # lines about refusals
 _IDLE_S = 30.0  # after so long without a command another master may connect
 
 CONNECT, DISCONNECT, GET_STATUS, SYNCH, GET_COMM_MODE_INFO, GET_ID = range(0xFF, 0xF9, -1)
@@ -48,7 +50,7 @@ class Slave:
         name: of the A2L file, and what the slave calls itself.
         a2l: the A2L file.
         writes: whether the master may write.
-        notice: gets a line for each refused write.
+        notice: gets a line for each refusal, of the first ``_MOST_TOLD``.
         clock: monotonic time, s.
         most: bytes of a command and of a response on its line.
     """
@@ -67,18 +69,25 @@ class Slave:
         self._writes, self._notice, self._clock, self._most = writes, notice, clock, most
         self._master: Any = None
         self._heard = 0.0
-        self._counter = 0
+        self._counter = self._told = 0
         self._at = (0, 0)  # MTA: extension and address
 
     def take(self, datagram: bytes, peer: Any) -> bytes:
-        """The answer to a datagram from a peer's socket address; empty for none."""
+        """The answer to a datagram from a peer's socket address; empty for none.
+
+        That to a datagram which connects is no longer than the datagram, or than a few short
+        answers: its sender's address may be forged, and belong to a machine that asked nothing.
+        """
         out, rest = b"", datagram
+        room = _LARGEST if peer == self._master else max(len(datagram), _SHORT)
         while len(rest) >= _HEADER.size:
             length, _ = _HEADER.unpack_from(rest)
             packet = rest[_HEADER.size : _HEADER.size + length]
             rest = rest[_HEADER.size + length :]
             whole = 1 <= length <= self._most and len(packet) == length
             response = self.packet(packet if whole else b"", peer)
+            if len(out) + _HEADER.size + len(response) > room:
+                break
             if response:
                 out += _HEADER.pack(len(response), self._counter) + response
                 self._counter = (self._counter + 1) % 2**16
@@ -104,8 +113,14 @@ class Slave:
             return bytes([_RES]) + self._carried_out(packet, peer)
         except Refused as problem:
             if problem.code != CMD_SYNCH:
-                self._notice(f"refused: {problem}")
+                self._tell(f"refused: {problem}")
             return bytes([_ERR, problem.code])
+
+    def _tell(self, text: str) -> None:
+        self._told += 1
+        if self._told <= _MOST_TOLD:
+            last = "; further refusals are not told" if self._told == _MOST_TOLD else ""
+            self._notice(text + last)
 
     def _carried_out(self, packet: bytes, peer: Any) -> bytes:
         """What follows the code of a positive response.

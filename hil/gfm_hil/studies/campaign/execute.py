@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.stopping import end_with_parent
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.worker import Job, Record, record, run_chunk
+from gfm_runtime.children import end_with_parent
 
 CHUNK = 8  # runs a task: a quarter of a second, so that little is lost and little is waited for
 _AHEAD = 2  # tasks in hand a worker
@@ -88,21 +88,29 @@ def _keep(done: set[Future[list[Record]]], keep: Callable[[list[Record]], None])
 @contextlib.contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of processes with one thread each. They are forked, when there is work, from a server
-    that at once begins to import what all need."""
+    that at once begins to import what all need. All end with this process, and a KeyboardInterrupt
+    in this context ends them at once."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("forkserver")
     # scipy loads its parts when they are first used
-    context.set_forkserver_preload([run_chunk.__module__, "scipy.signal"])
+    first = f"{__package__}.forked"
+    context.set_forkserver_preload([first, run_chunk.__module__, "scipy.signal"])
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
     try:
         # it starts with SIGINT blocked: Ctrl-C is the parent's to handle, also while it imports
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         forkserver.ensure_running()
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        yield pool
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+    except KeyboardInterrupt:
+        for process in multiprocessing.active_children():
+            process.kill()
+        raise
     finally:
-        pool.shutdown(cancel_futures=True)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -112,7 +120,10 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 def _set_up() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    end_with_parent()
+    end_with_parent(by=signal.SIGKILL)
+    command = multiprocessing.parent_process()
+    if command is not None and not command.is_alive():  # it ended before
+        os._exit(1)
 
 
 @contextlib.contextmanager

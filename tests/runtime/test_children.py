@@ -1,0 +1,92 @@
+"""A program behind a guard: how it ends, what it leaves, what it prints."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gfm_runtime.children import END_NOW, KEPT, guarded
+
+pytestmark = pytest.mark.processes
+
+PATIENCE_S = 60.0
+#: ignores SIGTERM, and has a child in a session of its own that does so too
+STUBBORN = r"""
+import os, signal, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+program = os.fork()
+if not program:
+    os.setsid()
+os.write(1, b"%s %d\n" % (b"program" if program else b"forked", os.getpid()))
+time.sleep(1000)
+"""
+
+
+def shell(text: str) -> list[str]:
+    return ["sh", "-c", text]
+
+
+def gone(numbers: list[int]) -> bool:
+    until = time.monotonic() + PATIENCE_S
+    while any(Path(f"/proc/{number}").exists() for number in numbers):
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "said"),
+    [
+        (shell("echo out; echo err >&2; exit 5"), 5, b"out\nerr\n"),
+        (shell("kill -SEGV $$"), -signal.SIGSEGV, b""),
+        (shell("kill -KILL $$"), -signal.SIGKILL, b""),
+        (["/no/such"], 2, b"gfmhil: /no/such: cannot be started: No such file or directory\n"),
+    ],
+)
+def test_a_guard_ends_as_its_program(command: list[str], code: int, said: bytes) -> None:
+    done = subprocess.run(guarded(command, bounded=True), stdout=subprocess.PIPE, check=False)
+    assert (done.returncode, done.stdout) == (code, said)
+
+
+def test_of_much_it_keeps_the_beginning_and_the_end() -> None:
+    program = [sys.executable, "-c", "print('first' + 10**7 * '.' + 'last')"]
+    said = subprocess.run(guarded(program, bounded=True), stdout=subprocess.PIPE, check=True).stdout
+    assert said.startswith(b"first.") and said.endswith(b".last\n")
+    note = f"\n… {10**7 + 10 - 2 * KEPT} bytes are left out here …\n".encode()
+    assert len(said) == 2 * KEPT + len(note) and note in said
+
+
+@pytest.mark.parametrize("how", ["program ends", "parent is killed", "SIGTERM", "END_NOW"])
+def test_nothing_is_left_of_a_stubborn_program(how: str) -> None:
+    script = (
+        "import os, subprocess, sys; from gfm_runtime.children import guarded\n"
+        f"p = subprocess.Popen(guarded([sys.executable, '-c', {STUBBORN!r}]))\n"
+        "os.write(1, b'guard %d\\n' % p.pid); p.wait()"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        lines = (parent.stdout.readline().split() for _ in range(3))
+        number = {name.decode(): int(text) for name, text in lines}
+        victim = {"program ends": number["program"], "parent is killed": parent.pid}
+        by = {"SIGTERM": signal.SIGTERM, "END_NOW": END_NOW}.get(how, signal.SIGKILL)
+        os.kill(victim.get(how, number["guard"]), by)
+        assert gone([*number.values()])
+
+
+def test_a_program_gets_the_signals_of_its_guard() -> None:
+    script = (
+        "import time\ntry:\n print(1, flush=True); time.sleep(1000)\n"
+        "except KeyboardInterrupt:\n print(2)"
+    )
+    command = guarded([sys.executable, "-c", script])
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"1\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.read() == b"2\n"
