@@ -117,11 +117,13 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
 
     Args:
         named: the command takes an endpoint for each converter, see ``endpoints``; the option
-            --converter says that the only one is that of a network's converter.
+            --converter says which one it controls. That of other commands says which one gets
+            the law and the inner stage.
 
     Raises:
         UserError: as ``load_scenario``.
     """
+    gets = {} if named or "converter" not in options else {"converter": "--converter"}
     ends = endpoints(options)
     for name in ends:
         if name and not named:
@@ -131,7 +133,8 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
             )
     return load_scenario(
         options.scenario,
-        OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
+        OPTIONS | gets | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
+        converter=options.converter if gets else None,
         mode=options.mode,
         link__type=options.link,
         link__endpoint=None if named and options.converter is not None else ends.get(""),

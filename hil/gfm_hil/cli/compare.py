@@ -21,6 +21,7 @@ from gfm_hil.cli.common import (
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import fitting, numbers, terminal
+from gfm_hil.engine.setup import ONE_CONVERTER
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
@@ -45,6 +46,8 @@ def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
     asked = options.link or options.endpoint or options.option or options.mode == "realtime"
     base = resolve(options, in_process=not asked)
+    if base.network is not None:
+        raise UserError(f"{options.scenario}: {ONE_CONVERTER}")
     names = split_laws(options.laws) if options.laws else base.compare
     if not names:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")

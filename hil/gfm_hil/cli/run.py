@@ -34,8 +34,13 @@ def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument(
         "--law",
-        help="override law: catalogue name or law file; of a network's converters that name none",
+        help="override law: catalogue name or law file; of a network see --converter",
     )
+    command.add_argument(
+        "--converter", metavar="NAME",
+        help="of a network: the one that gets --law and --inner; all get them by default, if none"
+        " has its own",
+    )  # fmt: skip
     command.add_argument(
         "--controller", metavar="KIND:NAME",
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"

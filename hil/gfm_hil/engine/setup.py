@@ -26,6 +26,8 @@ from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import NY, NY_INNER, REF_NAMES, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
+ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
+
 
 @dataclass
 class Bench:
@@ -110,9 +112,7 @@ def make_bench(scenario: Scenario, real: str = "float64") -> Bench:
         UserError: the law has no steady state on this grid, or the scenario has a network.
     """
     if scenario.network is not None and scenario.converter is None:
-        raise UserError(
-            "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
-        )
+        raise UserError(ONE_CONVERTER)
     benches = make_benches(scenario, real)
     return next(b for b in benches if b.scenario.converter == scenario.converter)
 
