@@ -17,6 +17,7 @@ from gfm_hil.cli.common import (
     print_summary,
     progress_bar,
     resolve,
+    why_it_ended,
     window,
 )
 from gfm_hil.cli.companion import companion
@@ -95,7 +96,7 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
-            print_summary(run.summary, folder)
+            print_summary(run.summary, folder, why_it_ended(run))
         if scope is not None and scope.poll() is None and run.summary["status"] != "interrupted":
             print("the scope stays open until Ctrl-C", file=sys.stderr, flush=True)
             with contextlib.suppress(KeyboardInterrupt):

@@ -21,7 +21,7 @@ from gfm_hil.scenario.events import Gains, LawChange, Reset
 from gfm_hil.scenario.model import Scenario, plant_of
 from gfm_plant import Network, NoEquilibrium, start_again, take_out
 from gfm_plant.names import MAY_START
-from gfm_runtime import load_law
+from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import NY, NY_INNER, REF_NAMES, carried
 from gfm_runtime.states import READY, SAFE, STATES
@@ -187,8 +187,8 @@ def _ready(
     Args:
         contents: of the files among names and inner stage.
     """
-    # under the name that events use: the name inside a law file may differ
-    sets = [replace(load_law(name, inner), name=name) for name in names]
+    titles = law_titles(names)
+    sets = [replace(load_law(name, inner), name=titles[name]) for name in names]
     return Controller(sets, T_s, [0.0] * len(REF_NAMES), hold, real, omega_b)
 
 
