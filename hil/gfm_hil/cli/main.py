@@ -1,8 +1,8 @@
 """Argument parsing and exit codes.
 
-0: done, and a run ended as its scenario expects; 1: a conformity test fails or cannot be judged, or
-a report is worse than the one before; 2: wrong input, nothing started; 3: a run ended otherwise, or
-its folder could not be completed; 130: interrupted.
+0: done, and a run ended as its scenario expects; 1: a conformity test fails, or a report is worse
+than the one before; 2: wrong input, nothing started; 3: a run ended otherwise, or its folder could
+not be completed; 4: no conformity test fails, but one cannot be judged; 130: interrupted.
 """
 
 from __future__ import annotations
