@@ -99,12 +99,12 @@ def law_file(name: str) -> LawFile:
         return _shipped(name, "")
     if name in tuned_names():
         return _shipped(name, "tuned")
-    known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
     close = meant(name, [*law_names(), *tuned_names()])
     with contextlib.suppress(OSError, ValueError):  # of what can be no path
         if Path(f"{name}.toml").is_file():
             close = f"; did you mean '{name}.toml'?"
-    raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}{close}")
+    known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
+    raise LawError(f"law {name!r}", f"unknown{close or ';'} use a .toml file or {known}")
 
 
 def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:

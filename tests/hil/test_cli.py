@@ -410,3 +410,30 @@ def test_an_unstable_law_is_told_with_its_mode(
         assert "an unstable mode" not in capsys.readouterr().out
     assert main([*start, str(tmp_path / "good"), "--law", "vsg-2"]) == 0
     assert "unstable" not in capsys.readouterr().out
+
+
+def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([]) == 0
+    assert "run a scenario and leave a run folder" in capsys.readouterr().out
+    assert main(["runn", "pref_step"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("gfmhil: runn: no command; did you mean 'run'? must be one of ['run'")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("event", "line"),
+    [
+        ({"typ": "law", "law": "vsg-2"}, "events.0.typ = 'law': unknown key; did you mean 'type'?"),
+        ({"type": "lwa", "law": "vsg-2"}, "events.0.type = 'lwa': did you mean 'law'? must be one"),
+        ({"type": "law", "law": 3}, "events.0.law: must be a valid string, not 3"),
+    ],
+)
+def test_a_wrong_word_in_a_scenario_is_one_line_and_the_hint_comes_first(
+    event: dict[str, Any], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", scenario(events=[{"t": 0.1, **event}])]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1

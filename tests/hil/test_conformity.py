@@ -941,3 +941,21 @@ def test_the_list_is_also_json(capsys: pytest.CaptureFixture[str]) -> None:
     listed = json.loads(capsys.readouterr().out)
     assert [row["test"] for row in listed] == [case.id for case in load_cases(["miso"])]
     assert all(row["runs"] > 0 and row["title"] and row["source"] for row in listed)
+
+
+@pytest.mark.parametrize(
+    ("criterion", "line"),
+    [
+        ('to = "befor"', "jump.toml: criteria.2.to: must be a valid number or 'before' or 'droop', "
+         "not 'befor'; did you mean 'before'?"),
+        ('too = "before"', "jump.toml: criteria.2.too = 'before': unknown key; did you mean 'to'?"),
+    ],
+)  # fmt: skip
+def test_a_wrong_word_in_a_test_is_one_line_in_its_own_words(
+    criterion: str, line: str, lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = f'kind = "settles"\nclause = "back"\ntolerance = 0.1\nwithin = 0.5\n{criterion}\n'
+    (lab / "jump.toml").write_text(f"{LAB}\n[[criteria]]\n{more}")
+    assert main(["conform", "--law", "droop-3", "--against", str(lab)]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1

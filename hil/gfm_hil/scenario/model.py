@@ -50,7 +50,7 @@ from gfm_plant import (
 from gfm_plant.records import SIZES
 from gfm_plant.synchro_check import AGREED
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
-from gfm_runtime.errors import meant, printable
+from gfm_runtime.errors import allowed, meant, printable
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.signals import REF_NAMES, table_hash
 from gfm_runtime.toml_file import read_toml
@@ -474,7 +474,7 @@ def find_file(kind: str, name: str, pattern: str) -> Path:
     if given.name.removesuffix(".toml") in shipped:
         return shipped[given.name.removesuffix(".toml")]
     what = "is not a regular file" if exists else "no such file"
-    known = f"shipped are {sorted(shipped)}{meant(given.stem, shipped)}"
+    known = allowed(given.stem, sorted(shipped), "shipped are")
     raise UserError(printable(f"{kind} {name}: {what}; {known}"))
 
 
@@ -623,7 +623,7 @@ def check_scenario(
     try:
         scenario = Scenario.model_validate(content)
     except ValidationError as problem:
-        raise UserError("\n".join(lines(problem, Scenario, source))) from None
+        raise UserError("\n".join(lines(problem, Scenario, source, content))) from None
     wrong: list[str] = []
     if scenario.inner is not None:
         try:

@@ -84,7 +84,7 @@ def check_campaign(
     try:
         file = CampaignFile.model_validate(content)
     except ValidationError as problem:
-        wrong = lines(problem, CampaignFile)
+        wrong = lines(problem, CampaignFile, content=content)
         raise UserError("\n".join(f"{path}: {line}" for line in wrong)) from None
     if text is None:
         text = toml_text(content)
