@@ -91,17 +91,17 @@ def _line(at: Path, errors: Sequence[Any], model: Any) -> str:
         if "tag" in context:
             tags = _quoted(context["expected_tags"])
             return f"{key} = {_cut(context['tag'])}: {allowed(context['tag'], tags)}"
-        known = error["input"] if isinstance(error["input"], dict) else ()
-        close = closest(tag, [word for word in known if word not in _fields(model, error["loc"])])
+        table = error["input"] if isinstance(error["input"], dict) else {}
+        close = closest(tag, [word for word in table if word not in _fields(model, error["loc"])])
         if close:
             other = ".".join(filter(None, (path, close)))
-            return f"{other} = {_cut(known[close])}: unknown key; did you mean {tag!r}?"
+            return f"{other} = {_cut(table[close])}: unknown key; did you mean {tag!r}?"
         return f"{key}: missing"
     if error["type"] == "extra_forbidden":
         known = _fields(model, error["loc"][:-1])
-        close = meant(error["loc"][-1], known)
-        others = "" if close or not known else f"; use one of {', '.join(sorted(known))}"
-        return f"{path} = {shown}: unknown key{close}{others}"
+        hint = meant(error["loc"][-1], known)
+        others = "" if hint or not known else f"; use one of {', '.join(sorted(known))}"
+        return f"{path} = {shown}: unknown key{hint}{others}"
     if error["type"] in ("model_type", "dict_type", "model_attributes_type"):
         models = _models_at(model, error["loc"])
         keys = [k for m in models for k, field in m.model_fields.items() if field.is_required()]

@@ -248,7 +248,8 @@ class _Judge:
         )  # fmt: skip
 
     def _cannot(self, reason: str) -> Verdict:
-        why, verdict = self.c.informative, CANNOT if self.c.informative is None else INFORMATIVE
+        why = self.c.informative
+        verdict: Outcome = CANNOT if why is None else INFORMATIVE
         text = f"Cannot be judged: {reason}" + (f" (informative: {why})." if why else ".")
         made = self._made(True, None, "", "", text)
         return replace(made, verdict=verdict, signal=getattr(self.c, "signal", ""))
