@@ -140,8 +140,8 @@ def fault(
         _require("R_0", Z_0.real, Z_0.real >= 0, ">= 0 p.u.")
     if position is not None:
         inner = LEAST_SEGMENT <= position <= 1 - LEAST_SEGMENT
-        allowed = f"0, or in [{LEAST_SEGMENT:g}, {1 - LEAST_SEGMENT:g}]"
-        _require("position", position, position == 0 or inner, allowed)
+        ends = f"0, or in [{LEAST_SEGMENT:g}, {1 - LEAST_SEGMENT:g}]"
+        _require("position", position, position == 0 or inner, ends)
         lines = wiring.named_lines()
         for name, _ in wiring.transformers:
             del lines[name]

@@ -396,7 +396,8 @@ class Wiring:
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
             sources.append(Source(GRID_SOURCE, self.grid))
-        whole, held = branches, {GROUND} | {part.node for part in (*capacitors, *shunts, *sources)}
+        whole, held = branches, {GROUND} | {source.node for source in sources}
+        held |= {one.node for one in capacitors} | {one.node for one in shunts}
         if self.closed and not self.opened:  # no line may hang, but a converter on an open bus may
             held |= {node for line in self.branches for node in (line.start, line.end)}
         branches = _without_ends(branches, held)

@@ -1,4 +1,4 @@
-from .catalogue import LawSet, get_law, law_file, law_names, load_law, tuned_names
+from .catalogue import LawSet, get_law, law_file, law_names, law_titles, load_law, tuned_names
 from .elements import Element
 from .errors import LawError
 from .kernel import law_dtype, pack_law, state_dtype, step
@@ -28,6 +28,7 @@ __all__ = [
     "law_dtype",
     "law_file",
     "law_names",
+    "law_titles",
     "load_law",
     "pack_law",
     "parse_law",

@@ -37,13 +37,13 @@ class Controller:
     The records ``ctl``, ``laws``, ``states`` and ``est`` hold all that a tick needs, and are the
     arguments of ``gfm_runtime.controller.control``.
 
-    ``asked`` is the name of the law that was requested last, and ``gains`` are its gains that
-    differ from its file. ``names`` and ``changed`` are the same for every entry of ``laws``;
-    ``labels`` are their names in reports. ``inner`` says whether one of the laws has an inner
-    stage; y and u then have its signals too, whichever law is active.
+    ``asked`` is what the law that was requested last is asked for by, and ``gains`` are its gains
+    that differ from its file. ``names`` and ``changed`` are the same for every entry of ``laws``;
+    ``labels`` are their names in reports, ``titles`` those of ``sets``. ``inner`` says whether one
+    of the laws has an inner stage; y and u then have its signals too, whichever law is active.
 
     Args:
-        sets: the laws that may become active, each under its name; the first one starts.
+        sets: the laws that may become active, each asked for by its ``asked``; the first starts.
         T_s: sampling time, s.
         references: Y_ref at the start, shape (5,), p.u.
         hold: ticks in a row without a fresh measurement before the safe state.
@@ -64,19 +64,20 @@ class Controller:
         omega_b: float = 100 * math.pi,
     ) -> None:
         self.T_s, self.omega_b = T_s, omega_b
-        self.sets = {s.name: s for s in sets}
+        self.sets = {s.asked or s.name: s for s in sets}
+        self.titles = {asked: s.name for asked, s in self.sets.items()}
         self.asked, self.gains = "", dict[str, float]()
         self.discrete: list[DiscreteLaw] = []
         self.labels: list[str] = []
         self.names: list[str] = []
         self._first: dict[str, int] = {}
-        for s in self.sets.values():
-            self._first[s.name] = len(self.discrete)
+        for asked, s in self.sets.items():
+            self._first[asked] = len(self.discrete)
             self.discrete += [discretise(law, T_s) for law in s.laws]
-            self.names += [s.name] * len(s.laws)
+            self.names += [asked] * len(s.laws)
             self.labels += [s.name] if len(s.laws) == 1 else _stage_labels(s)
         self.discrete += [self.discrete[0]] * SPARE
-        self.names += [sets[0].name] * SPARE
+        self.names += [next(iter(self.sets))] * SPARE
         self.changed: list[dict[str, float]] = [{} for _ in self.discrete]
         self.labels += [f"other gains {k + 1}" for k in range(SPARE)]
         self.laws = np.concatenate([pack_law(d, real, omega_b) for d in self.discrete])
@@ -85,7 +86,7 @@ class Controller:
         self.ctl = make_controller(hold)
         self.ctl["ref"] = self.ctl["ref_target"] = np.asarray(references, dtype=float)
         self.est = make_impedance(T_s, 1.0, omega_b)
-        self.select(sets[0].name)
+        self.select(next(iter(self.sets)))
         self.ctl["active"], self.ctl["request"] = self.ctl["request"], -1
         self.ctl["state"] = READY
 

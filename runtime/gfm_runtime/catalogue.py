@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -24,16 +25,38 @@ class LawSet:
     """The laws of one name: a single law, or the stages of a gain-scheduled one.
 
     Attributes:
-        name: the name asked for.
+        name: what results call it.
         laws: one law, or one for each stage in ascending order of the stage's reactance.
         schedule: None, or the limits of the stages.
         inner: the inner stage that replaces the law file's own, by name or path; None: its own.
+        asked: the name or path by which it is asked for; its name if empty.
     """
 
     name: str
     laws: tuple[Law, ...]
     schedule: Schedule | None = None
     inner: str | None = None
+    asked: str = ""
+
+
+def law_titles(names: Iterable[str]) -> dict[str, str]:
+    """What results call the laws of catalogue names and paths: the name that a file gives its law.
+
+    Of several laws with one name, those from files have the name of the file too. A file that
+    cannot be read any more counts as one that calls its law as itself.
+    """
+    laws = dict.fromkeys(names)
+    titles = {name: name for name in laws if not name.endswith(".toml")}
+    for path in (name for name in laws if name not in titles):
+        try:
+            own = law_file(path).name
+        except LawError:
+            own = Path(path).stem
+        more = Path(path).name
+        tries = [own, f"{own} ({more})"]
+        tries += [f"{own} ({more}, {k})" for k in range(2, len(laws) + 1)]
+        titles[path] = next(title for title in tries if title not in titles.values())
+    return {name: titles[name] for name in laws}
 
 
 def _natural(name: str) -> list[int | str]:
@@ -74,12 +97,12 @@ def law_file(name: str) -> LawFile:
         return read_law_file(name)
     if (shipped := _shipped(name)) is not None:
         return shipped
-    known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
     close = meant(name, [*law_names(), *tuned_names()])
     with contextlib.suppress(OSError, ValueError):  # of what can be no path
         if Path(f"{name}.toml").is_file():
             close = f"; did you mean '{name}.toml'?"
-    raise LawError(f"law {name!r}", f"unknown; use a .toml file or {known}{close}")
+    known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
+    raise LawError(f"law {name!r}", f"unknown{close or ';'} use a .toml file or {known}")
 
 
 def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
@@ -101,7 +124,7 @@ def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
         laws = tuple(build_law(file, parameters) for parameters in sets)
     except LawError as problem:
         raise problem.within(f"law {'file ' * name.endswith('.toml')}{name}") from None
-    return LawSet(file.name, laws, file.schedule, inner)
+    return LawSet(file.name, laws, file.schedule, inner, name)
 
 
 def get_law(name: str, **changed: float) -> Law:

@@ -8,7 +8,7 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gfm_runtime.errors import LawError, meant
+from gfm_runtime.errors import LawError, allowed
 
 _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -60,8 +60,8 @@ def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
             return float(number)
         case ast.Name(id=name):
             if name not in parameters:
-                known = f"; known: {sorted(parameters)}{meant(name, parameters)}"
-                raise LawError(where, f"unknown parameter {name!r}{known}")
+                known = allowed(name, sorted(parameters), "known:")
+                raise LawError(where, f"unknown parameter {name!r}; {known}")
             return parameters[name]
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _UNARY:
             return _UNARY[type(op)](_walk(where, operand, parameters))

@@ -150,8 +150,9 @@ def named_inner(name: str) -> InnerSpec | None:
         else:
             known = list(inner_names())
             raise ValueError(f"unknown; use a .toml file or one of {known}{meant(name, known)}")
-        return _ADAPTER.validate_python(parse_toml(text))
+        content = parse_toml(text)
+        return _ADAPTER.validate_python(content)
     except ValidationError as problem:
-        raise LawError(where, *lines(problem, InnerSpec)) from None
+        raise LawError(where, *lines(problem, InnerSpec, content=content)) from None
     except ValueError as problem:
         raise LawError(where, str(problem)) from None

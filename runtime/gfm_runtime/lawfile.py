@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
-from gfm_runtime.errors import LawError, Mistakes, meant
+from gfm_runtime.errors import LawError, Mistakes, allowed, meant
 from gfm_runtime.expressions import evaluate
 from gfm_runtime.inner_file import InnerSpec, build_inner, named_inner
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
@@ -39,9 +39,9 @@ Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class ElementSpec(Table):
-    """One factor: its kind and its numbers (T, T_f in s)."""
+    """One factor: its type and its numbers (T, T_f in s)."""
 
-    type: Literal["P", "I", "D", "PI", "PD", "IF", "O"] = Field(description="kind of element")
+    type: Literal["P", "I", "D", "PI", "PD", "IF", "O"] = Field(description="type of element")
     k: Number | None = Field(None, description="gain")
     k_i: Number | None = Field(None, description="integral gain, 1/s")
     T: Number | None = Field(None, description="time constant, s")
@@ -64,12 +64,23 @@ class ParameterSpec(Table):
     model_config = ConfigDict(json_schema_extra=lambda schema: schema.pop("required"))
 
     value: float = Field(allow_inf_nan=False, description="the number, in its unit")
-    unit: str = Field(description="e.g. p.u. or 1/s")
-    source: str = Field(description="where the number comes from")
+    unit: str = Field("", description="e.g. p.u. or 1/s")
+    source: str = Field("", description="where the number comes from")
     free: Range | None = Field(None, description="[low, high] within which a synthesis may move it")
     tied: str | None = Field(
         None, description="expression that it follows while a synthesis moves others"
     )
+
+
+def _valued(value: Any) -> Any:
+    bare = isinstance(value, int | float) and not isinstance(value, bool)
+    return {"value": value} if bare else value
+
+
+# a number alone may stand for the table
+Named = Annotated[
+    ParameterSpec, BeforeValidator(_valued, json_schema_input_type=ParameterSpec | float)
+]
 
 
 class ErrorMapSpec(Table):
@@ -154,7 +165,7 @@ class LawFile(Table):
     source: str = Field(description="where the law and its numbers come from")
     error_map: ErrorMapSpec = Field(ErrorMapSpec(), description="what Φ acts on")
     u_0: SetPoints = Field(SetPoints(), description="set-points of u")
-    parameters: dict[Name, ParameterSpec] = Field(
+    parameters: dict[Name, Named] = Field(
         default_factory=dict, description="named numbers for the expressions"
     )
     phi: dict[str, Factors] = Field(
@@ -267,7 +278,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
     numbers = {name: spec.value for name, spec in file.parameters.items()}
     for name, value in (changed or {}).items():
         if name not in numbers:
-            known = f"known: {sorted(numbers)}{meant(name, numbers)}"
+            known = allowed(name, sorted(numbers), "known:")
             raise LawError(f"parameter {name}", f"unknown to {file.name}; {known}")
         numbers[name] = value
     parameters = {
@@ -364,6 +375,8 @@ def _over(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
         old = below.get(key)
         if isinstance(value, dict) and isinstance(old, dict) and "type" not in value:
             value = _over(old, value)
+        elif isinstance(old, dict) and "value" in old:  # another number for a parameter
+            value = {**old, "value": value, "source": ""}
         merged[key] = value
     return merged
 
@@ -379,10 +392,12 @@ def parse_law(text: str, where: str = "law file", folder: str | Path = ".") -> L
     Raises:
         LawError: every mistake found, each with its path in the file.
     """
+    content: Any = None
     try:
-        return LawFile.model_validate(_with_base(parse_toml(text), Path(folder), ()))
+        content = _with_base(parse_toml(text), Path(folder), ())
+        return LawFile.model_validate(content)
     except ValidationError as problem:
-        raise LawError(where, *lines(problem, LawFile)) from None
+        raise LawError(where, *lines(problem, LawFile, content=content)) from None
     except ValueError as problem:
         raise LawError(where, str(problem)) from None
 

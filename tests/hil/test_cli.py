@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.scenario.model import shipped_scenarios
 from gfm_hil.scenario.toml_out import toml_text
-from gfm_runtime import law_names
+from gfm_runtime import law_names, law_titles
 from gfm_runtime.inner_file import inner_names
 
 from ..support.laws import every_law
@@ -340,3 +342,98 @@ def test_a_reader_that_has_seen_enough_is_no_error():
             stdout=closed, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def own_law(folder: Path, name: str, **gains: float) -> Path:
+    """A law file of VSG-2 in a folder of its own, with another name and other gains."""
+    path = folder / "laws of mine" / "file.toml"
+    path.parent.mkdir()
+    return gfmhil.Law.load("vsg-2").with_gains(name, **gains).save(path)
+
+
+def test_results_call_a_law_by_its_name_and_never_by_its_path(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = str(own_law(tmp_path, "mine", D_p=0.011))
+    content = {
+        "title": "own", "duration": 0.03, "law": own, "link": {"type": "inproc"},
+        "ready_laws": ["vsg-2"], "plant": {"delay": {"samples": 1}},
+        "events": [{"t": 0.01, "type": "law", "law": "vsg-2"},
+                   {"t": 0.02, "type": "law", "law": own}],
+    }  # fmt: skip
+    file = tmp_path / "s.toml"
+    file.write_text(toml_text(content))
+    run = tmp_path / "run"
+    assert main(["run", str(file), "--out", str(run), "--quiet"]) == 0
+    printed = capsys.readouterr().out.replace(str(run), "")
+    assert "mine → vsg-2 → mine" in printed and str(tmp_path) not in printed
+    for name in ("summary.json", "events.jsonl", "report.html", "network.svg"):
+        assert str(tmp_path) not in (run / name).read_text(), name
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["laws"] == ["mine", "vsg-2", "mine"]
+    assert [e["label"] for e in summary["events"]] == ["law vsg-2", "law mine"]
+    assert gfmhil.load_run(run).laws == ["mine", "vsg-2"]
+    compared = tmp_path / "compared"
+    options = ["--laws", f"{own},vsg-2", "--out", str(compared), "--quiet"]
+    assert main(["compare", str(file), *options]) == 0
+    assert {*json.loads((compared / "comparison.json").read_text())} == {"mine", "vsg-2"}
+    assert str(tmp_path) not in capsys.readouterr().out.replace(str(compared), "")
+    assert [*gfmhil.compare(file, [own, "vsg-2"])] == ["mine", "vsg-2"]
+
+
+def test_laws_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    own = str(own_law(tmp_path, "vsg-2"))
+    again = tmp_path / "file.toml"
+    again.write_text(Path(own).read_text())
+    titles = law_titles([own, "vsg-2", str(again), "gone/mine.toml"])
+    assert [*titles.values()] == ["vsg-2 (file.toml)", "vsg-2", "vsg-2 (file.toml, 2)", "mine"]
+
+
+def test_an_unstable_law_is_told_with_its_mode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By run, compare and laws show; of a stable one they say nothing."""
+    own = str(own_law(tmp_path, "mine", k_34=50.0))
+    words = r"the linear loop of mine has an unstable mode: [\d.]+ Hz, \+[\d.e+]+ 1/s "
+    run, command = tmp_path / "run", r"\(gfmhil design poles --law '.*file.toml' --scenario "
+    start = ["run", "pref_step", "--link", "inproc", "--quiet", "--no-figures", "--out"]
+    assert main([*start, str(run), "--law", own]) == 3
+    assert re.search(words + command + re.escape(f"{run}/scenario.toml)"), capsys.readouterr().out)
+    options = ["--laws", f"{own},vsg-2", "--out", str(tmp_path / "compared"), "--quiet"]
+    assert main(["compare", "pref_step", *options]) == 3
+    assert len(re.findall(words, capsys.readouterr().out)) == 1
+    assert main(["laws", "show", own]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(words + command + r"pref_step\)", shown)
+    for law in ("vsg-2", "droop-1"):  # droop-1 is for a weaker grid than that of pref_step
+        assert main(["laws", "show", law]) == 0
+        assert "an unstable mode" not in capsys.readouterr().out
+    assert main([*start, str(tmp_path / "good"), "--law", "vsg-2"]) == 0
+    assert "unstable" not in capsys.readouterr().out
+
+
+def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([]) == 0
+    assert "run a scenario and leave a run folder" in capsys.readouterr().out
+    assert main(["runn", "pref_step"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("gfmhil: runn: no command; did you mean 'run'? must be one of ['run'")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("event", "line"),
+    [
+        ({"typ": "law", "law": "vsg-2"}, "events.0.typ = 'law': unknown key; did you mean 'type'?"),
+        ({"type": "lwa", "law": "vsg-2"}, "events.0.type = 'lwa': did you mean 'law'? must be one"),
+        ({"type": "law", "law": 3}, "events.0.law: must be a valid string, not 3"),
+    ],
+)
+def test_a_wrong_word_in_a_scenario_is_one_line_and_the_hint_comes_first(
+    event: dict[str, Any], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", scenario(events=[{"t": 0.1, **event}])]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1

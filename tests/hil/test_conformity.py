@@ -25,7 +25,16 @@ from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies import envelopes
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Verdict, judge, judge_nfp, worst
+from gfm_hil.studies.conformity.judge import (
+    CANNOT,
+    FAIL,
+    INFORMATIVE,
+    PASS,
+    Verdict,
+    judge,
+    judge_nfp,
+    worst,
+)
 from gfm_hil.studies.conformity.model import Criterion, Declared, Nfp, Part
 from gfm_hil.studies.conformity.sets import (
     Case,
@@ -463,19 +472,26 @@ def test_two_workers_find_what_one_does(lab: Path) -> None:
     assert found[0] == found[1]
 
 
-def test_exit_code_is_1_if_a_clause_fails_or_cannot_be_judged(
+def test_exit_code_tells_failed_from_not_judged_and_every_clause_that_fails_is_printed(
     lab: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (lab / "strict.toml").write_text(STRICT)
+    low = '[[criteria]]\nkind = "stays_within"\nclause = "low"\nsignal = "V"\nhigh = 0.5\n'
+    (lab / "strict.toml").write_text(f"{STRICT}\n{low}")
     (lab / "none.toml").write_text(LAB + NONE)
-    for name, code in (("jump", 0), ("strict", 1), ("none", 1)):
+    for name, code in (("jump", 0), ("strict", 1), ("none", 4)):
         file, out = str(lab / f"{name}.toml"), str(lab.parent / name)
         asked = ["conform", "--law", "droop-3", "--against", file, "-o", out, "--no-figures"]
         assert main([*asked, "--workers", "1", "--quiet"]) == code
         tree = ElementTree.parse(lab.parent / name / "junit.xml").getroot()
         kinds = [e.tag for e in tree.iter() if e.tag in ("failure", "error")]
-        assert kinds == {"jump": [], "strict": ["failure"], "none": ["error"] * 2}[name]
-    assert "nobody built it" in capsys.readouterr().out
+        assert kinds == {"jump": [], "strict": ["failure"] * 2, "none": ["error"] * 2}[name]
+    printed = capsys.readouterr().out
+    assert "nobody built it" in printed
+    (part,) = json.loads((lab.parent / "strict" / "results.json").read_text("utf-8"))["laws"][
+        "droop-3"
+    ]["lab/strict"]["parts"]
+    wrong = [c["text"] for c in part["clauses"] if c["verdict"] == FAIL]
+    assert len(wrong) == 2 and all(text in printed for text in wrong)
 
 
 def test_several_laws_give_a_matrix(lab: Path) -> None:
@@ -495,6 +511,24 @@ def test_several_laws_give_a_matrix(lab: Path) -> None:
     assert "report-stiff.html#lab-jump" in report
     matrix = report.split('<table class="matrix">')[1].split("</table>")[0]
     assert matrix.count("<tr>") == 1 + len(tests)  # however many tests there are, down the page
+
+
+@pytest.mark.full  # all shipped tests
+def test_a_good_law_passes_the_documented_default(tmp_path: Path) -> None:
+    """What no law can be judged by is informative, says why, and counts for nothing."""
+    out = tmp_path / "out"
+    asked = ["conform", "--law", "vsg-2", "--inner", "virtual-stator", "--no-figures", "--quiet"]
+    assert main([*asked, "--out", str(out)]) == 0
+    tests = json.loads((out / "results.json").read_text("utf-8"))["laws"]["vsg-2"]
+    clauses = {
+        (name, c["kind"], c["verdict"])
+        for name, test in tests.items()
+        for p in test["parts"]
+        for c in p["clauses"]
+    }
+    told = {(name, kind) for name, kind, verdict in clauses if verdict == INFORMATIVE}
+    assert told == {("gb/6-nfp", "nfp"), ("rte/2-rocof", "in_envelope")}
+    assert {verdict for *_, verdict in clauses} == {PASS, INFORMATIVE}
 
 
 def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
@@ -682,11 +716,13 @@ def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
     assert "gfmhil identify" in report
 
 
-def test_a_plot_without_known_limits_is_drawn_and_not_judged(tmp_path: Path) -> None:
+def test_a_plot_without_known_limits_is_drawn_and_informative(tmp_path: Path) -> None:
     (tmp_path / "plot.toml").write_text(NFP + 'unknown = "nobody knows them"')
     found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
     (part,) = found.of("droop-3", f"{tmp_path.name}/plot")
-    assert part.verdict == CANNOT and "nobody knows them" in part.words
+    assert part.verdict == INFORMATIVE and "nobody knows them" in part.words
+    assert found.failures == [] and not found.passed  # nothing was judged
+    assert 'skipped="1"' in (tmp_path / "out" / "junit.xml").read_text("utf-8")
     assert part.figure is not None and part.figure.path.is_file()
 
 
@@ -747,7 +783,10 @@ def test_the_envelope_of_a_ramp_is_not_for_a_converter_with_droop(ramp: Scenario
     )
     (found,) = judge(run, [one("in_envelope")], under)
     assert found.verdict == CANNOT and "1 % alone moves p by 0.5 p.u." in found.text
-    (other,) = judge(run, [one("in_envelope")], under.model_copy(update={"droop": math.inf}))
+    asked = [one("in_envelope", informative="no law has none")]
+    (told,) = judge(run, asked, under)
+    assert told.verdict == INFORMATIVE and "informative: no law has none" in told.text
+    (other,) = judge(run, asked, under.model_copy(update={"droop": math.inf}))
     assert other.verdict in (PASS, FAIL)
 
 
@@ -916,3 +955,21 @@ def test_the_list_is_also_json(capsys: pytest.CaptureFixture[str]) -> None:
     listed = json.loads(capsys.readouterr().out)
     assert [row["test"] for row in listed] == [case.id for case in load_cases(["miso"])]
     assert all(row["runs"] > 0 and row["title"] and row["source"] for row in listed)
+
+
+@pytest.mark.parametrize(
+    ("criterion", "line"),
+    [
+        ('to = "befor"', "jump.toml: criteria.2.to: must be a valid number or 'before' or 'droop', "
+         "not 'befor'; did you mean 'before'?"),
+        ('too = "before"', "jump.toml: criteria.2.too = 'before': unknown key; did you mean 'to'?"),
+    ],
+)  # fmt: skip
+def test_a_wrong_word_in_a_test_is_one_line_in_its_own_words(
+    criterion: str, line: str, lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = f'kind = "settles"\nclause = "back"\ntolerance = 0.1\nwithin = 0.5\n{criterion}\n'
+    (lab / "jump.toml").write_text(f"{LAB}\n[[criteria]]\n{more}")
+    assert main(["conform", "--law", "droop-3", "--against", str(lab)]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1

@@ -254,6 +254,8 @@ def test_a_run_on_disk_is_that_in_memory(
          "network.converters.A.plant.converter = 'papr': must be one of paper"),
         ({"network": {"converters": {"A": {"node": "x", "plant": {"grid": {"V_g": 0.9}}}}}},
          "plant.grid: is the scenario's own"),
+        ({"plant": {"grid": {"scr": 1.5, "x_over_r": 10.0}}},
+         "plant.grid.scr = 1.5: is for one converter alone; network.lines say how strong the grid"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_line_that_names_it(change: dict[str, Any], message: str) -> None:
@@ -270,6 +272,45 @@ def test_what_a_converters_file_lacks_is_said_with_its_name(tmp_path: Path) -> N
     message = f"network.converters.A.plant.converter = '{file}': L_f: missing"
     with pytest.raises(UserError, match=re.escape(message)):
         load_scenario(content(**change))
+
+
+def test_a_law_that_reaches_no_converter_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also an inner stage; --converter names the one that gets it."""
+    out = ["--out", str(tmp_path / "run"), "--quiet", "--no-figures"]
+    run = ["run", "three_share_a_load", *out]
+    for more, words in (
+        (["--law", "vsg-2"], "--law vsg-2: does not replace the own law of A, B, C; name the "
+         "converter that gets it with --converter"),
+        (["--converter", "a"], "--converter a: must be one of ['A', 'B', 'C']; did you mean 'A'?"),
+        (["--law", "vsg2", "--converter", "B"], "network.converters.B.law: law 'vsg2'"),
+    ):  # fmt: skip
+        assert main([*run, *more]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
+    assert main(["run", "pref_step", "--converter", "A", *out]) == 2
+    assert "--converter A: the scenario has no network" in capsys.readouterr().err
+    assert main(["compare", "three_share_a_load", "--laws", "vsg-2,droop-3"]) == 2
+    assert "three_share_a_load: network: this takes one converter" in capsys.readouterr().err
+    with pytest.raises(UserError, match=r"law vsg-2: does not .*; set network.converters.NAME.law"):
+        gfmhil.run_network("three_share_a_load", law="vsg-2")
+    file = tmp_path / "short.toml"
+    file.write_text(scenario_toml(load_scenario(content(duration=0.02, events=[]))))
+    assert main(["run", str(file), "--converter", "B", "--law", "droop-5", *out]) == 0
+    laws = json.loads((tmp_path / "run" / "summary.json").read_text())["converters"]
+    assert [laws[name]["laws"] for name in "AB"] == [["droop-3"], ["droop-5"]]
+
+
+def test_a_law_for_all_reaches_those_that_name_none() -> None:
+    given = content()
+    assert [load_scenario(given, law="vsg-2").of(name).law for name in "AB"] == ["vsg-2"] * 2
+    given["network"]["converters"]["B"]["law"] = "droop-5"
+    with pytest.raises(UserError, match="does not replace the own law of B"):
+        load_scenario(given, law="vsg-2")
+    with pytest.raises(UserError, match="does not replace the own inner of A"):
+        given["network"]["converters"]["A"]["inner"] = "none"
+        load_scenario(given, inner="virtual-stator")
 
 
 def test_what_takes_one_converter_says_so() -> None:

@@ -19,9 +19,11 @@ from gfm_runtime import (
     build_law,
     discretise,
     law_file,
+    law_names,
     load_law,
     parse_law,
     read_law_file,
+    tuned_names,
 )
 from gfm_runtime.elements import IF, PD, PI, D, Element, I, O, P
 from gfm_runtime.kernel import pack_law
@@ -123,27 +125,27 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "unknown key": (
         '"IF", k = 1.0, T = 0.2',
         '"IF", gain = 3, k = 1.0, T = 0.2',
-        ("phi.23.0.gain", "3"),
+        ("phi.23.gain", "3"),
     ),
     "unknown table": ("[psi]", "[chi]", ("chi", "unknown key", "did you mean 'phi'?")),
     "unknown type": (
         '"IF", k = 1.0, T = 0.2',
         '"XY", k = 1.0, T = 0.2',
-        ("phi.23.0.type", "XY", "'PI'"),
+        ("phi.23.type", "XY", "'PI'"),
     ),
     "wrong type of a number": (
         "T = 2.0 }",
         "T = [2.0] }",
-        ("phi.34.0.T", "[2.0]", "number or an exp"),
+        ("phi.34.T", "[2.0]", "number or an exp"),
     ),
     "a boolean number": (
         "T = 2.0 }",
         "T = true }",
-        ("phi.34.0.T", "True", "number or an expression"),
+        ("phi.34.T", "True", "number or an expression"),
     ),
     "a number for a name": ('name = "custom-1"', "name = 3", ("name", "3", "string")),
     "bad name": ('name = "custom-1"', 'name = "a b"', ("name", "'a b'", "pattern")),
-    "no type": ('type = "I", T = 2.0', "T = 2.0", ("phi.34.0.type", "missing")),
+    "no type": ('type = "I", T = 2.0', "T = 2.0", ("phi.34.type", "missing")),
     "no factors": ('{ type = "I", T = 2.0 }', "[]", ("phi.34", "at least 1")),
     "too many factors": (
         '{ type = "I", T = 2.0 }',
@@ -167,21 +169,21 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "unstable xi": ("xi = 0.7", "xi = 0", ("phi_22, O", "xi = 0", "> 0")),
     "absurd T": ("T = 2.0 }", "T = 1e-200 }", ("phi_34, I", "1e-200", "[1e-09, 1e+09]")),
     "infinite gain": ("k_i = 400", "k_i = inf", ("phi_11.k_i", "inf", "finite")),
-    "gigantic integer": ("k_i = 400", "k_i = 1" + 400 * "0", ("phi.11.0.k_i", "must be a number")),
+    "gigantic integer": ("k_i = 400", "k_i = 1" + 400 * "0", ("phi.11.k_i", "must be a number")),
     "gigantic parameter": ("value = 90.0", "value = 1" + 400 * "0", ("parameters.k_p.value",)),
     "absurd gain": ("k_i = 400", "k_i = 1e300", ("phi_11.k_i", "1e+300", "1e+12")),
     "nan parameter": ("value = 90.0", "value = nan", ("parameters.k_p.value", "nan", "finite")),
-    "number in place of a parameter": (
+    "text in place of a parameter": (
         'D_p = { value = 0.01, unit = "p.u.", source = "Table III" }',
-        "D_p = 0.01",
-        ("parameters.D_p: must be a table with value, unit, source, not 0.01",),
+        'D_p = "0.01"',
+        ("parameters.D_p: must be a table with value, not '0.01'",),
     ),
     "unknown parameter": ('k = "D_p"', 'k = "D_q"', ("phi_22.k", "'D_q'", "D_p")),
     "bad parameter name": ("k_p = {", '"k p" = {', ("parameters.k p", "pattern")),
-    "parameter without source": (
-        ', source = "Table III"',
+    "parameter without value": (
+        "value = 0.01, ",
         "",
-        ("parameters.D_p.source", "missing"),
+        ("parameters.D_p.value", "missing"),
     ),
     "parameter as expression": (
         "value = 0.05",
@@ -245,7 +247,7 @@ def test_all_mistakes_at_once() -> None:
     with pytest.raises(LawError) as caught:
         parse_law(text, "law file a.toml")
     assert str(caught.value).startswith("law file a.toml: ")
-    assert "phi.34.0.T" in caught.value.why and "limits.T_t" in caught.value.why
+    assert "phi.34.T" in caught.value.why and "limits.T_t" in caught.value.why
 
 
 def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
@@ -401,7 +403,7 @@ base = "vsg-2"
 name = "softer"
 title = "VSG-2 with more damping"
 source = "here"
-parameters.D_p = { value = 0.02 }
+parameters.D_p = 0.02
 phi.22 = { type = "P", k = "D_p" }
 """
 
@@ -411,6 +413,7 @@ def test_a_base_gives_what_the_file_does_not_say() -> None:
     assert (softer.name, softer.title, softer.base) == ("softer", "VSG-2 with more damping", None)
     assert softer.parameters["D_p"].value == 0.02
     assert softer.parameters["D_p"].unit == own.parameters["D_p"].unit
+    assert softer.parameters["D_p"].source == "" != own.parameters["D_p"].source
     assert [factor.type for factor in softer.phi["22"]] == ["P"]
     assert {cell: softer.phi[cell] for cell in softer.phi if cell != "22"} == {
         cell: own.phi[cell] for cell in own.phi if cell != "22"
@@ -452,3 +455,52 @@ def test_the_schema_lets_a_file_with_a_base_leave_the_rest_out() -> None:
     content = tomllib.loads(BASED)
     assert schema.is_valid(content)
     assert not schema.is_valid({key: content[key] for key in content if key not in ("base", "phi")})
+
+
+def told(text: str) -> list[str]:
+    """What a person is told of the text of a law file."""
+    with pytest.raises(LawError) as caught:
+        build_law(parse_law(text))
+    return caught.value.lines
+
+
+def test_a_number_alone_is_a_parameter() -> None:
+    bare = CUSTOM.replace('{ value = 0.01, unit = "p.u.", source = "Table III" }', "0.01")
+    valued = CUSTOM.replace(', unit = "p.u.", source = "Table III" }', " }")
+    for text in (bare, valued):
+        law = build_law(parse_law(text))
+        assert law.phi == custom().phi
+        assert (law.parameters["D_p"].unit, law.parameters["D_p"].source) == ("", "")
+    (line,) = told(CUSTOM.replace('{ value = 0.01, unit = "p.u.", source = "Table III" }', "true"))
+    assert "parameters.D_p: must be a table with value, not True" in line
+
+
+@pytest.mark.parametrize("name", [*law_names(), *tuned_names()])
+def test_the_catalogue_says_unit_and_source_of_every_parameter(name: str) -> None:
+    for parameter in law_file(name).parameters.values():
+        assert {"unit", "source"} <= parameter.model_fields_set and parameter.source.strip()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ('22 = [{ type = "O"', '22 = [{ typ = "O"', "phi.22.0.typ = 'O': unknown key; did you"),
+        ('34 = { type = "I"', '34 = { typ = "I"', "phi.34.typ = 'I': unknown key; did you mean"),
+        ('34 = { type = "I"', '34 = { type = "J"', "phi.34.type: must be 'P', 'I', 'D', 'PI', '"),
+        ("[phi]", "[phy]", "...: unknown key; did you mean 'phi'?"),
+        ("D_p = {", "D_pp = {", "unknown parameter 'D_p'; known: ['D_pp', 'X_half', 'k_p']; did"),
+    ],
+)  # fmt: skip
+def test_one_wrong_word_is_one_line_in_the_files_own_words(old: str, new: str, line: str) -> None:
+    assert old in CUSTOM
+    (found,) = told(CUSTOM.replace(old, new))
+    assert line in found
+
+
+def test_a_name_in_many_places_is_one_line_and_the_hint_stands_before_a_long_list() -> None:
+    cells = "".join(f'{i}{j} = {{ type = "P", k = "D_q" }}\n' for i in "123" for j in "12345")
+    names = "".join(f"{name} = 1.0\n" for name in ("D_p", "a", "b", "c", "d", "e", "f"))
+    text = f'name = "a"\ntitle = ""\nsource = ""\n[parameters]\n{names}[phi]\n{cells}'
+    (line,) = told(text)
+    assert "phi_11.k, phi_12.k, phi_13.k and 12 more: unknown parameter 'D_q'; did you me" in line
+    assert line.index("did you mean 'D_p'?") < line.index("known:")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -22,10 +23,12 @@ from rich.progress import (
 from rich.table import Table
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import target_of
 from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages, staged
+from gfm_hil.results.run import Run
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
 from gfm_hil.scenario.model import Scenario, load_scenario
@@ -117,11 +120,13 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
 
     Args:
         named: the command takes an endpoint for each converter, see ``endpoints``; the option
-            --converter says that the only one is that of a network's converter.
+            --converter says which one it controls. That of other commands says which one gets
+            the law and the inner stage.
 
     Raises:
         UserError: as ``load_scenario``.
     """
+    gets = {} if named or "converter" not in options else {"converter": "--converter"}
     ends = endpoints(options)
     for name in ends:
         if name and not named:
@@ -131,7 +136,8 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
             )
     return load_scenario(
         options.scenario,
-        OPTIONS | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
+        OPTIONS | gets | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
+        converter=options.converter if gets else None,
         mode=options.mode,
         link__type=options.link,
         link__endpoint=None if named and options.converter is not None else ends.get(""),
@@ -187,8 +193,36 @@ def progress_bar(
         yield tell, above(bar)
 
 
-def print_summary(summary: dict[str, Any], folder: Path) -> None:
-    """The short table that ends a run."""
+def why_unstable(scenario: Scenario, named: str | Path) -> str:
+    """The unstable mode of a scenario's linear loop in one sentence, with the command that shows
+    its modes; empty if there is none.
+
+    Args:
+        scenario: whose loop it is.
+        named: what that command calls the scenario.
+    """
+    from gfm_hil.studies.loop import unstable_mode  # a second of imports
+
+    found = unstable_mode(scenario)
+    if found is None:
+        return ""
+    law, words = found
+    more = ["--law", law] if law else []
+    return f"{words} ({shlex.join(['gfmhil', 'design', 'poles', *more, '--scenario', str(named)])})"
+
+
+def why_it_ended(run: Run | NetworkRun) -> str:
+    """As ``why_unstable``, of a run that did not last, or still oscillated at its end, under laws
+    of ours."""
+    each = [*run.values()] if isinstance(run, NetworkRun) else [run]
+    if all(one.status in ("completed", "interrupted") for one in each) or run.folder is None:
+        return ""
+    ours = all(target_of(one.summary["controller"]) is not None for one in each)
+    return why_unstable(run.scenario, run.folder / "scenario.toml") if ours else ""
+
+
+def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
+    """The short table that ends a run; ``why`` is a sentence more on its end."""
     console = terminal()
     colour = "red" if summary["unmet"] else "green"
     reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
@@ -196,6 +230,8 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
     console.print(f"[bold {colour}]{summary['status']}[/]{expected}{reason}", highlight=False)
     for part in summary["unmet"]:
         console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
+    if why:
+        console.print(escape(why), highlight=False, soft_wrap=True)
     stage = f" · inner stage {inner_stages(summary)}" if staged(summary) else ""
     console.print(escape(controlled_by(summary) + stage), highlight=False)
     console.print(
@@ -227,6 +263,8 @@ def print_network(runs: NetworkRun, folder: Path) -> None:
     for name, run in runs.items():
         print(f"\n{name}")
         print_summary(run.summary, folder / name)
+    if why := why_it_ended(runs):
+        print(f"\n{why}")
 
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:

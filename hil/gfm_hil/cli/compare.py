@@ -17,16 +17,19 @@ from gfm_hil.cli.common import (
     progress_bar,
     resolve,
     split_laws,
+    why_it_ended,
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import fitting, numbers, terminal
+from gfm_hil.engine.setup import ONE_CONVERTER
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import cell, event_rows
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import find_scenario
+from gfm_runtime import law_titles
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -45,19 +48,21 @@ def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
     asked = options.link or options.endpoint or options.option or options.mode == "realtime"
     base = resolve(options, in_process=not asked)
-    names = split_laws(options.laws) if options.laws else base.compare
-    if not names:
+    if base.network is not None:
+        raise UserError(f"{options.scenario}: {ONE_CONVERTER}")
+    laws = split_laws(options.laws) if options.laws else base.compare
+    if not laws:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
     scenarios = {
-        name: resolve(options, in_process=not asked, law=name) for name in dict.fromkeys(names)
+        name: resolve(options, in_process=not asked, law=law)
+        for law, name in law_titles(laws).items()
     }
     folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
     check_free(folder, base.ticks * len(scenarios), base.has_inner)
     runs: dict[str, Run] = {}
     for name, scenario in scenarios.items():
         with progress_bar(scenario, name, options.quiet) as (progress, notice):
-            place = folder / name.removesuffix(".toml").replace("/", "_")
-            runs[name] = run_scenario(scenario, place, progress, notice)
+            runs[name] = run_scenario(scenario, folder / name, progress, notice)
         if runs[name].summary["status"] == "interrupted":
             break
     events = max((run.summary["events"] for run in runs.values()), key=len)
@@ -70,6 +75,8 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(summaries, indent=2))
     else:
         _print(summaries, events)
+        for why in filter(None, map(why_it_ended, runs.values())):
+            terminal().print(escape(why), highlight=False, soft_wrap=True)
         terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
     return max(exit_code(run.summary) for run in runs.values())
 

@@ -30,19 +30,21 @@ from gfm_hil.realtime.priority import processors
 from gfm_hil.studies.campaign.execute import WorkerLost
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.execute import Found, execute, foreign_controller, make_jobs
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, load_under_test, shipped_sets
-from gfm_runtime import law_file, law_names
+from gfm_runtime import law_file, law_names, law_titles
 from gfm_runtime.inner_file import named_inner
 
 EXIT_FAILED = 1
-_COLOURS = {PASS: "green", FAIL: "red", CANNOT: "yellow"}
+_EXIT = {PASS: 0, FAIL: EXIT_FAILED, CANNOT: 4, INFORMATIVE: 4}
+_COLOURS = {PASS: "green", FAIL: "red", CANNOT: "yellow", INFORMATIVE: "blue"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
     command.description = (
-        "Exit code 0: every clause passes; 1: one fails or cannot be judged; 2: wrong input."
+        "Exit code 0: every clause passes, the informative ones left out; 1: one fails; 2: wrong "
+        "input; 4: none fails, but one cannot be judged."
     )
     others = command.add_subparsers(metavar="{diff}", title="on reports")
     diff = others.add_parser("diff", help="what changed between two reports")
@@ -108,16 +110,21 @@ def call(options: argparse.Namespace) -> int:
     if options.workers is not None and not 1 <= options.workers <= 1024:
         raise UserError(f"--workers {options.workers}: must lie in [1, 1024]")
     foreign = foreign_controller(options.controller, options.map)
-    laws = list(dict.fromkeys(n for law in options.law or [] for n in _names(law)))
-    for name in laws:
+    given = [n for law in options.law or [] for n in _names(law)]
+    for name in given:
         law_file(name)
+    titles = law_titles(given)
+    laws = [*titles.values()]
     if options.inner is not None:
         named_inner(options.inner)
     under = load_under_test(options.converter)
     folder = new_folder(options.out, "conform")
     if folder.exists() and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
-    files = {name: str(Path(name).absolute()) if name.endswith(".toml") else name for name in laws}
+    files = {
+        title: str(Path(name).absolute()) if name.endswith(".toml") else name
+        for name, title in titles.items()
+    }
     jobs = make_jobs(
         files, cases, options.inner, under, folder / "converters", folder, not options.no_figures,
         foreign,
@@ -133,7 +140,7 @@ def call(options: argparse.Namespace) -> int:
 
         def keep(one: Found) -> None:
             found.append(one)
-            bad = sum(f.verdict != PASS for f in found)
+            bad = sum(f.verdict in (FAIL, CANNOT) for f in found)
             at = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
             bar.update(task, advance=1, at=escape(at))
 
@@ -155,7 +162,7 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(result.plain(), indent=1))
     else:
         _print(result, time.monotonic() - began)
-    return 0 if result.passed else EXIT_FAILED
+    return _EXIT[result.verdict]
 
 
 def _diff(options: argparse.Namespace) -> int:
@@ -204,18 +211,20 @@ def _print(result: Conformity, wall_s: float) -> None:
     if len(result.laws) == 1:
         table = Table("test", "", "why", box=None, pad_edge=False)
         for case in result.cases:
-            parts = result.of(result.laws[0], case.id)
             verdict = result.matrix[result.laws[0], case.id]
-            wrong = [f for f in parts if f.verdict == verdict and f.words]
-            why = f"{wrong[0].part}: {wrong[0].words}" if wrong and wrong[0].part else ""
-            why = why or (wrong[0].words if wrong else "")
-            table.add_row(case.id, f"[{_COLOURS[verdict]}]{verdict}[/]", escape(why))
+            wrong = [
+                f"{f.part}: {text}" if f.part else text
+                for f in result.of(result.laws[0], case.id)
+                if f.verdict == verdict != PASS
+                for text in dict.fromkeys(v.text for v in f.wrong) or [f.reason]
+            ]
+            table.add_row(case.id, f"[{_COLOURS[verdict]}]{verdict}[/]", escape("\n".join(wrong)))
         console.print(table)
     else:
         for table in fitting(console, result.laws, lambda laws: _matrix(result, laws)):
             console.print(table)
     verdicts = list(result.matrix.values())
-    told = ", ".join(f"{verdicts.count(v)} {v}" for v in (PASS, FAIL, CANNOT) if v in verdicts)
+    told = ", ".join(f"{verdicts.count(v)} {v}" for v in SIGNS if v in verdicts)
     count = len(result.found)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)

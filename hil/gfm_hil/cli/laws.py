@@ -9,12 +9,16 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Column, Table
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
+from gfm_hil.scenario.model import load_scenario
 from gfm_hil.studies.law import cell_text
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
 from gfm_runtime.inner_file import acting, inner_names, named_inner
+from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -87,6 +91,8 @@ def call_show(options: argparse.Namespace) -> int:
     console.print(f"[bold]{laws.name}[/]: {first.title}")
     console.print(" ".join(first.source.split()).replace("[", "\\["), style="dim")
     console.print(f"errors: {first.error_map} · grid: {first.home_grid.note}")
+    if why := _unstable(options, first.home_grid):
+        console.print(f"[red]on this grid {escape(why)}[/]", soft_wrap=True)
     table = Table("Φ(s)", *Y_NAMES, box=None, pad_edge=False)
     for i, u in enumerate(U_NAMES):
         table.add_row(u, *[cell_text(file, f"{i + 1}{j + 1}") for j in range(5)])
@@ -109,6 +115,20 @@ def call_show(options: argparse.Namespace) -> int:
                 )
                 console.print(f"{name} =\n{text}".replace("[", "\\["))
     return 0
+
+
+def _unstable(options: argparse.Namespace, grid: HomeGrid) -> str:
+    """Why the law's loop on its own grid is unstable; empty if it is not."""
+    from gfm_hil.cli.common import why_unstable  # a second of imports, which the list does without
+
+    factors = {"L_g": grid.L_g, "R_g": grid.R_g}
+    try:
+        scenario = load_scenario(
+            "pref_step", in_process=True, law=options.name, T_s=options.T_s, plant__factors=factors
+        )
+    except UserError:  # a sampling time that does not suit the plant
+        return ""
+    return why_unstable(scenario, "pref_step")
 
 
 def _value(value: Any) -> str:

@@ -1,8 +1,8 @@
 """Argument parsing and exit codes.
 
-0: done, and a run ended as its scenario expects; 1: a conformity test fails or cannot be judged, or
-a report is worse than the one before; 2: wrong input, nothing started; 3: a run ended otherwise, or
-its folder could not be completed; 130: interrupted.
+0: done, and a run ended as its scenario expects; 1: a conformity test fails, or a report is worse
+than the one before; 2: wrong input, nothing started; 3: a run ended otherwise, or its folder could
+not be completed; 4: no conformity test fails, but one cannot be judged; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -97,6 +97,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             why = "-- cannot be a value; for a file of that name write ./--"
             return _refuse(OSError(errno.EINVAL, why, text))
     top = parser(given[0] if given else None)
+    if not given:
+        top.print_help()
+        return 0
+    if not given[0].startswith("-") and given[0] not in COMMANDS:
+        return _refuse(_no_command(given[0]))
     options, unknown = top.parse_known_args(given)
     if unknown:
         return _refuse(_unknown(top, options.command, unknown))
@@ -111,6 +116,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except Exception as problem:
         return _refuse(problem)
+
+
+def _no_command(word: str) -> Exception:
+    from gfm_hil.core.errors import UserError
+    from gfm_runtime.errors import allowed
+
+    return UserError(f"{word}: no command; {allowed(word, COMMANDS)}")
 
 
 def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Exception:

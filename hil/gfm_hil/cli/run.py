@@ -17,6 +17,7 @@ from gfm_hil.cli.common import (
     print_summary,
     progress_bar,
     resolve,
+    why_it_ended,
     window,
 )
 from gfm_hil.cli.companion import companion
@@ -34,8 +35,13 @@ def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument(
         "--law",
-        help="override law: catalogue name or law file; of a network's converters that name none",
+        help="override law: catalogue name or law file; of a network see --converter",
     )
+    command.add_argument(
+        "--converter", metavar="NAME",
+        help="of a network: the one that gets --law and --inner; all get them by default, if none"
+        " has its own",
+    )  # fmt: skip
     command.add_argument(
         "--controller", metavar="KIND:NAME",
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"
@@ -90,7 +96,7 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
-            print_summary(run.summary, folder)
+            print_summary(run.summary, folder, why_it_ended(run))
         if scope is not None and scope.poll() is None and run.summary["status"] != "interrupted":
             print("the scope stays open until Ctrl-C", file=sys.stderr, flush=True)
             with contextlib.suppress(KeyboardInterrupt):

@@ -20,6 +20,7 @@ class _Law(BaseModel):
 
     label: str
     name: str
+    title: str = ""
     gains: dict[str, float]
 
 

@@ -111,7 +111,7 @@ class CommandServer:
             c = of.controller
             content = {"endpoint": self._endpoint, "T_s": c.T_s, "names": list(c.sets)}
             content["laws"] = [
-                {"label": label, "name": name, "gains": gains}
+                {"label": label, "name": name, "title": c.titles[name], "gains": gains}
                 for label, name, gains in zip(c.labels, c.names, c.changed, strict=True)
             ]
             place = announcement(folder, self._role)
@@ -185,4 +185,4 @@ class CommandServer:
             return {"ok": False, "error": ticket.error}
         if isinstance(event, Gains):
             self._announce()
-        return {"ok": True, "tick": ticket.tick, "label": event.label()}
+        return {"ok": True, "tick": ticket.tick, "label": self._timeline.label(event)}

@@ -21,10 +21,12 @@ from gfm_hil.scenario.events import Gains, LawChange, Reset
 from gfm_hil.scenario.model import Scenario, plant_of
 from gfm_plant import Network, NoEquilibrium, start_again, take_out
 from gfm_plant.names import MAY_START
-from gfm_runtime import load_law
+from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import NY, NY_INNER, REF_NAMES, carried
 from gfm_runtime.states import READY, SAFE, STATES
+
+ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
 
 
 @dataclass
@@ -110,9 +112,7 @@ def make_bench(scenario: Scenario, real: str = "float64") -> Bench:
         UserError: the law has no steady state on this grid, or the scenario has a network.
     """
     if scenario.network is not None and scenario.converter is None:
-        raise UserError(
-            "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
-        )
+        raise UserError(ONE_CONVERTER)
     benches = make_benches(scenario, real)
     return next(b for b in benches if b.scenario.converter == scenario.converter)
 
@@ -187,8 +187,8 @@ def _ready(
     Args:
         contents: of the files among names and inner stage.
     """
-    # under the name that events use: the name inside a law file may differ
-    sets = [replace(load_law(name, inner), name=name) for name in names]
+    titles = law_titles(names)
+    sets = [replace(load_law(name, inner), name=titles[name]) for name in names]
     return Controller(sets, T_s, [0.0] * len(REF_NAMES), hold, real, omega_b)
 
 

@@ -137,7 +137,7 @@ class Timeline:
             try:
                 self._carry_out(event, tick)
             except ValueError as problem:
-                self.write(tick, event.type, label=event.label(), refused=str(problem))
+                self.write(tick, event.type, label=self.label(event), refused=str(problem))
         while self._inbox:
             event, ticket = self._inbox.popleft()
             if not ticket.claim():
@@ -146,7 +146,7 @@ class Timeline:
                 said = {"by": "operator", "operator": ticket.operator}
                 self._carry_out(event, tick, **said)
                 for other in ticket.others:
-                    other.write(tick, event.type, label=event.label(), **said)
+                    other.write(tick, event.type, label=self.label(event), **said)
                 ticket.tick = tick
             except ValueError as problem:  # the plant changed after the check
                 ticket.error = str(problem)
@@ -171,7 +171,13 @@ class Timeline:
                 pass  # what happens to a network, the timeline of its first converter carries out
             case _:
                 apply_grid_event(event, self._bench.plant)
-        self.write(tick, event.type, label=event.label(), **more)
+        self.write(tick, event.type, label=self.label(event), **more)
+
+    def label(self, event: Any) -> str:
+        """What results call an event; no law file is read for it while the loop runs."""
+        if isinstance(event, LawChange):
+            return f"law {self._bench.controller.titles[event.law]}"
+        return str(event.label())
 
     def look(self, tick: int) -> None:
         """Log what the last tick brought: a change of law, a safe state, a trip."""

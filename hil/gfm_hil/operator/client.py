@@ -85,9 +85,10 @@ class Operator:
         """The newest recorded tick: every column of the recording by name, codes also as words.
 
         Of the plant: ``tick``, ``misses``, ``trip`` ("" without one). Of the controller:
-        ``state``, ``reason`` (why SAFE), ``active`` (name of the law in force), ``gains`` (its
-        gains that differ from its file), ``laws`` (names of those that are ready), ``T_s`` (s). A
-        side that has not recorded anything is left out.
+        ``state``, ``reason`` (why SAFE), ``active`` (what the law in force is asked for by),
+        ``law_title`` (its name in results), ``gains`` (those that differ from its file), ``laws``
+        (what those that are ready are asked for by), ``T_s`` (s). A side that has not recorded
+        anything is left out.
 
         The loop only appends rows, so that reading them does not disturb it.
 
@@ -106,6 +107,7 @@ class Operator:
             if (server := announced(folder, "controller")) is not None:
                 law = _word(folder, "law", dict(enumerate(server["laws"])), found["law"])
                 found["active"], found["gains"] = law["name"], law["gains"]
+                found["law_title"] = law["title"]
                 found["laws"], found["T_s"] = server["names"], server["T_s"]
         return found
 

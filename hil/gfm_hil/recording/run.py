@@ -213,12 +213,11 @@ class RecordedRun:
 
 
 def controlled_by(summary: Mapping[str, Any]) -> str:
-    """The laws of a run, files without their folders, or what a controller that is not ours calls
-    itself."""
+    """The laws of a run, or what a controller that is not ours calls itself."""
     name = summary.get("controller", OUR_CONTROLLER)
     target = target_of(name)
     if target is not None:
-        laws = " → ".join(Path(law).name for law in summary["laws"])
+        laws = " → ".join(summary["laws"])
         return laws + (f" on {target}" if target else "")
     return name or "a controller that gave no name"
 

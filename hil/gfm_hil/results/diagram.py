@@ -21,6 +21,7 @@ from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario.events import Fault
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import Plant, load_converter
+from gfm_runtime import law_titles
 
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
@@ -105,12 +106,14 @@ _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
 def _converters(
     scenario: Scenario,
 ) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
-    """The plant, the law and the node of each converter, by its name."""
+    """The plant, what results call the law, and the node of each converter, by its name."""
     if scenario.network is None:
-        return {"": scenario.plant}, {"": scenario.law}, {"": ""}
+        return {"": scenario.plant}, {"": law_titles([scenario.law])[scenario.law]}, {"": ""}
     each = {name: scenario.of(name) for name in scenario.converters}
     nodes = {name: member.node for name, member in scenario.network.converters.items()}
-    return {n: s.plant for n, s in each.items()}, {n: s.law for n, s in each.items()}, nodes
+    titles = law_titles(s.law for s in each.values())
+    laws = {name: titles[s.law] for name, s in each.items()}
+    return {name: s.plant for name, s in each.items()}, laws, nodes
 
 
 _Lines = dict[str, tuple[int, str, str, str, bool]]  #: row, start, end, text, closed

@@ -177,7 +177,11 @@ def write_report(
     unmet = "".join(
         f'<p class="unmet">not as expected: {html.escape(part)}</p>' for part in summary["unmet"]
     )
-    resolved = html.escape((folder / "scenario.toml").read_text("utf-8"))
+    resolved = (folder / "scenario.toml").read_text("utf-8")
+    for one in [scenario, *map(scenario.of, scenario.converters)]:
+        for law in {*one.laws(), *one.compare}:
+            resolved = resolved.replace(f'"{law}"', f'"{Path(law).name}"')
+    resolved = html.escape(resolved)
     path = folder / "report.html"
     write_text(
         path,

@@ -24,7 +24,7 @@ from gfm_hil.results.modes import acting, free_from
 from gfm_hil.results.ripple import remaining_ripple
 from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime import load_law
+from gfm_runtime import law_titles, load_law
 from gfm_runtime.inner_file import NO_INNER
 
 _BLOCKS = 20  # of a run, whose earliest arrivals tell the drift of its clocks
@@ -64,7 +64,10 @@ def stages(scenario: Scenario) -> dict[str, Any]:
     has one."""
     if not scenario.has_inner:
         return {}
-    laws = {name: load_law(name, scenario.inner).laws[0] for name in scenario.laws()}
+    laws = {
+        title: load_law(name, scenario.inner).laws[0]
+        for name, title in law_titles(scenario.laws()).items()
+    }
     kinds = {name: law.inner.kind if law.inner else NO_INNER for name, law in laws.items()}
     return {"inner": kinds}
 
@@ -105,7 +108,8 @@ def summarise(
     ends = [*np.searchsorted(starts, starts, side="right").tolist()]
     T_s, f_n = scenario.T_s, nominal_frequency(scenario)
     acts = acting(scenario, signals, done) if plant else []
-    laws = [scenario.law, *[e["law"] for e in changes]]
+    first = law_titles(scenario.laws())[scenario.law]
+    laws = [first, *[e["law"] for e in changes]]
     events = []
     for k, e in enumerate(happened):
         stop = int(starts[ends[k]]) if ends[k] < len(starts) else done

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from gfm_plant.names import FAULTED_PHASES
+from gfm_runtime import law_titles
 from gfm_runtime.signals import SIGNALS
 
 if TYPE_CHECKING:  # an operator's command loads no compiler
@@ -100,7 +101,7 @@ class LawChange(_Event):
     converter: str | None = Field(None, description=_WHOSE)
 
     def label(self) -> str:
-        return f"law {self.law}"
+        return f"law {law_titles([self.law])[self.law]}"
 
 
 class Gains(_Event):

@@ -50,7 +50,7 @@ from gfm_plant import (
 from gfm_plant.records import SIZES
 from gfm_plant.synchro_check import AGREED
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
-from gfm_runtime.errors import meant, printable
+from gfm_runtime.errors import allowed, meant, printable
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.signals import REF_NAMES, table_hash
 from gfm_runtime.toml_file import read_toml
@@ -439,6 +439,11 @@ class Scenario(_Model):
                 )
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
+        if self.network is not None and self.plant.grid.scr is not None:
+            problems.append(
+                f"plant.grid.scr = {self.plant.grid.scr:g}: is for one converter alone;"
+                " network.lines say how strong the grid of a network is"
+            )
         problems += self._wrong_links()
         if problems:
             raise ValueError("; ".join(problems))
@@ -487,7 +492,7 @@ def find_file(kind: str, name: str, pattern: str) -> Path:
     if given.name.removesuffix(".toml") in shipped:
         return shipped[given.name.removesuffix(".toml")]
     what = "is not a regular file" if exists else "no such file"
-    known = f"shipped are {sorted(shipped)}{meant(given.stem, shipped)}"
+    known = allowed(given.stem, sorted(shipped), "shipped are")
     raise UserError(printable(f"{kind} {name}: {what}; {known}"))
 
 
@@ -504,6 +509,7 @@ def load_scenario(
     given: str | Path | Scenario | dict[str, Any],
     options: Mapping[str, str] = MappingProxyType({}),
     in_process: bool = False,
+    converter: str | None = None,
     **changed: Any,
 ) -> Scenario:
     """Read, override and check a scenario, its laws and its plant.
@@ -515,6 +521,8 @@ def load_scenario(
         in_process: the caller runs it in this process: the link is ``inproc`` unless ``changed``
             names another one. Messages do not mention this choice, because the user did not make
             it.
+        converter: of a network: the one that gets ``law`` and ``inner`` of ``changed``. Without it
+            all converters get them, so that none may name its own.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
             None leaves the file's value. A link other than the file's drops the file's endpoint
             and options. The link ``inproc`` implies lockstep unless a ``mode`` is given.
@@ -537,6 +545,7 @@ def load_scenario(
     else:
         content = copy.deepcopy(given)
     overrides = {key: value for key, value in changed.items() if value is not None}
+    overrides, options = _of_converter(content, converter, overrides, options)
     implied: dict[str, Any] = {}
     if in_process or overrides.get("link__type") == INPROC:
         implied = {"link__type": INPROC, "mode": "lockstep"}
@@ -562,6 +571,47 @@ def load_scenario(
         for key, value in overrides.items()
     }
     return check_scenario(content, where, named)
+
+
+def _of_converter(
+    content: dict[str, Any],
+    converter: str | None,
+    overrides: dict[str, Any],
+    options: Mapping[str, str],
+) -> tuple[dict[str, Any], Mapping[str, str]]:
+    """Overrides and their names as for ``load_scenario``, with ``law`` and ``inner`` where they
+    reach the converters of a network.
+
+    Raises:
+        UserError: there is no such converter; none is named, and one has its own law or stage.
+    """
+    network = content.get("network")
+    members = network.get("converters") if isinstance(network, dict) else None
+    members = members if isinstance(members, dict) else {}
+    if converter is not None and converter not in members:
+        allowed = f"must be one of {[*members]}" if members else "the scenario has no network"
+        option = options.get("converter", "converter")
+        raise UserError(f"{option} {converter}: {allowed}{meant(converter, members)}")
+    if converter is None and members:
+        converter = content.get("converter")  # the folder of a converter knows it
+    found, names = dict(overrides), dict(options)
+    for key in ("law", "inner"):
+        if key not in overrides or not members:
+            continue
+        named = options.get(key, key)
+        if converter is not None:
+            own = f"network__converters__{converter}__{key}"
+            found[own], names[own] = found.pop(key), named
+        elif owners := [n for n, m in members.items() if isinstance(m, dict) and key in m]:
+            other = f"set network.converters.NAME.{key}"
+            if "converter" in options:
+                other = f"name the converter that gets it with {options['converter']}"
+            whose = ", ".join(map(str, owners))
+            raise UserError(
+                printable(f"{named} {overrides[key]}: does not replace the own {key} of {whose};"
+                          f" {other}")
+            )  # fmt: skip
+    return found, names
 
 
 def check_scenario(
@@ -591,7 +641,7 @@ def check_scenario(
     try:
         scenario = Scenario.model_validate(content)
     except ValidationError as problem:
-        raise UserError("\n".join(lines(problem, Scenario, source))) from None
+        raise UserError("\n".join(lines(problem, Scenario, source, content))) from None
     wrong: list[str] = []
     if scenario.inner is not None:
         try:

@@ -14,7 +14,7 @@ from gfm_hil.recording.live import begun as recording
 from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.run import RecordedRun, nominal_frequency, read_scenario
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime import LawError, load_law
+from gfm_runtime import LawError, law_titles, load_law
 
 Law = dict[str, str]  #: label and name of a law, and in words its changes against its file
 
@@ -76,7 +76,7 @@ class Record:
         server = announced(self.folder, "controller")
         if server is None:  # a foreign controller, or it has ended
             return
-        self.laws = [_law(law["label"], law["name"], law["gains"]) for law in server["laws"]]
+        self.laws = [_law(law["label"], law["title"], law["gains"]) for law in server["laws"]]
 
     def events(self) -> list[dict[str, Any]]:
         """The events so far, in order of time."""
@@ -129,12 +129,12 @@ def open_record(folder: Path) -> Record:
 def _laws(scenario: Scenario) -> list[Law]:
     """The laws as the controller numbers them: each stage of a scheduled law has a number."""
     laws: list[Law] = []
-    for name in scenario.laws():
+    for name, title in law_titles(scenario.laws()).items():
         try:
             stages = len(load_law(name).laws)
         except LawError as problem:
             raise UserError(str(problem)) from None
-        laws += [_law(name)] if stages == 1 else [_law(f"{name}[{k}]") for k in range(stages)]
+        laws += [_law(title)] if stages == 1 else [_law(f"{title}[{k}]") for k in range(stages)]
     return laws
 
 

@@ -30,6 +30,7 @@ from gfm_hil.scope.channels import make_channels
 from gfm_hil.scope.pyramid import Pyramid
 from gfm_hil.scope.record import Record
 from gfm_hil.scope.session import SEND_S, Session, in_words
+from gfm_runtime import law_titles
 from gfm_runtime.signals import group
 from gfm_runtime.states import STATES
 
@@ -214,7 +215,7 @@ class Scope:
             "channels": [channel.about() for channel in self._pyramid.channels],
             "states": STATES,
             "labels": self.record.laws,
-            "laws": s.laws(),
+            "laws": [*law_titles(s.laws()).items()],
             "limits": {r.name: [r.low, r.high] for r in group("ref")},
             "grid_hz": s.plant.grid.omega_g * self.record.f_b,
         }

@@ -17,7 +17,16 @@ from gfm_hil.core.files import write_text
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_plant import NoEquilibrium, Plant
-from gfm_runtime import DiscreteLaw, LawError, build_law, discretise, law_file, law_names, parse_law
+from gfm_runtime import (
+    DiscreteLaw,
+    LawError,
+    build_law,
+    discretise,
+    law_file,
+    law_names,
+    law_titles,
+    parse_law,
+)
 from gfm_runtime import Law as BuiltLaw
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import ElementSpec, LawFile, tied
@@ -34,20 +43,21 @@ def as_law(law: str | Path | Law) -> Law:
 
 @contextmanager
 def law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
-    """What a scenario calls each law, by its name; a ``Law`` has a file while this lasts, which
-    messages call by the name of the law."""
+    """What a scenario calls each law, by its name in results; a ``Law`` has a file while this
+    lasts, which messages call by the name of the law."""
     with tempfile.TemporaryDirectory(prefix="gfmhil-law-") as place:
-        files: dict[str, str] = {}
-        for k, law in enumerate(laws):
-            if isinstance(law, Law):
-                files[law.name] = str(law.save(Path(place) / f"{k}.toml"))
-            else:
-                files[str(law)] = str(law)
+        own = {
+            str(law.save(Path(place) / f"{k}.toml")): law.name
+            for k, law in enumerate(laws)
+            if isinstance(law, Law)
+        }
+        saved = iter(own)
+        files = [next(saved) if isinstance(law, Law) else str(law) for law in laws]
         try:
-            yield files
+            yield {title: file for file, title in law_titles(files).items()}
         except UserError as problem:
             text = str(problem)
-            for name, file in files.items():
+            for file, name in own.items():
                 text = text.replace(file, name)
             raise UserError(text) from None
 

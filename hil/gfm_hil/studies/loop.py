@@ -12,7 +12,7 @@ from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.closed_loop import frequencies_near as _near
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.model import Scenario
-from gfm_runtime import DiscreteLaw, load_law
+from gfm_runtime import DiscreteLaw, law_titles, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -26,6 +26,7 @@ _POINTS = 1000
 _LEAST_DB = -100.0  # the hold has zeros at the Nyquist frequency
 _NYQUIST = 3.0  # half a side of the figure: beyond it L is not near -1
 _GREY = "#888888"
+_GROWS = 1e-6  # 1/s; rounding may move a mode that rests, as the angle of an island, by less
 
 
 class Loop(ClosedLoop):
@@ -190,6 +191,32 @@ def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[Loo
         )
     loop = network_loop(scenario).converter(name)
     return loop, loop.title
+
+
+def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
+    """The law under which the linear loop of a scenario's start is unstable, and the mode that
+    grows fastest there, in words.
+
+    Of a network the law is empty. Of other scenarios those count that the run changes to as well.
+    None if every loop is stable, or if there is none, for example for want of an operating point.
+    """
+    from gfm_hil.studies.network_loop import network_loop
+
+    alone = scenario.network is None
+    laws = scenario.model_copy(update={"ready_laws": []}).laws() if alone else [""]
+    for law, title in law_titles(laws).items():
+        under = scenario.model_copy(update={"law": law})
+        try:
+            loop = scenario_loop(under)[0] if alone else network_loop(scenario)
+            worst = max(loop.modes(), key=lambda mode: mode.sigma)
+        except (UserError, ValueError, ArithmeticError, ModuleNotFoundError):
+            continue
+        if worst.sigma > _GROWS:
+            hz = f"{worst.frequency_hz:.4g} Hz" if worst.frequency_hz else "real"
+            of = f" of {title}" if title else ""
+            words = f"the linear loop{of} has an unstable mode: {hz}, {worst.sigma:+.3g} 1/s"
+            return law, words
+    return None
 
 
 def _figure(rows: int) -> list[Axes]:

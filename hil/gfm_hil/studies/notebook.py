@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 import time
@@ -76,12 +75,8 @@ def run_network(scenario: str | Path | Scenario | dict[str, Any], **changes: Any
 
 def _named(made: Run, law: Law) -> Run:
     """The run of a ``Law``: its name in place of its temporary file, and its text."""
-    content = json.dumps([made.summary, made.laws, made.events])
-    summary, laws, events = json.loads(content.replace(made.scenario.law, law.name))
     scenario = made.scenario.model_copy(update={"law": law.name})
-    return replace(
-        made, scenario=scenario, summary=summary, laws=laws, events=events, law_text=law.to_toml()
-    )
+    return replace(made, scenario=scenario, law_text=law.to_toml())
 
 
 @dataclass(frozen=True, repr=False)
@@ -129,7 +124,8 @@ def compare(
     """Run a scenario under several laws; arguments and errors as for ``run``."""
     if not laws:
         raise UserError("laws: name some laws to compare")
-    names = [law.name if isinstance(law, Law) else str(law) for law in laws]
+    with law_files(laws) as files:
+        names = [*files]
     return Comparison(
         {name: run(scenario, law, **changes) for name, law in zip(names, laws, strict=True)}
     )

@@ -86,7 +86,7 @@ class RunCollector(Collector):
             for name in STATES:
                 state.add_metric([name], float(name == seen["state"]))
             yield state
-        for label, key in (("law", "active"), ("reason", "reason"), ("trip", "trip")):
+        for label, key in (("law", "law_title"), ("reason", "reason"), ("trip", "trip")):
             if key in seen:
                 metric = _metric(f"gfmhil_{label}_info")
                 metric.add_metric([str(seen[key])], 1.0)
@@ -101,7 +101,7 @@ class RunCollector(Collector):
         done = follower.run.done("controller")
         if done and not seen:
             row = follower.run.row("controller", done - 1)
-            seen = {"state": STATES[int(row["state"])], "active": str(int(row["law"]))}
+            seen = {"state": STATES[int(row["state"])], "law_title": str(int(row["law"]))}
         return seen
 
 

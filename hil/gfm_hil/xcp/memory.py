@@ -126,7 +126,8 @@ class Memory:
                 raise UserError(f"law {law}: has more than {_LAW_BYTES // CELL} parameters")
             for j, (name, spec) in enumerate(file.parameters.items()):
                 entry = Entry(
-                    f"{identifier(law)}.{name}", f"gain of {law}: {spec.source}", "FLOAT64_IEEE",
+                    f"{identifier(law)}.{name}",
+                    ": ".join(filter(None, (f"gain of {law}", spec.source))), "FLOAT64_IEEE",
                     _GAINS + k * _LAW_BYTES + j * CELL, spec.unit, calibrated=True,
                     fixed=file.schedule is not None,
                 )  # fmt: skip

@@ -284,7 +284,8 @@ def about(m: Module, T_s: float) -> str:
         lines[0] = f"{m.name}: {m.law.title}. {MADE}"
         lines += [f"Source: {m.law.source}", f"Errors: {m.law.error_map}. Parameters:"]
         lines += [
-            f"  {name} = {p.value:g} {p.unit} ({p.source})" for name, p in m.law.parameters.items()
+            f"  {name} = {p.value:g} {p.unit} {f'({p.source})' * bool(p.source)}".rstrip()
+            for name, p in m.law.parameters.items()
         ]
         lines += [
             f"Limits of (i_u, omega_u, E_u): {m.law.limits.low} to {m.law.limits.high} p.u.; "

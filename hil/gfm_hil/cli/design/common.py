@@ -46,21 +46,10 @@ def chosen_scenario(given: str, options: argparse.Namespace) -> Scenario:
     Raises:
         UserError: as ``load_scenario``; --converter does not name a converter of the network.
     """
-    changed = {"law": options.law, "inner": options.inner}
-    name = options.converter
-    scenario = load_scenario(given)
-    if name is not None and name not in scenario.converters:
-        known = f"use one of {scenario.converters}" if scenario.network else "it has no network"
-        raise UserError(f"--converter {name}: {given} has no such converter; {known}")
-    if scenario.network is None:
-        return load_scenario(given, OPTIONS, **changed)
-    name = name or scenario.converter
-    for key, value in changed.items():
-        if value is not None and name is None:
-            raise UserError(f"--{key} {value}: name the converter that gets it with --converter")
-    own = {f"network__converters__{name}__{key}": value for key, value in changed.items()}
-    names = {f"network__converters__{name}__{key}": f"--{key}" for key in changed}
-    return load_scenario(given, names, **own)
+    names = {**OPTIONS, "converter": "--converter"}
+    return load_scenario(
+        given, names, converter=options.converter, law=options.law, inner=options.inner
+    )
 
 
 def chosen_law(options: argparse.Namespace) -> LawFile:

@@ -109,9 +109,9 @@ export class Knobs {
   }
 
   laws() {
-    this.lawButtons = this.about.laws.map((law) => {
-      const button = make("button", { type: "button", class: "law", "data-law": law,
-        "aria-pressed": "false" }, law);
+    this.lawButtons = this.about.laws.map(([law, title]) => {
+      const button = make("button", { type: "button", class: "law", "data-law": title,
+        "aria-pressed": "false" }, title);
       button.addEventListener("click", () => this.send(section, { type: "law", law }));
       return button;
     });

@@ -17,6 +17,7 @@ from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies.campaign.draw import Distribution
 from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
 from gfm_plant import make_plant
+from gfm_runtime import law_titles
 from gfm_runtime.errors import printable
 from gfm_runtime.toml_file import parse_toml, read_text
 
@@ -83,7 +84,7 @@ def check_campaign(
     try:
         file = CampaignFile.model_validate(content)
     except ValidationError as problem:
-        wrong = lines(problem, CampaignFile)
+        wrong = lines(problem, CampaignFile, content=content)
         raise UserError("\n".join(f"{path}: {line}" for line in wrong)) from None
     if text is None:
         text = toml_text(content)
@@ -99,9 +100,11 @@ def check_campaign(
         put(content, target, value)
     given = laws or {}
     files = {law: given.get(law) or _beside(path, law) for law in file.laws}
+    titles = law_titles(files.values())
+    file = file.model_copy(update={"laws": [titles[law] for law in files.values()]})
     for label, law in files.items():
         check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
-    campaign = Campaign(path.stem, text, file, content, files)
+    campaign = Campaign(path.stem, text, file, content, {titles[f]: f for f in files.values()})
     checks = [*_end_checks(path, campaign), *_run_checks(path, campaign)]
     for k, check in enumerate(checks):
         tell(k, len(checks))

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.results.report import cell
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, Outcome
+from gfm_hil.studies.conformity.judge import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_hil.studies.conformity.result import document, status, table
 from gfm_runtime.errors import printable
 
@@ -26,7 +26,7 @@ Change = Literal["worse", "better", "gone", "new", "moved"]
 
 SHARE = 0.05
 _SMALL = 1e-3  # in the unit of a value: what moves by less has not moved
-_RANK = {PASS: 0, CANNOT: 1, FAIL: 2}
+_RANK = {PASS: 0, INFORMATIVE: 1, CANNOT: 1, FAIL: 2}
 _ORDER: tuple[Change, ...] = ("worse", "gone", "moved", "better", "new")
 
 
@@ -39,7 +39,7 @@ class Clause(_Read):
 
     Attributes:
         clause, kind: its words and its criterion.
-        verdict: pass, fail or cannot judge.
+        verdict: pass, fail, cannot judge or informative.
         value: measured, in ``unit``, or None.
         unit: of the value.
         text: one sentence.
@@ -268,7 +268,7 @@ def _bare(verdict: Outcome, text: str) -> Clause:
 def _change(old: Clause | None, new: Clause | None, share: float) -> Change | None:
     if old is None or new is None:
         return "new" if old is None else "gone"
-    if old.verdict != new.verdict:
+    if _RANK[old.verdict] != _RANK[new.verdict]:
         return "worse" if _RANK[new.verdict] > _RANK[old.verdict] else "better"
     if old.value is None or new.value is None:
         return None if old.value is new.value else "moved"

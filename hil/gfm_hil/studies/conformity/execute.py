@@ -129,15 +129,21 @@ class Found:
 
     @property
     def words(self) -> str:
-        """What is wrong, in one sentence; empty if all passes."""
-        return self.cause.text if self.cause else "" if self.verdict == PASS else self.reason
+        """What is wrong, a sentence for each clause that fails; empty if all passes."""
+        texts = dict.fromkeys(v.text for v in self.wrong)
+        return " ".join(texts) or ("" if self.verdict == PASS else self.reason)
+
+    @property
+    def wrong(self) -> list[Verdict]:
+        """The clauses that make it not pass; the one first that says most about why: a trip, or a
+        loss of step, explains whatever comes after it."""
+        told = [v for v in self.verdicts if v.verdict == self.verdict != PASS]
+        return sorted(told, key=lambda v: _CAUSES.get(v.kind, len(_CAUSES)))
 
     @property
     def cause(self) -> Verdict | None:
-        """The clause that says most about why it does not pass: a trip, or a loss of step, explains
-        whatever comes after it; None if all pass or it did not run."""
-        told = [v for v in self.verdicts if v.verdict == self.verdict != PASS]
-        return min(told, key=lambda v: _CAUSES.get(v.kind, len(_CAUSES)), default=None)
+        """The first of ``wrong``; None if all pass or it did not run."""
+        return next(iter(self.wrong), None)
 
 
 def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign | None:

@@ -15,13 +15,23 @@ from gfm_hil.recording.columns import printed, unit_of
 from gfm_hil.recording.run import RecordedRun, nominal_frequency
 from gfm_hil.results.cycles import cycle_means, cycle_ticks
 from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Verdict, judge_nfp
+from gfm_hil.studies.conformity.judge import (
+    CANNOT,
+    FAIL,
+    INFORMATIVE,
+    PASS,
+    SIGNS,
+    Verdict,
+    judge_nfp,
+)
 from gfm_hil.studies.conformity.model import Nfp
 from gfm_hil.studies.identification import Identification
 from gfm_hil.studies.identification_figures import draw_nfp
 
-#: Okabe and Ito's green, vermilion and grey: pass, fail, cannot judge
-VERDICT_COLOURS = {PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999"}
+#: Okabe and Ito's green, vermilion, grey and blue: pass, fail, cannot judge, informative
+VERDICT_COLOURS = {
+    PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999", INFORMATIVE: COLOURS[0],
+}  # fmt: skip
 _ALWAYS = ("p", "V", "i", "f_hz")
 _TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "frequency f"}
 _LIGHT = "#c9d6e2"

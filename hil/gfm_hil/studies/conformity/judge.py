@@ -40,11 +40,12 @@ from gfm_hil.studies.conformity.model import (
 )
 from gfm_hil.studies.envelopes import Envelope, Unit, phase_jump, rocof, scr_jump
 
-Outcome = Literal["pass", "fail", "cannot judge"]
+Outcome = Literal["pass", "fail", "cannot judge", "informative"]
 PASS: Final = "pass"
 FAIL: Final = "fail"
 CANNOT: Final = "cannot judge"
-SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?"}
+INFORMATIVE: Final = "informative"  # no law can be judged by it: it counts for nothing
+SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?", INFORMATIVE: "i"}
 
 _LASTED = ("completed", "oscillating")
 _CURVE = 600  # points of a limit in the figure
@@ -62,7 +63,7 @@ class Verdict:
         kind: of the criterion.
         signal: that was judged; may be empty.
         start, stop: of the window, s.
-        verdict: pass, fail or cannot judge.
+        verdict: pass, fail, cannot judge or informative.
         value: measured, in ``unit``; None if there is none.
         unit: of the value.
         limit: of the value, with its unit.
@@ -126,8 +127,8 @@ def judge_nfp(hz: Vector, nfp: NDArray[np.complex128], asked: Nfp) -> list[Verdi
     span = f"From {hz[0]:.3g} to {hz[-1]:.3g} Hz the gain lies between {gain.min():.4g} and "
     span += f"{gain.max():.4g} p.u./p.u."
     if asked.unknown is not None:
-        text = f"Cannot be judged: {asked.unknown}. {span}"
-        return [made(CANNOT, float(gain.max()), "p.u./p.u.", "", text)]
+        text = f"Informative: {asked.unknown}. {span}"
+        return [made(INFORMATIVE, float(gain.max()), "p.u./p.u.", "", text)]
     found = []
     for band in asked.bands:
         inside = (hz >= band.from_hz) & (hz <= band.to_hz)
@@ -167,10 +168,10 @@ def cannot(criteria: Sequence[Criterion], reason: str) -> list[Verdict]:
 
 
 def worst(outcomes: Sequence[str]) -> Outcome:
-    """fail before cannot judge before pass; no outcome at all cannot be judged."""
-    if FAIL in outcomes:
-        return FAIL
-    return PASS if outcomes and CANNOT not in outcomes else CANNOT
+    """fail before cannot judge before pass before informative; no outcome at all cannot be
+    judged."""
+    order: tuple[Outcome, ...] = (FAIL, CANNOT, PASS, INFORMATIVE)
+    return next((outcome for outcome in order if outcome in outcomes), CANNOT)
 
 
 def _first(run: RecordedRun) -> float:
@@ -247,8 +248,11 @@ class _Judge:
         )  # fmt: skip
 
     def _cannot(self, reason: str) -> Verdict:
-        made = self._made(True, None, "", "", f"Cannot be judged: {reason}.")
-        return replace(made, verdict=CANNOT, signal=getattr(self.c, "signal", ""))
+        why = self.c.informative
+        verdict: Outcome = CANNOT if why is None else INFORMATIVE
+        text = f"Cannot be judged: {reason}" + (f" (informative: {why})." if why else ".")
+        made = self._made(True, None, "", "", text)
+        return replace(made, verdict=verdict, signal=getattr(self.c, "signal", ""))
 
     def _end(self) -> str:
         """How the run ended early."""

@@ -47,6 +47,12 @@ class _Criterion(_Model):
     at: list[float] | None = Field(
         None, min_length=1, description="s; the first event of the run if none"
     )
+    informative: str | None = Field(
+        None,
+        min_length=1,
+        description="why this clause can be judged for no law on the shipped converter; where it "
+        "cannot be judged, it is informative and counts for nothing",
+    )
 
 
 class _Windowed(_Criterion):
@@ -185,7 +191,7 @@ class Nfp(_Criterion):
     points: int = Field(21, ge=2, le=1000, description="evenly apart on a logarithmic axis")
     bands: list[Band] = Field([], description="limits; each gives a verdict")
     unknown: str | None = Field(
-        None, description="without bands: why none are known; the plot is drawn, but not judged"
+        None, description="without bands: why none are known; the plot is drawn, and informative"
     )
 
     @model_validator(mode="after")

@@ -18,12 +18,22 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import printed
 from gfm_hil.results.report import STYLE, cell, figure, finite
 from gfm_hil.studies.conformity.execute import Found, slug
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, PASS, SIGNS, Outcome, Verdict, worst
+from gfm_hil.studies.conformity.judge import (
+    CANNOT,
+    FAIL,
+    INFORMATIVE,
+    PASS,
+    SIGNS,
+    Outcome,
+    Verdict,
+    worst,
+)
 from gfm_hil.studies.conformity.model import KNOWN, UnderTest
 from gfm_hil.studies.conformity.sets import Case
 
 _STYLE = """
 .pass{background:#00734f} .fail{background:#b34500} .cannot{background:#777}
+.informative{background:#36648b}
 td .status{padding:0 .4rem;white-space:nowrap}
 .scroll.text :is(th,td):not(:first-child){text-align:left;white-space:normal}
 .scroll .matrix :is(td,th){padding:.1rem;text-align:center;border:0} .matrix a{color:inherit;
@@ -59,8 +69,14 @@ class Conformity:
 
     @property
     def passed(self) -> bool:
-        """Whether every clause of every test passes under every law."""
-        return bool(self.matrix) and all(v == PASS for v in self.matrix.values())
+        """Whether every clause of every test passes under every law, the informative ones left
+        out."""
+        return self.verdict == PASS
+
+    @property
+    def verdict(self) -> Outcome:
+        """The worst of all tests under all laws."""
+        return worst([*self.matrix.values()])
 
     @cached_property
     def matrix(self) -> dict[tuple[str, str], Outcome]:
@@ -86,7 +102,7 @@ class Conformity:
             for law in self.laws
             for case in self.cases
             for f in self.of(law, case.id)
-            if f.verdict != PASS
+            if f.verdict not in (PASS, INFORMATIVE)
         ]
 
     def plain(self) -> dict[str, Any]:
@@ -154,7 +170,8 @@ class Conformity:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
     def _junit(self) -> str:
-        """One suite a law and test, one case a clause; what cannot be judged is an error."""
+        """One suite a law and test, one case a clause; what cannot be judged is an error, what is
+        informative is skipped."""
         top = ElementTree.Element("testsuites", name="gfmhil conform")
         for law in self.laws:
             for case in self.cases:
@@ -166,6 +183,7 @@ class Conformity:
                     top, "testsuite", name=f"{law}: {case.id}", tests=str(len(outcomes)),
                     failures=str(outcomes.count("fail")),
                     errors=str(outcomes.count("cannot judge")),
+                    skipped=str(outcomes.count("informative")),
                 )  # fmt: skip
                 for f, v in verdicts:
                     _case(suite, law, f, f"{v.clause} [{v.kind} from {v.start:g} s]", v.verdict,
@@ -247,7 +265,7 @@ class Conformity:
 
     def __repr__(self) -> str:
         count = list(self.matrix.values())
-        told = ", ".join(f"{count.count(v)} {v}" for v in (PASS, FAIL, CANNOT) if v in count)
+        told = ", ".join(f"{count.count(v)} {v}" for v in SIGNS if v in count)
         return "\n".join([f"<Conformity of {', '.join(self.laws)}: {told}", *self.failures, ">"])
 
 
@@ -298,3 +316,5 @@ def _case(suite: Any, law: str, f: Found, name: str, verdict: str, text: str) ->
         ElementTree.SubElement(entry, "failure", message=text)
     elif verdict == CANNOT:
         ElementTree.SubElement(entry, "error", message=text, type=CANNOT)
+    elif verdict == INFORMATIVE:
+        ElementTree.SubElement(entry, "skipped", message=text)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario, check_scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies.conformity.model import Part, Test, UnderTest
 from gfm_plant import ConverterParameters, load_converter
-from gfm_runtime.errors import meant, printable
+from gfm_runtime.errors import allowed, printable
 from gfm_runtime.toml_file import read_toml
 
 ALL = "all"
@@ -80,8 +79,8 @@ def _files(name: str, shipped: Mapping[str, Path]) -> list[Path]:
         known = [ALL, *shipped]
         raise UserError(
             printable(
-                f"--against {name}: must be one of {known}, a test such as miso/2-rocof, or a "
-                f"path of tests in TOML{meant(name, known)}"
+                f"--against {name}: "
+                + allowed(name, known, more=", a test such as miso/2-rocof, or a path of tests")
             )
         )
     return files
@@ -93,8 +92,7 @@ def _load_case(path: Path) -> Case:
     for part in test.runs():
         if part.cannot is None:
             content = _content(case, part, {})
-            made = partial(Scenario.model_validate, content)
-            _checked(path, Scenario, made, "scenario.")
+            _checked(path, Scenario, content, "scenario.")
             wrong = _mistakes(test, part, content)
             if wrong:
                 raise UserError("\n".join(printable(f"{path}: {line}") for line in wrong))
@@ -150,14 +148,14 @@ def _read(path: Path, model: type[Any]) -> Any:
         content = read_toml(path)
     except (OSError, ValueError) as problem:
         raise UserError(printable(f"{path}: {problem}")) from None
-    return _checked(path, model, partial(model.model_validate, content))
+    return _checked(path, model, content)
 
 
-def _checked(path: Path, model: type[BaseModel], make: Any, table: str = "") -> Any:
+def _checked(path: Path, model: type[BaseModel], content: Any, table: str = "") -> Any:
     try:
-        return make()
+        return model.model_validate(content)
     except ValidationError as problem:
-        told = [f"{path}: {table}{line}" for line in lines(problem, model)]
+        told = [f"{path}: {table}{line}" for line in lines(problem, model, content=content)]
         raise UserError("\n".join(told)) from None
 
 
