@@ -216,10 +216,10 @@ def place_of(folder: Path) -> Path | None:
         return parts if parts.is_dir() else None
     if not parts.exists():
         return None
-    place, found = parts.readlink(), parts.lstat()
-    ours = found.st_uid == os.geteuid() and scratch.is_private(place.lstat())
+    place, ours = parts.readlink(), parts.lstat().st_uid == os.geteuid()
     named = place.parent == _MEMORY and place.name.startswith(_PREFIX)
-    if not ours or not named or place.is_symlink() or not place.is_dir():
+    there = named and place.is_dir() and not place.is_symlink()
+    if not ours or not there or not scratch.is_private(place.lstat()):
         raise UserError(f"{parts}: is a link to {place}, not to a recording in memory of our user")
     home = place / _HOME
     made = home.readlink() if home.is_symlink() else None
