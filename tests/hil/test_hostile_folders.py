@@ -331,7 +331,7 @@ def odd(chance: random.Random, value: object) -> object:
 def odd_json(chance: random.Random, folder: Path, away: Path) -> str:
     """JSON that no run writes."""
     path = folder / chance.choice((*JSON, *LOGS))
-    if not path.is_file():
+    if not path.is_file() or path.is_symlink():
         return ""
     lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
     kind = chance.choice(("odd", "odd", "odd", "odd", "deep", "many", "long", "no JSON"))
@@ -370,7 +370,7 @@ def odd_array(chance: random.Random) -> bytes:
 def odd_npz(chance: random.Random, folder: Path, away: Path) -> str:
     """Archives that no run writes."""
     path = folder / chance.choice(DATA)
-    if not path.is_file():
+    if not path.is_file() or path.is_symlink():
         return ""
     kind = chance.choice(("bits", "bits", "cut", "arrays", "bomb", "members", "method", "field"))
     data = bytearray(path.read_bytes())
