@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import stat
 import tomllib
 from collections.abc import Mapping
 from functools import cache, lru_cache
@@ -13,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gfm_plant.bases import Bases
 
+_MOST_BYTES = 1 << 20
 LEAST, MOST = 1e-12, 1e12
 """Limits of any quantity, in SI units or p.u.; beyond them products overflow before the checks."""
 
@@ -107,7 +110,13 @@ def load_converter(name_or_path: str | Path) -> ConverterParameters:
                 " or the path of a .toml file"
             )
         return _parsed(shipped[name_or_path])
-    return _parsed(Path(name_or_path).read_text(encoding="utf-8"))
+    path = Path(name_or_path)
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):  # a pipe or a device may have no end
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
+    if found.st_size > _MOST_BYTES:
+        raise OSError(errno.EFBIG, f"is larger than {_MOST_BYTES} bytes", str(path))
+    return _parsed(path.read_text(encoding="utf-8"))
 
 
 @cache
@@ -119,4 +128,7 @@ def _shipped() -> dict[str, str]:
 
 @lru_cache(maxsize=16)
 def _parsed(text: str) -> ConverterParameters:
-    return ConverterParameters.model_validate(tomllib.loads(text))
+    try:
+        return ConverterParameters.model_validate(tomllib.loads(text))
+    except RecursionError:
+        raise ValueError("not usable: tables and arrays are nested too deep") from None

@@ -6,8 +6,6 @@ may walk through them by recursion.
 
 from __future__ import annotations
 
-import os
-import stat
 import tomllib
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +13,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, PlainValidator
 from pydantic_core import PydanticCustomError
+
+from gfm_runtime.regular import read_regular
 
 MAX_BYTES = 4 * 2**20  # some ten thousand events
 MAX_DEPTH = 32
@@ -39,38 +39,26 @@ def _number(value: Any) -> float | str:
 Number = Annotated[float | str, PlainValidator(_number, json_schema_input_type=float | str)]
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """The content of a TOML file.
+def read_toml(path: str | Path, links: bool = True) -> dict[str, Any]:
+    """The content of a TOML file; ``links``: it may be a link.
 
     Raises:
         ValueError: one line: as ``read_text`` or ``parse_toml``.
     """
-    return parse_toml(read_text(path))
+    return parse_toml(read_text(path, links))
 
 
-def read_text(path: str | Path) -> str:
-    """The text of a file, with or without a byte order mark.
+def read_text(path: str | Path, links: bool = True) -> str:
+    """The text of a file, with or without a byte order mark; ``links``: it may be a link.
 
     Raises:
         ValueError: one line: the file cannot be opened, is not regular (a pipe or a device may
             have no end), is larger than ``MAX_BYTES`` or is not UTF-8.
     """
     try:
-        # O_NONBLOCK: opening a named pipe would otherwise wait for its writer.
-        file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        data = read_regular(path, MAX_BYTES, links)
     except OSError as problem:
         raise ValueError(f"cannot be read: {problem.strerror}") from None
-    try:
-        if not stat.S_ISREG(os.fstat(file).st_mode):
-            raise ValueError("cannot be read: is not a regular file")
-        with os.fdopen(file, "rb", closefd=False) as opened:
-            data = opened.read(MAX_BYTES + 1)
-    except OSError as problem:
-        raise ValueError(f"cannot be read: {problem.strerror}") from None
-    finally:
-        os.close(file)
-    if len(data) > MAX_BYTES:
-        raise ValueError(f"cannot be read: is larger than {MAX_BYTES // 2**20} MiB")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as problem:

@@ -460,6 +460,16 @@ def test_command_writes_report_results_and_junit(
     assert "is not empty" in capsys.readouterr().err
 
 
+def test_control_characters_leave_junit_well_formed(lab: Path) -> None:
+    bad = NONE.replace("nobody built it", r"nobody \u0007\u001b[2J\uffff built it")
+    (lab / "jump.toml").write_text(LAB + bad)
+    out = lab.parent / "out"
+    asked = ["conform", "--law", "droop-3", "--against", str(lab), "-o", str(out), "--no-figures"]
+    assert main([*asked, "--workers", "1", "--quiet"]) == 1
+    (error,) = ElementTree.parse(out / "junit.xml").getroot().iter("error")
+    assert error.attrib["message"] == "nobody \ufffd\ufffd[2J\ufffd built it"
+
+
 @pytest.mark.processes
 def test_two_workers_find_what_one_does(lab: Path) -> None:
     (lab / "strict.toml").write_text(STRICT)

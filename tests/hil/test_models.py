@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -306,6 +309,36 @@ def test_a_file_that_is_no_model_is_refused(model: str, message: str, tmp_path: 
     (tmp_path / "text").write_text("no model")
     with pytest.raises(UserError, match=message):
         open_model(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
+
+
+@pytest.mark.attack(
+    "16.5", "an FMU of 3 GB when unpacked, or a pipe", "3 GB written; waits for ever"
+)
+@pytest.mark.parametrize("kind", ["bomb", "members", "description"])
+def test_an_fmu_is_unpacked_within_limits(
+    kind: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    attack_now: Callable[[str], None],
+) -> None:
+    file, scratch = tmp_path / "x.fmu", tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", bytes(40 << 20 if kind == "description" else 9))
+        for k in range(10_001 if kind == "members" else 0):
+            archive.writestr(f"resources/{k}", b"")
+        for k in range(9 if kind == "bomb" else 0):
+            archive.writestr(f"resources/{k}", bytes(64 << 20))
+    said = {
+        "bomb": "unpacked it has 603979785 bytes, more than 536870912",
+        "members": "its directory has more than 10000 members",
+        "description": "modelDescription.xml has 41943040 bytes, more than 33554432",
+    }[kind]
+    with pytest.raises(UserError, match=f"{file}: is no FMU that FMPy reads: {said}"):
+        open_model(f"fmu:{file}", PortMap(), Rig())
+    assert not [path for path in scratch.rglob("*") if path.is_file()]
+    attack_now("refused before it is unpacked")
 
 
 def test_the_command_refuses_what_makes_no_sense(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -183,3 +185,22 @@ def test_text_of_any_entry_is_read_by_a_parser(tmp_path: Path) -> None:
         a2l_text("x", "", [entries[2], entries[2]])
     with pytest.raises(LawError, match="address 0x100000000 must have at most 32 bits"):
         a2l_text("x", "", [Entry("x", "", "UBYTE", 2**32)])
+
+
+def test_a_damaged_file_that_points_beyond_any_file_is_refused(tmp_path: Path) -> None:
+    kind, where = b"\x7fELF\x02\x01\x01" + bytes(9), 64
+    head = struct.pack("<HHIQQQIHHHHHH", 2, 62, 1, 0, 0, where, 0, 64, 0, 0, 64, 3, 2)
+    sections = [(0, 0, 0, 0), (1, 1, 300, 9), (0, 3, 2**62, 20)]  # name, type, offset, size
+    for name, of, offset, size in sections:
+        head += struct.pack("<IIQQQQIIQQ", name, of, 0, 0, offset, size, 0, 0, 1, 0)
+    file = tmp_path / "program.elf"
+    file.write_bytes(kind + head + bytes(200))
+    with pytest.raises(LawError, match=r"program.elf: is damaged: OSError"):
+        elf_entries(file)
+
+
+def test_a_pipe_is_no_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    words = ["firmware", "a2l", str(tmp_path / "pipe"), "-o", str(tmp_path / "x.a2l")]
+    assert main(words) == 2
+    assert capsys.readouterr().err == f"gfmhil: {tmp_path / 'pipe'}: is not a regular file\n"

@@ -1,13 +1,120 @@
-"""Atomic files: written under another name, then renamed."""
+"""Files of a run folder: read with limits, written whole or not at all.
+
+A folder may come from anybody: what lies in place of a file may be a link, a pipe, a device, or
+larger than memory. ``open_file``, ``read_file`` and ``read_json`` are the only ways in.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import secrets
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_runtime.errors import printable
+from gfm_runtime.regular import open_regular, read_regular
+
+SMALL = 1 << 20  # bytes: more than any file that does not grow with the run has
+_MOST_VALUES = 1 << 20  # of a JSON text: each takes up to some hundred bytes of memory
 _PREFIX = ".part-"
+_ENTRY = b"PK\x01\x02"  # begins each entry of a zip file's directory
+_LONGEST = 1 << 17  # bytes of an entry, at most: a name and an extra field of 64 KiB each
+
+
+def open_file(path: Path, most: int | None = None) -> io.BufferedReader:
+    """Open a file of a run folder for reading: regular, no link, at most so many bytes.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        UserError: it is something else, or too large.
+    """
+    with _refused(path):
+        return open_regular(path, most, links=False)
+
+
+def read_file(path: Path, most: int = SMALL) -> bytes:
+    """The content of a file of a run folder; raises as ``open_file``."""
+    with _refused(path):
+        return read_regular(path, most, links=False)
+
+
+@contextlib.contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as problem:
+        raise UserError(f"{path}: {problem.strerror}") from None
+
+
+def read_json(path: Path, model: type[BaseModel], most: int = SMALL) -> dict[str, Any]:
+    """The content of a JSON file of a run folder.
+
+    Args:
+        path: of the file.
+        model: what it must be.
+        most: how many bytes it may have.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        UserError: one line: as ``open_file``, or it is no JSON or not what it must be.
+    """
+    data = read_file(path, most)
+    check_values(path, data)
+    try:
+        content = from_json(data)
+        model.model_validate(content)
+    except ValidationError as problem:
+        raise UserError(f"{path}: {lines(problem, model)[0]}") from None
+    except ValueError as problem:
+        raise UserError(printable(f"{path}: is not JSON: {problem}")) from None
+    return dict(content)
+
+
+def check_values(path: Path, data: bytes) -> None:
+    """See that a JSON text takes a limited memory when it is parsed.
+
+    Raises:
+        UserError: it may hold too many values.
+    """
+    if sum(data.count(sign) for sign in (b",", b"[", b"{")) > _MOST_VALUES:
+        raise UserError(f"{path}: holds more than {_MOST_VALUES} values")
+
+
+class Archive(io.BufferedReader):
+    """An open zip file whose directory has a limited length; to be given to ``zipfile``.
+
+    Args:
+        file: opened; it shares its place in the file with this one, which closes it.
+        members: how many it may have.
+    """
+
+    def __init__(self, file: io.BufferedReader, members: int) -> None:
+        super().__init__(file.raw)
+        self._end = os.fstat(self.fileno()).st_size
+        self._members = members
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file; ``zipfile`` reads the directory at once.
+
+        Raises:
+            BadZipFile: the directory is too long.
+        """
+        most = self._members * _LONGEST
+        left = min(most, self._end - self.tell()) + 1  # a read of more would first take the memory
+        data = super().read(min(left, size) if size is not None and size >= 0 else left)
+        if len(data) > most or data.count(_ENTRY) > self._members:
+            raise zipfile.BadZipFile(f"its directory has more than {self._members} members")
+        return data
 
 
 @contextlib.contextmanager
@@ -15,13 +122,16 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to; afterwards rename it to ``path``.
 
     The data is on disk before the rename is, so that a power failure leaves either the old file or
-    the new one. If the block raises, ``path`` stays as it was.
+    the new one. If the block raises, ``path`` stays as it was. The file is new and its name cannot
+    be told in advance, so that nobody can put a link in its place; if ``path`` is a link, the file
+    replaces the link.
 
     Raises:
         OSError: the file cannot be written; it names ``path``, not the path beside it.
     """
-    part = path.with_name(f"{_PREFIX}{os.getpid()}-{path.name}")
+    part = path.with_name(f"{_PREFIX}{secrets.token_hex(8)}-{path.name}")
     try:
+        os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
         yield part
         with part.open("rb") as file:
             os.fsync(file.fileno())

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import read_json
 from gfm_hil.core.roles import ROLES, Role
 
 SCHEME = "ipc://"
@@ -46,15 +47,15 @@ def announced(folder: Path, role: Role) -> dict[str, Any] | None:
     """
     file = announcement(folder, role)
     try:
-        found = Announcement.model_validate_json(file.read_text("utf-8"))
+        found = Announcement(**read_json(file, Announcement))
         place = Path(found.endpoint.removeprefix(SCHEME)).parent
         return found.model_dump() if scratch.held(place) else None
     except FileNotFoundError:
         return None
     except OSError as problem:
         raise UserError(f"{file}: {problem.strerror}") from None
-    except ValueError:
-        raise UserError(f"{file}: not an announcement of a run") from None
+    except ValueError as problem:  # a zero byte in the name of a folder
+        raise UserError(f"{file}: endpoint: {problem}") from None
 
 
 def present(folder: Path) -> list[Role]:

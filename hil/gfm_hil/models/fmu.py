@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,15 @@ from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.files import Archive
 from gfm_hil.models.model import BenchContext, ModelError, Wired, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
+from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import carried
 
 _NUMBERS = ("Real", "Float64")
+_MEMBERS = 10_000  # of an archive, at most
+_UNPACKED, _DESCRIPTION = 1 << 29, 1 << 25  # bytes of all members, and of the one that FMPy parses
 
 
 class FmuModel(Wired):
@@ -38,11 +43,14 @@ class FmuModel(Wired):
         where, self._said = path.name, ""
         self._resources = contextlib.ExitStack()
         try:
+            _check_size(path)
             folder = self._resources.enter_context(scratch.temporary("gfmhil-fmu-"))
             unpacked = fmpy.extract(str(path), str(folder))
             of = fmpy.read_model_description(unpacked)
         except Exception as problem:  # FMPy has no class of its own for it
-            raise UserError(f"{path}: is no FMU that FMPy reads: {problem}") from None
+            self._resources.close()
+            why = getattr(problem, "strerror", None) or problem
+            raise UserError(f"{path}: is no FMU that FMPy reads: {why}") from None
         if of.coSimulation is None or of.fmiVersion.startswith("1."):
             raise UserError(f"{path}: must be an FMU for co-simulation of FMI 2.0 or 3.0")
         self.name = run_name("fmu", of.modelName)
@@ -114,6 +122,23 @@ class FmuModel(Wired):
 
     def _why(self, problem: Exception) -> str:
         return f"{self.name}: {problem}{f' ({self._said})' if self._said else ''}"
+
+
+def _check_size(path: Path) -> None:
+    """See that a file is an archive that may be unpacked.
+
+    Raises:
+        OSError: it is no regular file.
+        BadZipFile: it is no archive, or has too many or too large members.
+    """
+    with open_regular(path) as file, zipfile.ZipFile(Archive(file, _MEMBERS)) as archive:
+        size = sum(info.file_size for info in archive.infolist())
+        if size > _UNPACKED:
+            raise zipfile.BadZipFile(f"unpacked it has {size} bytes, more than {_UNPACKED}")
+        described = archive.getinfo("modelDescription.xml").file_size
+        if described > _DESCRIPTION:
+            said = f"modelDescription.xml has {described} bytes, more than {_DESCRIPTION}"
+            raise zipfile.BadZipFile(said)
 
 
 def _by_type(variables: list[Any]) -> list[tuple[str, list[int], list[int]]]:

@@ -37,7 +37,7 @@ class LiveRun:
             UserError: scenario.toml does not say it.
         """
         try:
-            T_s = read_toml(self.folder / "scenario.toml")["T_s"]
+            T_s = read_toml(self.folder / "scenario.toml", links=False)["T_s"]
             if not isinstance(T_s, float) or not 0 < T_s < math.inf:
                 raise ValueError(f"T_s = {T_s!r}: must be a number of seconds")
         except (ValueError, KeyError) as problem:

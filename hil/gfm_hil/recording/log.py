@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from gfm_hil.core.errors import UserError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic_core import from_json
+
+from gfm_hil.core.files import SMALL, check_values, read_file, read_json
+from gfm_hil.core.roles import ROLES, Role
 from gfm_plant.names import CONTROLLER_LEFT, CONTROLLER_SAFE
 from gfm_runtime.states import PLANT_TRIP, REASONS
 
@@ -18,6 +22,11 @@ PLANT_LEFT = "the plant ended before the scenario did"
 
 #: reasons with which a role reports what the other role did
 _SECONDARY = (REASONS[PLANT_TRIP], PLANT_LEFT, CONTROLLER_LEFT, CONTROLLER_SAFE)
+
+_A_TICK = 1024  # bytes of the log or the summary: an event at every tick
+_MOST = 32 << 20  # bytes: a hundred thousand events
+
+Tick = Annotated[int, Field(ge=0, le=10**12)]
 
 SEVERITY: tuple[Status, ...] = ("completed", "oscillating", "interrupted", "safe", "tripped")
 
@@ -31,26 +40,119 @@ class Outcome:
     tick: int
 
 
-def read_log(*paths: Path) -> list[dict[str, Any]]:
-    """The lines of one or more logs, in order of their ticks.
+class _Said(BaseModel):
+    """What a file of a run says; keys without a type here may hold anything."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class _Line(_Said):
+    """A line of the log."""
+
+    tick: Tick
+    t: FiniteFloat
+    event: str
+    label: str = ""
+    role: str = ""
+    status: Status = "completed"
+    reason: str = ""
+    law: str = ""
+    bump_pu: float | None = None
+    controller: str | None = None
+    run: str | None = None
+    one_clock: bool = True
+
+
+#: keys that a line of a kind must have besides tick, t and event
+_NEEDS = {
+    "handshake": {"controller", "run", "one_clock"},
+    "law-active": {"law", "bump_pu"},
+    "tripped": {"reason"},
+    "safe": {"reason"},
+    "end": {"status", "reason"},
+}
+_LOGS = tuple(f"events_{side}.jsonl" for side in (*ROLES, "both"))
+
+
+class _Event(_Said):
+    t: FiniteFloat
+    tick: Tick
+    type: str
+    label: str
+
+
+class _Trip(_Said):
+    t: FiniteFloat
+    tick: Tick
+    reason: str
+
+
+class Summary(_Said):
+    """What summary.json must be, as far as anything relies on it."""
+
+    title: str
+    status: Status
+    reason: str
+    unmet: list[str]
+    controller: str | None
+    laws: list[str]
+    link: str
+    mode: Literal["lockstep", "realtime"]
+    T_s: Annotated[float, Field(gt=0, le=0.1)]
+    ticks: Tick
+    duration_s: FiniteFloat
+    wall_s: FiniteFloat
+    misses: int | None
+    round_trip_us: dict[str, float] | None
+    instructions: dict[str, float] = {}
+    faults: dict[Role, dict[str, int]]
+    e2e: dict[Role, str]
+    injected: dict[Role, dict[str, int]] = {}
+    inner: dict[str, str] = {}
+    bump_pu: list[float | None] | None
+    trips: list[_Trip] = []
+    events: list[_Event]
+    run: str | None
+    date: str = ""
+    version: str = ""
+    machines: dict[str, Any] = {}
+
+
+def most_bytes(ticks: int) -> int:
+    """How large the log or the summary of a run of so many ticks may be."""
+    return min(SMALL + _A_TICK * ticks, _MOST)
+
+
+def read_log(*paths: Path, most: int = _MOST) -> list[dict[str, Any]]:
+    """The lines of one or more logs of at most so many bytes each, in order of their ticks.
 
     It skips damaged lines: the last line of a process that was killed may be incomplete.
+
+    Raises:
+        UserError: a log is no regular file, or longer than that of any run.
     """
-    lines: list[dict[str, Any]] = []
+    found: list[dict[str, Any]] = []
     for path in paths:
-        if path.is_file():
-            for text in path.read_text("utf-8", errors="replace").splitlines():
-                with contextlib.suppress(ValueError, RecursionError):
-                    line = json.loads(text)
-                    if isinstance(line, dict) and isinstance(line.get("tick"), int):
-                        lines.append(line)
-    return sorted(lines, key=lambda line: line["tick"])
+        try:
+            data = read_file(path, most)
+        except FileNotFoundError:
+            continue
+        check_values(path, data)
+        for text in data.splitlines():
+            with contextlib.suppress(ValueError):
+                line = from_json(text)
+                _Line.model_validate(line)
+                if line.keys() >= _NEEDS.get(line["event"], set()):
+                    found.append(line)
+    return sorted(found, key=lambda line: line["tick"])
 
 
-def read_events(folder: Path) -> list[dict[str, Any]]:
-    """The log of a run folder, or of a run in progress what its roles have written so far."""
+def read_events(folder: Path, ticks: int) -> list[dict[str, Any]]:
+    """The log of the folder of a run of so many ticks, or of one in progress what its roles have
+    written so far; raises as ``read_log``."""
     whole = folder / "events.jsonl"
-    return read_log(whole) if whole.is_file() else read_log(*folder.glob("events_*.jsonl"))
+    logs = [whole] if os.path.lexists(whole) else [folder / name for name in _LOGS]
+    return read_log(*logs, most=most_bytes(ticks))
 
 
 def event_text(event: dict[str, Any]) -> str:
@@ -61,20 +163,14 @@ def event_text(event: dict[str, Any]) -> str:
     return ", ".join(f"{key} {value}" for key, value in rest.items())
 
 
-def read_summary(folder: Path) -> dict[str, Any]:
-    """The content of a run's summary.json.
+def read_summary(folder: Path, ticks: int) -> dict[str, Any]:
+    """The content of the summary.json of a run of so many ticks.
 
     Raises:
         FileNotFoundError: the run is not over, or was killed.
         UserError: the file is not a summary.
     """
-    path = folder / "summary.json"
-    try:
-        content = json.loads(path.read_text("utf-8"))
-        _ = content["status"], content["reason"]
-    except (ValueError, TypeError, KeyError, RecursionError):
-        raise UserError(f"{path}: is not the summary of a run") from None
-    return dict(content)
+    return read_json(folder / "summary.json", Summary, most_bytes(ticks))
 
 
 def cause(reasons: list[str]) -> str:

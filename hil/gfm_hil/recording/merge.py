@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, COUNTS_OF, kept_of, recorded_in
 from gfm_hil.recording.npz import BLOCK, Table, write_npz
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import Part, mapped, place_of
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.signals import NY
 
 
 def _rows(file: Path, first: int, last: int, columns: int | None = None) -> NDArray[Any]:
     """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
-    return np.ascontiguousarray(np.load(file, mmap_mode="r")[first:last, :columns].T)
+    return np.ascontiguousarray(mapped(file)[first:last, :columns].T)
 
 
 def _blocks(rows: int) -> Iterator[tuple[int, int]]:
@@ -44,14 +44,16 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> None:
 
     Raises:
         OSError: a file cannot be written; it is then not there.
+        UserError: a part is damaged, or ``parts`` is a link to anything but a recording.
     """
-    parts = {role: part for role in ROLES if (part := Part.open(folder, role)) is not None}
-    files = {role: folder / "parts" / f"{role}_signals.npy" for role in parts}
+    parts = {role: part for role in ROLES if (part := Part.read(folder, role)) is not None}
+    place = place_of(folder) or folder
+    files = {role: place / f"{role}_signals.npy" for role in parts}
     counts = {role: _recorded(files[role], len(part.signals)) for role, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
     columns = {role: recorded_in(role, part.signals.shape[1]) for role, part in parts.items()}
     write_npz(folder / "signals.npz", _signals(files, columns, done, T_s, laws))
-    write_npz(folder / "timing.npz", _timing(folder / "parts", [*parts], done))
+    write_npz(folder / "timing.npz", _timing(place, [*parts], done))
 
 
 def _signals(

@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import replacing
+from gfm_hil.core.files import Archive, open_file, replacing
 
 BLOCK = 1 << 16  # rows, at least
 _BLOCKS = 4000  # at most: an extra field holds 64 KiB
@@ -34,7 +35,13 @@ _LEVEL = 1
 _SPOOL = 1 << 20  # bytes of a column, compressed, that are kept in memory
 _DENSEST = 1032  # bytes that deflate can make of one
 _FIELD = 0x6667  # id of the extra field: rows a block, then where each block begins
-_DAMAGED = (zlib.error, zipfile.BadZipFile, struct.error, ValueError, KeyError, EOFError)
+_MEMBERS = 128  # of a file, at most; there are half as many columns
+_LARGEST = 1 << 23  # bytes of a block, or of a column of another writer, which has no blocks
+#: what a damaged file raises in zipfile, zlib and here; of OSError, a place where no file goes on
+_DAMAGED = (
+    *(zlib.error, zipfile.BadZipFile, struct.error, ValueError, KeyError, EOFError),
+    *(NotImplementedError, RuntimeError, OverflowError, OSError),
+)
 _LAST = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS).flush()  # ends a deflate stream
 
 
@@ -74,7 +81,7 @@ def write_npz(path: Path, tables: Iterable[Table]) -> None:
                     _Packed(stack.enter_context(spool()), name, kind, table.rows)
                     for name, kind in table.columns.items()
                 ]
-                step = max(BLOCK, -(-table.rows // _BLOCKS))
+                step = _step(table.rows)
                 for first in range(0, table.rows, step):
                     last = min(first + step, table.rows)
                     for column, rows in zip(packed, table.read(first, last), strict=True):
@@ -121,6 +128,11 @@ class _Packed:
         info.extra = struct.pack("<HH", _FIELD, len(field)) + field
 
 
+def _step(rows: int) -> int:
+    """Rows a block."""
+    return max(BLOCK, -(-rows // _BLOCKS))
+
+
 def _deflate(plain: bytes) -> bytes:
     """``plain`` as blocks of a deflate stream that a reader can decompress alone."""
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
@@ -155,8 +167,7 @@ class Column:
         """The rows of a slice with step 1.
 
         Raises:
-            OSError: the file is gone.
-            UserError: the file is damaged.
+            UserError: the file is gone or damaged.
         """
         first, last, _ = rows.indices(self.rows)
         found = np.empty(max(0, last - first), self.dtype)
@@ -178,15 +189,17 @@ class Column:
         return held[1]
 
     def _read(self, k: int) -> NDArray[Any]:
-        if not self.starts:
-            with np.load(self.path) as file:
-                return np.asarray(file[self.name])
-        with self.path.open("rb") as file:
-            file.seek(self.starts[k])
-            packed = file.read(self.starts[k + 1] - self.starts[k])
         rows = min(self.step, self.rows - k * self.step)
-        unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
-        plain = unpacker.decompress(packed, rows * self.dtype.itemsize)
+        size = rows * self.dtype.itemsize
+        with open_file(self.path) as file:
+            if self.starts:
+                file.seek(self.starts[k])
+                packed = file.read(self.starts[k + 1] - self.starts[k])
+                plain = zlib.decompressobj(-zlib.MAX_WBITS).decompress(packed, size)
+            else:
+                with _archive(file) as archive, archive.open(f"{self.name}.npy") as member:
+                    read_header(member)
+                    plain = member.read(size)
         return np.frombuffer(plain, self.dtype, rows)
 
 
@@ -194,37 +207,69 @@ def open_npz(path: Path) -> dict[str, Column]:
     """The columns of an .npz file, none of them read yet.
 
     Raises:
-        OSError: it cannot be read.
-        UserError: it is damaged.
+        FileNotFoundError: it is not there.
+        UserError: it is no regular file, or is damaged.
+    """
+    with open_file(path) as file:
+        try:
+            with _archive(file) as archive:
+                return {c.name: c for c in (_column(path, archive, i) for i in archive.infolist())}
+        except _DAMAGED as problem:
+            raise UserError(f"{path} is damaged: {problem}") from None
+
+
+def _archive(file: io.BufferedReader) -> zipfile.ZipFile:
+    return zipfile.ZipFile(Archive(file, _MEMBERS))
+
+
+def _column(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Column:
+    name = info.filename.removesuffix(".npy")
+    with archive.open(info) as member:
+        shape, dtype = read_header(member)
+    if len(shape) != 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is not a compressed column")
+    (rows,) = shape
+    size, blocks = rows * dtype.itemsize, _field(info.extra)
+    if size > _DENSEST * (info.compress_size + 1):
+        raise ValueError(f"{name} cannot hold {rows} rows")
+    at_once = min(rows, _step(rows) if blocks else rows) * dtype.itemsize
+    if at_once > _LARGEST:
+        raise ValueError(f"{name}: {at_once} bytes are to be read at once, more than {_LARGEST}")
+    if not blocks:
+        return Column(path, name, dtype, rows, max(1, rows), ())
+    assert archive.fp is not None
+    archive.fp.seek(info.header_offset + 26)  # lengths of name and extra field
+    begin = info.header_offset + 30 + sum(struct.unpack("<HH", archive.fp.read(4)))
+    step, *relative = struct.unpack(f"<{len(blocks) // 8}Q", blocks)
+    ends = [*relative, info.compress_size]
+    largest = 2 * step * dtype.itemsize + BLOCK  # compressed
+    sound = step == _step(rows) and len(relative) == -(-rows // step)
+    if not sound or not all(0 <= b - a <= largest for a, b in pairwise([0, *ends])):
+        raise ValueError(f"{name}: its blocks are not those of {rows} rows")
+    return Column(path, name, dtype, rows, step, tuple(begin + at for at in ends))
+
+
+def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """The shape and the type of an array that begins in an open file, as numpy writes it.
+
+    Raises:
+        ValueError: there is none, or a recording has none of its type.
     """
     try:
-        return _open(path)
-    except _DAMAGED as problem:
-        raise UserError(f"{path} is damaged: {problem}") from None
+        shape, fortran, dtype = _HEADERS[np.lib.format.read_magic(file)](file)
+    except Exception as problem:  # numpy has no common base for its errors
+        raise ValueError(f"is no array of numpy's: {problem}") from None
+    if dtype.str not in ("<f8", "<i8") and dtype.kind != "U":
+        raise ValueError(f"holds {dtype}, not numbers of 8 bytes or texts")
+    if fortran or min(shape, default=0) < 0:
+        raise ValueError(f"has a shape that no recording has: {shape}")
+    return shape, dtype
 
 
-def _open(path: Path) -> dict[str, Column]:
-    found = {}
-    with zipfile.ZipFile(path) as archive, path.open("rb") as file:
-        for info in archive.infolist():
-            with archive.open(info) as member:
-                version = np.lib.format.read_magic(member)
-                read = {
-                    (1, 0): np.lib.format.read_array_header_1_0,
-                    (2, 0): np.lib.format.read_array_header_2_0,
-                }[version]
-                (rows,), _, dtype = read(member)
-            if rows * dtype.itemsize > _DENSEST * (info.compress_size + 1):
-                raise ValueError(f"{info.filename} cannot hold {rows} rows")
-            step, starts = max(1, rows), ()
-            if field := _field(info.extra):
-                file.seek(info.header_offset + 26)  # lengths of name and extra field
-                begin = info.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))
-                step, *relative = struct.unpack(f"<{len(field) // 8}Q", field)
-                starts = tuple(begin + at for at in (*relative, info.compress_size))
-            name = info.filename.removesuffix(".npy")
-            found[name] = Column(path, name, dtype, rows, step, starts)
-    return found
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 def _field(extra: bytes) -> bytes:

@@ -20,12 +20,15 @@ from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import open_file
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import bytes_per_tick, kept_of, recorded_in, signals_of
+from gfm_hil.recording.npz import read_header
 
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
-_FILES = frozenset(f"{s}_{what}.npy" for s in ROLES for what in ("signals", "times", "progress"))
+_KINDS = ("signals", "times", "progress")
+_FILES = frozenset(f"{s}_{what}.npy" for s in ROLES for what in _KINDS)
 _HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
 _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
 
@@ -50,7 +53,7 @@ class Part:
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
-        def mapped(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
+        def made(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
             path = parts / f"{role}_{what}.npy"
             try:
                 array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
@@ -62,9 +65,9 @@ class Part:
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
         return Part(
-            mapped("signals", "f8", (ticks, len(columns)), np.nan),
-            mapped("times", "i8", (ticks, len(times)), -1),
-            mapped("progress", "i8", (2,), 0),
+            made("signals", "f8", (ticks, len(columns)), np.nan),
+            made("times", "i8", (ticks, len(times)), -1),
+            made("progress", "i8", (2,), 0),
         )
 
     def put(self, first: int, rows: NDArray[np.float64]) -> None:
@@ -74,19 +77,65 @@ class Part:
     @staticmethod
     def open(folder: Path, role: Role) -> Part | None:
         """The files of a role, or None if they do not exist or one of them is damaged."""
-        try:
-            arrays: list[NDArray[Any]] = [
-                np.asarray(np.load(folder / "parts" / f"{role}_{what}.npy", mmap_mode="r"))
-                for what in ("signals", "times", "progress")
-            ]
-        except Exception:  # missing or incomplete; numpy has no common base for its errors
+        with contextlib.suppress(UserError, OSError):  # OSError: just removed
+            return Part.read(folder, role)
+        return None
+
+    @staticmethod
+    def read(folder: Path, role: Role) -> Part | None:
+        """The files of a role, or None if one of them does not exist.
+
+        Raises:
+            UserError: a file is damaged, or ``parts`` is a link as of ``place_of``.
+        """
+        place = place_of(folder)
+        files = [place / f"{role}_{what}.npy" for what in _KINDS] if place is not None else []
+        if not files or not all(os.path.lexists(file) for file in files):
             return None
-        signals, times, progress = arrays
-        kinds = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
+        signals, times, progress = arrays = [mapped(file) for file in files]
+        types = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
         known = signals.ndim == 2 and recorded_in(role, signals.shape[1]) != ()
         widths = known and times.shape[1:] == (len(kept_of(role)),)
-        whole = kinds and widths and progress.shape == (2,) and len(signals) == len(times)
-        return Part(*arrays) if whole and 0 <= progress[0] <= len(signals) else None
+        whole = types and widths and progress.shape == (2,) and len(signals) == len(times)
+        if not whole or not 0 <= progress[0] <= len(signals):
+            raise UserError(f"{files[0]}: is no recording of a {role}, nor are those beside it")
+        return Part(signals, times, progress)
+
+
+def mapped(file: Path) -> NDArray[Any]:
+    """The array in a file of a part, mapped.
+
+    Raises:
+        UserError: the file is gone or damaged.
+    """
+    try:
+        with open_file(file) as opened:
+            shape, dtype = read_header(opened)
+            return np.asarray(np.memmap(opened, dtype, "r", opened.tell(), shape))
+    except (OSError, ValueError, OverflowError) as problem:
+        raise UserError(f"{file}: is damaged: {problem}") from None
+
+
+def check_parts(folder: Path, ticks: int) -> None:
+    """See that the parts in a folder are what a run of so many ticks wrote.
+
+    Raises:
+        UserError: one is damaged, has another length, or bytes that were never written: a run fills
+            its files before it begins, and writes no zeros over a whole page.
+    """
+    for role in ROLES:
+        part, place = Part.read(folder, role), place_of(folder)
+        if part is None or place is None:
+            continue
+        if len(part.signals) != ticks:
+            said = f"holds {len(part.signals)} ticks, but the run has {ticks}"
+            raise UserError(f"{place}/{role}_signals.npy: {said}")
+        for what in ("signals", "times"):
+            with open_file(place / f"{role}_{what}.npy") as file:
+                written = os.lseek(file.fileno(), 0, os.SEEK_HOLE)
+                if written < os.fstat(file.fileno()).st_size:
+                    said = f"is damaged: was never written from byte {written} on"
+                    raise UserError(f"{place}/{role}_{what}.npy: {said}")
 
 
 class Kept:
@@ -146,14 +195,39 @@ def keep_in_memory(
         except FileExistsError:  # another process of this run was first
             shutil.rmtree(place)
             scratch.let_go(_holds.pop(parts))
-    place = parts.readlink()
-    ours = parts.lstat().st_uid == os.geteuid()
-    if not ours or place.parent != _MEMORY or not place.name.startswith(_PREFIX):
-        raise UserError(f"{parts}: is a link to {place}, not to a recording in memory of our user")
+    place = place_of(folder) or parts.readlink()
     try:
         _holds[parts] = scratch.hold(place)
     except OSError as problem:
         raise UserError(f"{parts}: {place}: {problem.strerror or problem}") from None
+
+
+def place_of(folder: Path) -> Path | None:
+    """Where the parts of a run lie: in ``folder``/parts, or in the folder in memory to which
+    ``keep_in_memory`` has linked it; None if there is neither.
+
+    Raises:
+        UserError: ``parts`` is something else, or a link to anything else.
+    """
+    parts = folder / "parts"
+    if not parts.is_symlink():
+        if os.path.lexists(parts) and not parts.is_dir():
+            raise UserError(f"{parts}: is not a folder")
+        return parts if parts.is_dir() else None
+    if not parts.exists():
+        return None
+    place, ours = parts.readlink(), parts.lstat().st_uid == os.geteuid()
+    named = place.parent == _MEMORY and place.name.startswith(_PREFIX)
+    there = named and place.is_dir() and not place.is_symlink()
+    if not ours or not there or not scratch.is_private(place.lstat()):
+        raise UserError(f"{parts}: is a link to {place}, not to a recording in memory of our user")
+    home = place / _HOME
+    made = home.readlink() if home.is_symlink() else None
+    if made is not None and made.is_symlink() and made.readlink() == place:
+        if made.parent.samefile(folder):
+            return place
+        raise UserError(f"{parts}: is a link to {place}, the recording of {made.parent}")
+    return place
 
 
 def _rescue(notice: Callable[[str], None]) -> None:
@@ -220,12 +294,17 @@ def remove_parts(folder: Path) -> None:
     """Remove the parts from disk and memory.
 
     If the process is killed meanwhile, the next call removes the rest.
+
+    Raises:
+        UserError: ``parts`` is a link as of ``place_of``.
     """
     parts = folder / "parts"
-    if parts.is_dir():
-        for file in parts.glob("*.npy"):
-            file.unlink()
-        shutil.rmtree(parts.resolve())
+    place = place_of(folder)
+    if place is not None:
+        for file in place.glob("*.npy"):
+            if not file.is_dir():
+                file.unlink()
+        shutil.rmtree(place)
     if parts.is_symlink():
         parts.unlink()
     if parts in _holds:

@@ -14,14 +14,38 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines, need
+from gfm_hil.core.files import read_file
 from gfm_hil.core.roles import OUR_CONTROLLER, target_of
-from gfm_hil.recording.columns import HERTZ, Columns, Described, describe
-from gfm_hil.recording.log import read_events, read_summary
+from gfm_hil.recording.columns import (
+    CONTROLLER_COLUMNS,
+    CONTROLLER_INNER,
+    HERTZ,
+    PLANT_COLUMNS,
+    PLANT_INNER,
+    TIMES_OF,
+    Columns,
+    Described,
+    describe,
+)
+from gfm_hil.recording.log import most_bytes, read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.profiles import look_beside
 from gfm_plant import Bases, load_converter
 from gfm_runtime.toml_file import read_toml
+
+_LAST = 253402300799.0  # s since 1970, of the year 9999
+#: columns of which a recording has all or none
+_TOGETHER = (
+    *(
+        [name for name in columns if name.startswith(kind)]
+        for columns in (PLANT_COLUMNS, PLANT_INNER)
+        for kind in ("y_", "u_", "true_")
+    ),
+    CONTROLLER_COLUMNS,
+    CONTROLLER_INNER,
+    *([f"{role}_{name}" for name in times] for role, times in TIMES_OF.items()),
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -102,7 +126,8 @@ class RecordedRun:
         folder = Path(folder)
         try:
             columns, timing, laws = read_recording(folder)
-            summary = read_summary(folder)
+            ticks = len(columns["tick"])
+            summary = read_summary(folder, ticks)
         except FileNotFoundError as problem:
             going = (folder / "scenario.toml").is_file()
             if going and (names := converters_of(folder)):
@@ -114,9 +139,10 @@ class RecordedRun:
             what = what if going else "is not a run folder"
             missing = Path(problem.filename).name
             raise UserError(f"{folder}: {what} ({missing} is missing)") from None
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem}") from None
-        events = read_events(folder)
+        if summary["ticks"] != ticks:
+            said = summary["ticks"]
+            raise UserError(f"{folder}: summary.json says {said} ticks, signals.npz has {ticks}")
+        events = read_events(folder, ticks)
         return cls(read_scenario(folder), summary, columns, laws, events, folder, timing)
 
     def file(self, name: str) -> Path:
@@ -130,8 +156,17 @@ class RecordedRun:
         return self.folder / name
 
     def text(self, name: str) -> str:
-        """The content of a text file of the run folder."""
-        return self.file(name).read_text(encoding="utf-8")
+        """The content of a text file of the run folder.
+
+        Raises:
+            UserError: the run is in memory only, or the file is none of a run.
+        """
+        return read_file(self.file(name), most_bytes(self.ticks)).decode("utf-8", "replace")
+
+    @property
+    def began(self) -> float:
+        """When the run of the folder began, s since 1970."""
+        return began(self.file("."))
 
     @property
     def signals(self) -> Signals:
@@ -247,7 +282,7 @@ def read_scenario(folder: Path) -> Scenario:
         UserError: there is none in the folder, or it is damaged.
     """
     try:
-        content = read_toml(folder / "scenario.toml")
+        content = read_toml(folder / "scenario.toml", links=False)
         look_beside(content, folder)
         return Scenario.model_validate(content)
     except ValidationError as problem:
@@ -266,19 +301,36 @@ def converters_of(folder: Path) -> list[str]:
         return []
 
 
+def began(folder: Path) -> float:
+    """When the run of a folder began, s since 1970: when its scenario was written."""
+    return min(max(0.0, (folder / "scenario.toml").lstat().st_mtime), _LAST)
+
+
 def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
     """The columns of signals.npz and of timing.npz, and the labels of the laws.
 
     Raises:
-        OSError: a file is not there.
+        FileNotFoundError: a file is not there.
         UserError: a file is damaged.
     """
-    signals, timing = open_npz(folder / "signals.npz"), open_npz(folder / "timing.npz")
+    files = folder / "signals.npz", folder / "timing.npz"
+    signals, timing = map(open_npz, files)
     for name in ("tick", "t", "laws"):
         if name not in signals:
-            raise UserError(f"{folder / 'signals.npz'}: has no column {name}")
-    laws = [str(label) for label in signals.pop("laws")[:]]
+            raise UserError(f"{files[0]}: has no column {name}")
+    labels = signals.pop("laws")
+    if labels.dtype.kind != "U":
+        raise UserError(f"{files[0]}: its column laws holds no texts")
+    for file, columns, kind in (files[0], signals, float), (files[1], timing, np.int64):
+        for name, column in columns.items():
+            if column.dtype != (np.int64 if name == "tick" else kind):
+                raise UserError(f"{file}: its column {name} holds {column.dtype}")
+    for group in _TOGETHER:
+        there = [name for name in group if name in signals or name in timing]
+        if there and len(there) < len(group):
+            lacks = next(name for name in group if name not in there)
+            raise UserError(f"{folder}: the recording has {there[0]}, but no {lacks}")
     lengths = {name: len(column) for name, column in [*signals.items(), *timing.items()]}
     if len(set(lengths.values())) > 1:
         raise UserError(f"{folder}: the columns of the recording differ in length: {lengths}")
-    return signals, timing, laws
+    return signals, timing, [str(label) for label in labels[:]]

@@ -88,17 +88,20 @@ class NetworkRun(Mapping[str, Run]):
             raise UserError(f"{folder}: is not empty; choose another folder")
         for name, run in self.items():
             run.save(folder / name)
+        try:
+            write_scenario(folder, self.scenario)
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem.strerror}") from None
         self.conclude(folder)
         return folder
 
     def conclude(self, folder: Path, figures: bool = True) -> None:
-        """Write what the runs share into a folder that has theirs.
+        """Write what the runs share into a folder that has theirs and the scenario.
 
         Raises:
             UserError: the folder cannot be written.
         """
         try:
-            write_scenario(folder, self.scenario)
             if figures and any(run.ticks for run in self.values()):
                 from gfm_hil.results.diagram import draw_diagram
                 from gfm_hil.results.figures import draw_comparison
@@ -118,7 +121,8 @@ class NetworkRun(Mapping[str, Run]):
             UserError, Unfinished: as ``run_folder.recover``.
         """
         scenario = read_scenario(folder)
-        found = cls(scenario, {name: recover(folder / name) for name in scenario.parts}, folder)
+        runs = {name: recover(place) for name, place in _places(folder, scenario).items()}
+        found = cls(scenario, runs, folder)
         found.conclude(folder)
         return found
 
@@ -133,7 +137,8 @@ class NetworkRun(Mapping[str, Run]):
         scenario = read_scenario(folder)
         if not scenario.parts:
             raise UserError(f"{folder}: is not the folder of a network")
-        return cls(scenario, {n: Run.load(folder / n) for n in scenario.parts}, folder)
+        runs = {name: Run.load(place) for name, place in _places(folder, scenario).items()}
+        return cls(scenario, runs, folder)
 
     def _columns(self) -> dict[str, Any]:
         return {name: run.columns for name, run in self.items()}
@@ -149,3 +154,16 @@ class NetworkRun(Mapping[str, Run]):
     def __repr__(self) -> str:
         lines = [f"  {name}: {run.status}" for name, run in self.items()]
         return "\n".join(["<NetworkRun", *lines, ">"])
+
+
+def _places(folder: Path, scenario: Scenario) -> dict[str, Path]:
+    """The run folders of a network's converters in its own folder, by their names.
+
+    Raises:
+        UserError: one is a link.
+    """
+    places = {name: folder / name for name in scenario.parts}
+    for name, place in places.items():
+        if place.is_symlink() or place.parent != folder or name == "..":
+            raise UserError(f"{place}: is not a folder in {folder}")
+    return places

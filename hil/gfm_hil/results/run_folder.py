@@ -13,16 +13,16 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
-from gfm_hil.core.files import sync_folder, unfinished, write_text
+from gfm_hil.core.files import read_json, sync_folder, unfinished, write_text
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.setup import make_bench
@@ -30,8 +30,8 @@ from gfm_hil.recording.columns import Columns, bytes_per_tick
 from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.npz import Table, write_npz
-from gfm_hil.recording.parts import remove_parts
-from gfm_hil.recording.run import converters_of, read_recording
+from gfm_hil.recording.parts import check_parts, place_of, remove_parts
+from gfm_hil.recording.run import began, converters_of, read_recording, read_scenario
 from gfm_hil.results.run import Run
 from gfm_hil.results.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
@@ -88,37 +88,61 @@ def finish(
         Unfinished: a file cannot be written; ``recover`` completes the folder.
         KeyboardInterrupt: SIGINT, SIGTERM or SIGHUP came; the message says the same.
     """
-    ended = {"wall_s": wall_s, "figures": figures, "outside": outside and asdict(outside)}
+    ended = _Ended(wall_s=wall_s, figures=figures, outside=outside)
     with _kept(folder):
-        write_text(folder / _ENDED, json.dumps(ended))
+        write_text(folder / _ENDED, ended.model_dump_json())
         return _complete(scenario, folder, laws, wall_s, figures, outside)
 
 
 def recover(folder: Path) -> Run:
     """Complete the folder of a run that was cut off; leave one that is complete as it is.
 
+    What lies in the folder may be anything: no link in it is followed, and nothing is removed or
+    written elsewhere than there and in the run's own folder in memory.
+
     Raises:
-        UserError: it is no run folder, the run is still going on, or its recording is gone.
+        UserError: it is no run folder, the run is still going on, its recording is gone, or a file
+            is none of a run.
         Unfinished: a file cannot be written.
     """
     if not (folder / "scenario.toml").is_file():
         raise UserError(f"{folder}: is not a run folder (scenario.toml is missing)")
     with _alone(folder), _kept(folder):
-        if (folder / "summary.json").is_file():
+        if os.path.lexists(folder / "summary.json"):
+            run = Run.load(folder)
             _clear(folder)
-            return Run.load(folder)
+            return run
         parts = folder / "parts"
-        if not parts.is_dir() and not (folder / "signals.npz").is_file():
+        if place_of(folder) is None and not (folder / "signals.npz").is_file():
             lay = f" (it lay in {parts.readlink()})" if parts.is_symlink() else ""
             raise UserError(f"{folder}: nothing is left of what was recorded{lay}")
+        read_scenario(folder)  # says what is wrong with it as a file
         scenario = load_scenario(str(folder / "scenario.toml"))
         laws = make_bench(scenario).controller.labels
         try:
-            ended = json.loads((folder / _ENDED).read_text("utf-8"))
+            ended = _Ended(**read_json(folder / _ENDED, _Ended))
         except FileNotFoundError:  # it was cut off while it ran
-            ended = {"wall_s": _lasted(folder), "figures": True, "outside": None}
-        outside = Outcome(**ended["outside"]) if ended["outside"] else None
-        return _complete(scenario, folder, laws, ended["wall_s"], ended["figures"], outside)
+            ended = _Ended(wall_s=_lasted(folder))
+        return _complete(scenario, folder, laws, ended.wall_s, ended.figures, ended.outside)
+
+
+class _Ended(BaseModel):
+    """What ``ended.json`` says."""
+
+    wall_s: FiniteFloat
+    figures: bool = True
+    outside: Outcome | None = None
+
+
+class _LinkEnd(BaseModel):
+    """What ``link_<role>.json`` says, see ``_link_ends``."""
+
+    model_config = ConfigDict(strict=True)
+
+    role: Role
+    faults: dict[str, int]
+    e2e: str
+    injected: dict[str, int] = {}
 
 
 @contextlib.contextmanager
@@ -148,18 +172,20 @@ def _alone(folder: Path) -> Iterator[None]:
             scratch.lock(handle, fcntl.LOCK_EX, patience_s=0.0)
         except TimeoutError:
             raise UserError(f"{folder}: the run is still going on") from None
-        if (folder / "parts").is_symlink() and (folder / "parts").is_dir():
-            stack.callback(scratch.let_go, scratch.hold((folder / "parts").resolve()))
+        place = place_of(folder)
+        if place is not None and place.parent != folder:
+            stack.callback(scratch.let_go, scratch.hold(place))
         yield
 
 
 def _open_lock(folder: Path) -> int:
     """The file that is locked while a run folder is in use; only our user can open it, so that no
     other user can keep it locked."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        return os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        return os.open(folder / _LOCK, flags, 0o600)
     except OSError as problem:
-        raise UserError(f"{folder}: {problem.strerror}") from None
+        raise UserError(f"{folder / _LOCK}: {problem.strerror}") from None
 
 
 @contextlib.contextmanager
@@ -189,8 +215,9 @@ def _kept(folder: Path) -> Iterator[None]:
 
 def _lasted(folder: Path) -> float:
     """How long a run lasted whose end nobody saw: from its start to what was written last, s."""
-    times = [path.stat().st_mtime for path in [*folder.iterdir(), *folder.glob("parts/*")]]
-    return max(0.0, max(times) - (folder / "scenario.toml").stat().st_mtime)
+    place = place_of(folder)
+    files = [*folder.iterdir(), *(place.iterdir() if place is not None else ())]
+    return max(0.0, max(path.lstat().st_mtime for path in files) - began(folder))
 
 
 def _complete(
@@ -202,14 +229,18 @@ def _complete(
     outside: Outcome | None,
 ) -> Run:
     """Make the files of a run, then remove what they were made of; may be repeated at any point."""
-    if (folder / "parts").is_dir() or not (folder / "signals.npz").is_file():
+    if place_of(folder) is not None or not (folder / "signals.npz").is_file():
+        check_parts(folder, scenario.ticks)
         merge(folder, scenario.T_s, laws)  # of no parts where no side came so far
     signals, timing, labels = read_recording(folder)
-    log = read_events(folder)
+    if len(signals["tick"]) > scenario.ticks:
+        said = f"holds {len(signals['tick'])} ticks, but the run has {scenario.ticks}"
+        raise UserError(f"{folder / 'signals.npz'}: {said}")
+    log = read_events(folder, scenario.ticks)
     write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
     links = _link_ends(folder)
     summary = summarise(scenario, signals, timing, log, worst(log, outside), links, wall_s)
-    summary |= stages(scenario) | origin(scenario, (folder / "scenario.toml").stat().st_mtime)
+    summary |= stages(scenario) | origin(scenario, began(folder))
     run = Run(scenario, summary, signals, labels, log, folder, timing)
     _conclude(run, figures)
     return run
@@ -218,8 +249,11 @@ def _complete(
 def _link_ends(folder: Path) -> dict[Role, dict[str, Any]]:
     """What each side wrote about its end of the link: the faults that it counted, the state of the
     end-to-end protection, and the faults injected on purpose."""
-    ends = (json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("link_*.json")))
-    return {end["role"]: end for end in ends}
+    ends = {}
+    for role in ROLES:
+        with contextlib.suppress(FileNotFoundError):
+            ends[role] = read_json(folder / f"link_{role}.json", _LinkEnd)
+    return ends
 
 
 def merge_roles(first: Path, second: Path, folder: Path) -> Run:
@@ -323,8 +357,10 @@ def _conclude(run: Run, figures: bool) -> None:
 def _clear(folder: Path) -> None:
     """Remove what the files of a complete run were made of, and what a killed process left."""
     remove_parts(folder)
-    for pattern in (_LOCK, "events_*", "link_*.json", "commands_*.json", _ENDED):
-        for path in folder.glob(pattern):
-            path.unlink()
-    for path in unfinished(folder):
-        path.unlink()
+    names = [_LOCK, _ENDED]
+    for side in (*ROLES, "both"):
+        names += [f"events_{side}.jsonl", f"events_{side}.room", f"link_{side}.json"]
+        names += [f"commands_{side}.json", f"commands_{side}.new"]
+    for path in [*(folder / name for name in names), *unfinished(folder)]:
+        with contextlib.suppress(IsADirectoryError):  # it is none of ours
+            path.unlink(missing_ok=True)

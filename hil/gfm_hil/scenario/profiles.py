@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gfm_hil.core.errors import UserError
 from gfm_runtime.errors import printable
+from gfm_runtime.regular import open_regular, read_regular
 from gfm_runtime.signals import SIGNALS
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 _COLUMNS = ("t", "f_hz", "omega_g", "V_g")
 _RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
 _MOST = 100_000  # lines
+_MOST_BYTES = 64 << 20
 
 
 class Point(NamedTuple):
@@ -99,7 +102,7 @@ def read_profile(file: str, f_n: float | None) -> Profile:
     """
     t, columns = [], dict[str, list[float]]()
     try:
-        with Path(file).open(encoding="utf-8", newline="") as text:
+        with io.TextIOWrapper(open_regular(file, _MOST_BYTES), "utf-8", newline="") as text:
             for number, cells in _lines(text, file):
                 if not columns:
                     columns = {name: [] for name in _head([c.strip() for c in cells], file)}
@@ -169,7 +172,7 @@ def last_time(file: str) -> float:
 
 def content_hash(file: str) -> str:
     """Hash of a file, wherever it lies."""
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]
+    return hashlib.sha256(read_regular(file, _MOST_BYTES)).hexdigest()[:16]
 
 
 def look_beside(content: Any, folder: Path) -> None:

@@ -80,17 +80,17 @@ class Record:
 
     def events(self) -> list[dict[str, Any]]:
         """The events so far, in order of time."""
-        return read_events(self.folder)
+        return read_events(self.folder, self.capacity)
 
     def ended(self) -> dict[str, str] | None:
         """How the run ended, ``status`` and ``reason``; None while it is in progress.
 
         Raises:
-            OSError: the summary cannot be read.
-            UserError: it is unknown whether the run is still in progress.
+            UserError: the summary cannot be read, or it is unknown whether the run is still in
+                progress.
         """
         try:
-            content = read_summary(self.folder)
+            content = read_summary(self.folder, self.capacity)
         except FileNotFoundError:
             return self._gone()
         return {key: str(content[key]) for key in ("status", "reason")}

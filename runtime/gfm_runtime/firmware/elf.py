@@ -19,12 +19,14 @@ from gfm_runtime.firmware.a2l import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.module import RESULTS
 from gfm_runtime.firmware.stage import SHARED, VARIABLES
 from gfm_runtime.inner import INNER_CONSTANTS
+from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import Signal, carried_rows, group
 
 _INSTANCE = re.compile(r"gfm(_\w+)?_t")
 _RECORD = "gfm_law_t"
 _REAL = re.compile(r"gfm(_\w+)?_real")
 _MOST_ELEMENTS = 64  # of an array of instances
+_MOST_BYTES = 1 << 28
 _MOST_LINKS = 64  # from a variable to its type: more of them go in a circle
 _FLOATS = {4: "FLOAT32_IEEE", 8: "FLOAT64_IEEE"}
 _SIGNED = {1: "SBYTE", 2: "SWORD", 4: "SLONG", 8: "A_INT64"}
@@ -120,6 +122,7 @@ def elf_a2l(path: Path) -> tuple[str, int, int]:
 
     Raises:
         LawError: it is no linked ELF file, has no debug information, or no exported law.
+        OSError: it cannot be opened, is no regular file or is too large.
     """
     entries, big_endian = elf_entries(path)
     about = f"laws of gfmhil in {path.name}"
@@ -132,14 +135,15 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
     """What can be measured and calibrated, by address; and whether the program is big-endian.
 
     Raises:
-        LawError: as ``elf_a2l``.
+        LawError, OSError: as ``elf_a2l``.
     """
     from elftools.common.exceptions import ELFError
     from elftools.elf.elffile import ELFFile
 
     where = str(path)
+    file = open_regular(path, _MOST_BYTES)
     try:
-        with path.open("rb") as file:
+        with file:
             elf = ELFFile(file)
             if elf["e_type"] == "ET_REL":
                 raise LawError(where, "is not linked, so that it has no addresses")
@@ -150,7 +154,7 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
                 for entry in _entries(place, kind):
                     found.setdefault(entry.name, entry)
             big_endian = not elf.little_endian
-    except (LawError, OSError):
+    except LawError:
         raise
     except ELFError as problem:
         raise LawError(where, f"is no readable ELF file: {problem}") from None

@@ -32,9 +32,11 @@ from gfm_runtime.firmware.module import (
 from gfm_runtime.firmware.stage import CONSTANTS, SIZE, numbers_of, stage_text
 from gfm_runtime.firmware.unrolled import Unrolled
 from gfm_runtime.kernel import law_dtype
+from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import NU, NY, U_NAMES, carried_rows, group, table_hash
 
 FORMAT = 1  # of report.json
+_MOST_BYTES = 64 << 20
 
 
 class Exported(NamedTuple):
@@ -91,9 +93,11 @@ def read_report(folder: Path) -> Exported:
     """
     path = folder / "report.json"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, _MOST_BYTES).decode("utf-8")
     except FileNotFoundError:
         raise LawError(str(path), "is not there; gfmhil firmware export writes it") from None
+    except OSError as problem:
+        raise LawError(str(path), f"cannot be read: {problem.strerror}") from None
     except UnicodeDecodeError:
         raise LawError(str(path), "is not a text in UTF-8") from None
     try:

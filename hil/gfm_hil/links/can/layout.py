@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,10 @@ from gfm_hil.links.can.dbc import (
 )
 from gfm_hil.links.can.wire import crc8
 from gfm_runtime.compiled import cached
+from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import Vector, carried
+
+_MOST_BYTES = 16 << 20  # of a DBC file
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,9 @@ def load_plan(options: CanOptions) -> Plan:
         return plan_of(read_dbc(write_dbc(options.fd)), options.inner)
     where = f"dbc = {options.dbc!r}"
     try:
-        plan = plan_of(read_dbc(Path(options.dbc).read_text(encoding="utf-8")), options.inner)
+        plan = plan_of(
+            read_dbc(read_regular(options.dbc, _MOST_BYTES).decode("utf-8")), options.inner
+        )
     except OSError as problem:
         raise ValueError(f"{where}: {problem.strerror}") from None
     except Exception as problem:  # cantools' parser errors have no common base class

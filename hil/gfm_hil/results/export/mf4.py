@@ -40,9 +40,8 @@ def write_mf4(run: RecordedRun, file: Path) -> None:
         )
 
     channels = [c for c in run.described if c.name != "t"]  # the group's master
-    began = run.file("scenario.toml").stat().st_mtime  # written as the run is started
     with MDF(version="4.11") as mdf:
-        mdf.start_time = datetime.fromtimestamp(began, UTC)
+        mdf.start_time = datetime.fromtimestamp(run.began, UTC)
         empty = {name: x[:0] for name, x in run.recorded.items()}
         for first, rows in run.blocks(_ROWS) if run.ticks else [(0, empty)]:
             if first:  # asammdf keeps what was appended in a file of its own

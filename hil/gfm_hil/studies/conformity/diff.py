@@ -17,6 +17,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.files import read_file
 from gfm_hil.results.report import cell
 from gfm_hil.studies.conformity.judge import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_hil.studies.conformity.result import document, status, table
@@ -25,6 +26,7 @@ from gfm_runtime.errors import printable
 Change = Literal["worse", "better", "gone", "new", "moved"]
 
 SHARE = 0.05
+_MOST = 64 << 20  # bytes of results.json: hundreds of laws
 _SMALL = 1e-3  # in the unit of a value: what moves by less has not moved
 _RANK = {PASS: 0, INFORMATIVE: 1, CANNOT: 1, FAIL: 2}
 _ORDER: tuple[Change, ...] = ("worse", "gone", "moved", "better", "new")
@@ -192,7 +194,7 @@ def read_results(path: str | Path) -> Results:
     file = Path(path)
     file = file / "results.json" if file.is_dir() else file
     try:
-        return Results.model_validate_json(file.read_bytes())
+        return Results.model_validate_json(read_file(file, _MOST))
     except OSError as problem:
         raise UserError(f"{file}: {problem.strerror}") from None
     except ValidationError as problem:

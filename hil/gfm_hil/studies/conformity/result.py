@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -31,6 +32,8 @@ from gfm_hil.studies.conformity.judge import (
 from gfm_hil.studies.conformity.model import KNOWN, UnderTest
 from gfm_hil.studies.conformity.sets import Case
 
+#: characters that XML cannot hold, not even escaped
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _STYLE = """
 .pass{background:#00734f} .fail{background:#b34500} .cannot{background:#777}
 .informative{background:#36648b}
@@ -191,7 +194,8 @@ class Conformity:
                 for f in bare:
                     _case(suite, law, f, f.part, f.verdict, f.reason)
         ElementTree.indent(top)
-        return ElementTree.tostring(top, encoding="unicode", xml_declaration=True) + "\n"
+        text = ElementTree.tostring(top, encoding="unicode", xml_declaration=True)
+        return _NOT_XML.sub("\ufffd", text) + "\n"
 
     def _page(self, law: str) -> str:
         body = [self._head(f"{law}: conformity")]
