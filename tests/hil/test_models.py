@@ -336,7 +336,7 @@ def test_an_fmu_is_unpacked_within_limits(
         "description": "modelDescription.xml has 41943040 bytes, more than 33554432",
     }[kind]
     with pytest.raises(UserError, match=f"{file}: is no FMU that FMPy reads: {said}"):
-        open_model(f"fmu:{file}", PortMap(), Rig())
+        open_model(f"fmu:{file}", PortMap(), BenchContext())
     assert not [path for path in scratch.rglob("*") if path.is_file()]
     attack_now("refused before it is unpacked")
 
