@@ -32,7 +32,9 @@ def test_channels_agree_with_control_and_a_dense_grid(law: str) -> None:
     A, B, C, D = p.closed_loop(NONE).performance()
     for channel, weight in zip(p.channels(NONE), PAPER_WEIGHTS, strict=True):
         system = channel_system((A, B, C, D), weight)
-        assert channel.norm == pytest.approx(control.linfnorm(control.ss(*system))[0], rel=1e-6)
+        # its search comes from below, and may end early: on some processors 1e-6 below the peak
+        found = [control.linfnorm(control.ss(*system), tol=t)[0] for t in (1e-6, 1e-8, 1e-10)]
+        assert channel.norm == pytest.approx(max(found), rel=1e-6)
         near = channel.omega * np.linspace(0.99, 1.01, 2001)
         w = np.concatenate([np.logspace(-3, 5, 2000), near])
         inner = np.linalg.solve(1j * w[:, None, None] * np.eye(len(A)) - A, B[None])

@@ -277,7 +277,7 @@ def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
         (["compare", "short.toml"], "compare list is empty"),
         (["compare", "short.toml", "--laws", "vsg-2,,vsg-1"], "none empty"),
         (["compare", "short.toml", "--laws", "vsg-99"], "vsg-99"),
-        (["run", "short.toml", "--law", "bad.toml"], "law file bad.toml: phi.22.0.typ"),
+        (["run", "short.toml", "--law", "bad.toml"], "law file bad.toml: phi.22.typ"),
         (["run", "short.toml", "--law", "vsg2"], "did you mean 'vsg-2'?"),
         (["run", "short.toml", "--link", "can", "--option", "every=99"], "--option every 99"),
         (["tell", "run", "Pref=1"], "did you mean 'P_ref'?"),
@@ -409,7 +409,7 @@ def test_an_unstable_law_is_told_with_its_mode(
         assert main(["laws", "show", law]) == 0
         assert "an unstable mode" not in capsys.readouterr().out
     assert main([*start, str(tmp_path / "good"), "--law", "vsg-2"]) == 0
-    assert "unstable" not in capsys.readouterr().out
+    assert "an unstable mode" not in capsys.readouterr().out
 
 
 def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(

@@ -60,7 +60,7 @@ def test_a_trip_for_another_reason_is_not_the_one_expected(tmp_path, attack_now)
     assert "droop in Python" in repr(run)
     assert run.summary["unmet"] == [
         "expect_reason = 'over-current', but the reason was 'command not finite'",
-        "expect_after = 1 s, but the end came at 0.028 s",  # after 280 good commands
+        "expect_after = 1 s, but the end came at 0.0281 s",  # after 280 good commands
     ]
     attack_now(f"exit code 3 at {run.summary['duration_s'] * 1e3:.1f} ms: reason and time named")
 

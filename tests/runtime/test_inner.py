@@ -169,7 +169,7 @@ def test_shipped_stages_load_and_differ() -> None:
     ("text", "said"),
     [
         ('type = "virtual"', "inner stage .*: type = 'virtual': must be one of .*virtual-stator"),
-        ('type = "cascaded"\nI_thr = 1.0', "cascaded.I_thr = 1.0: unknown key"),
+        ('type = "cascaded"\nI_thr = 1.0', r"stage\.toml: I_thr = 1.0: unknown key"),
         ('type = "virtual-stator"\nX_v = 0.0', "inner.X_v: 0.0 must be > 0"),
         ('type = "cascaded"\nI_max = -1.0', "inner.I_max: -1.0 must be > 0"),
         ('type = "cascaded"\n[power]\nP_max = 0.1\nP_min = 0.5', "inner.P_max: 0.1 must be above"),

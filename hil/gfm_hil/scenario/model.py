@@ -310,8 +310,8 @@ class Scenario(_Model):
 
     @property
     def model_timeout_s(self) -> float:
-        """How long a model may take for an answer, s: half, so that its controller can still say
-        what has failed."""
+        """How long a model may take for an answer, s. It is half of the peer's time, so that its
+        controller can still say what has failed."""
         return self.peer_timeout_s / 2
 
     @property
