@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.impedance import estimate
-from gfm_runtime.inner import measure_frequency, settle_inner, shape, take_measurements
-from gfm_runtime.kernel import advance, output, set_inputs, step
+from gfm_runtime.inner import settle_inner, take_measurements
+from gfm_runtime.kernel import step, step_with_inner
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.states import (
     BAD_U,
@@ -52,9 +52,8 @@ controller_dtype = np.dtype(
         ("ref_rate", "f8", (NY,)),  # p.u. per tick; 0 is a step
         ("y", "f8", (NY_INNER,)),  # of this tick: the kernel takes fields of a record
         ("u", "f8", (NU,)),
-        # with an inner stage: the references that the law sees, and what goes to the bridge
-        ("ref_seen", "f8", (NY,)),
-        ("out", "f8", (NU_INNER,)),
+        ("ref_seen", "f8", (NY,)),  # with which a law joins, see ``_join``
+        ("out", "f8", (NU_INNER,)),  # with an inner stage: what goes to the bridge
         ("y_low", "f8", (NY_INNER,)),
         ("y_high", "f8", (NY_INNER,)),
         # gain scheduling: stages first..first+count-1 of the laws share one schedule
@@ -142,25 +141,6 @@ def _schedule(ctl, est, y):
 
 
 @inlined
-def step_with_inner(law, state, c):
-    """One tick of a law and its inner stage: ``c.out`` (4,) from ``c.ref`` (5,) and ``c.y`` (11,).
-
-    ``c`` is a record that has the fields ``ref``, ``ref_seen``, ``y``, ``u`` and ``out`` of
-    ``controller_dtype``.
-    """
-    take_measurements(state, c.y)
-    for j in range(NY):
-        c.ref_seen[j] = c.ref[j]
-    if law.k_pll > 0.0:
-        measure_frequency(law, state)
-        c.ref_seen[2] = state.omega_pll
-    set_inputs(law, state, c.ref_seen, c.y)
-    output(law, state, c.u)
-    shape(law, state, c.u, c.out)
-    advance(law, state)
-
-
-@inlined
 def accept(c, y):
     """Check y[k] and keep it in ``c.y``, and move the references by one tick.
 
@@ -202,7 +182,7 @@ def _join(law, state, c, inner):
     settle_into(law, state, c.ref_seen, c.y, c.u, state.trend)
     if inner:
         take_measurements(state, c.y)
-        settle_inner(law, state, c.u, c.u[2], 0.0)
+        settle_inner(law, state, c.u[2], 0.0)
 
 
 @inlined
@@ -242,10 +222,10 @@ def control(ctl, laws, states, est, y, u):
         c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u)
         if inner:
             take_measurements(states[k], c.y)
-            settle_inner(laws[k], states[k], c.u, c.out[2], c.out[3])
+            settle_inner(laws[k], states[k], c.out[2], c.out[3])
         c.active, c.changes = k, c.changes + 1
     if inner:
-        step_with_inner(laws[c.active], states[c.active], c)
+        step_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
         for i in (1, 0, 2, 3):
             if not math.isfinite(c.out[i]):
                 _go_safe(c, BAD_U, i)

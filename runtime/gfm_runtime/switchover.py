@@ -26,7 +26,12 @@ def settle_into(law, state, ref, y, u, trend):
         state.offset[i] = 0
         state.trend[i] = trend[i]
         state.u[i] = state.raw[i] - state.trend[i]
-    state.y[2] = state.raw[1]
+    i_u, omega_u, E_u = state.raw[0], state.raw[1], state.raw[2]
+    state.y[2] = omega_u
+    for i in range(NU):  # raw is now what the states and the trend have to give
+        state.raw[i] -= law.u_0[i]
+        for j in range(NY):
+            state.raw[i] -= law.D_u0[i, j] * state.ref[j]
     for i in range(law.n):
         a = law.E_r[i, 0] * state.r[0]
         for j in range(1, NY):
@@ -34,19 +39,17 @@ def settle_into(law, state, ref, y, u, trend):
         for j in range(NY):
             a += law.E_y[i, j] * state.y[j]
         for j in range(NU):
-            wanted = state.raw[j] - law.u_0[j]
-            for m in range(NY):
-                wanted -= law.D_u0[j, m] * state.ref[m]
-            a += law.F[i, j] * wanted + law.G[i, j] * state.trend[j]
+            a += law.F[i, j] * state.raw[j] + law.G[i, j] * state.trend[j]
         state.x[i] = a + 0  # never -0, as after a step: code that leaves out zeros gives +0
     # the offset takes the rest: all of it in a row without states, rounding in the others
-    i_u, omega_u, E_u = state.raw[0], state.raw[1], state.raw[2]
-    output(law, state, u)
+    output(law, state)
     state.offset[1] = (omega_u - state.raw[1]) / law.loop
-    output(law, state, u)
+    output(law, state)
     state.offset[0] = i_u - state.raw[0]
     state.offset[2] = E_u - state.raw[2]
-    output(law, state, u)
+    output(law, state)
+    for i in range(NU):
+        u[i] = state.now[i]
 
 
 @compiled
@@ -62,7 +65,9 @@ def change_law(old, old_state, new, new_state, ref, y, u):
         max |u_new - u_old| in p.u.: rounding, unless the new law's limits are tighter.
     """
     set_inputs(old, old_state, ref, y)
-    output(old, old_state, u)
+    output(old, old_state)
+    for i in range(NU):
+        u[i] = old_state.now[i]
     i_u, omega_u, E_u = u[0], u[1], u[2]
     settle_into(new, new_state, ref, y, u, old_state.trend)
     return max(abs(u[0] - i_u), abs(u[1] - omega_u), abs(u[2] - E_u))

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.controller import step_with_inner
 from gfm_runtime.firmware.fixed import (
     REFS,
     YS,
@@ -34,7 +33,7 @@ from gfm_runtime.firmware.fixed import (
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.firmware.stage import VARIABLES
 from gfm_runtime.inner import settle_inner, take_measurements
-from gfm_runtime.kernel import state_dtype, step
+from gfm_runtime.kernel import state_dtype, step, step_with_inner
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, carried, carried_rows, group, names
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into
@@ -173,7 +172,7 @@ def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:
     """What goes into and out of a step, as ``gfm_runtime.controller`` has it; and the u in use."""
     return np.dtype(
         [
-            ("ref", real, (NY,)), ("ref_seen", real, (NY,)), ("y", real, (NY_INNER,)),
+            ("ref", real, (NY,)), ("y", real, (NY_INNER,)),
             ("u", real, (NU,)), ("out", real, (NU_INNER,)), ("held", real, (NU_INNER,)),
             ("zero", real, (NU,)), ("bump", real),
         ],
@@ -216,7 +215,7 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             c.bump = change_law(laws[old], old_state, laws[k], new_state, c.ref, c.y, c.u)
             if inner:
                 take_measurements(new_state, c.y)
-                settle_inner(laws[k], new_state, c.u, old_state.e[0], old_state.e[1])
+                settle_inner(laws[k], new_state, old_state.e[0], old_state.e[1])
             now[0], now[1] = k, 1 - now[1]
         elif op[i] == RESET:
             now[2] = OK
@@ -226,13 +225,13 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
             if inner:
                 take_measurements(old_state, c.y)
-                settle_inner(laws[now[0]], old_state, c.u, old_state.e[0], old_state.e[1])
+                settle_inner(laws[now[0]], old_state, old_state.e[0], old_state.e[1])
         law, state = laws[now[0]], instances[now[0], now[1]]
         if now[2] == OK:
             now[2] = _refusal(ranges, c.ref, c.y, n_y)
         if now[2] == OK:
             if inner:
-                step_with_inner(law, state, c)
+                step_with_inner(law, state, c.ref, c.y, c.out)
             else:
                 step(law, state, c.ref, c.y, c.u)
                 for j in range(NU):

@@ -32,7 +32,7 @@ VARIABLES = (
 #: numbers among them
 SIZE = sum(size for _, size, _ in VARIABLES)
 #: constants that are the same in all laws, and no members of a law's record in C
-SHARED = ("one", "negligible")
+SHARED = ("one",)
 CONSTANTS = tuple(name for name in INNER_CONSTANTS if name not in SHARED)
 #: templates: a tick, and what settles the stage
 STAGE_PARTS = ("stage.c", "stage_settle.c")
