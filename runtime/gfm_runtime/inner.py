@@ -143,7 +143,7 @@ class Inner:
         """Fill the fields of ``INNER_FIELDS`` in a law's record."""
         turn = omega_b * T_s
         rec["inner"], rec["priority"] = KINDS[self.kind], PRIORITIES[self.priority]
-        rec["freeze"] = self.freeze
+        rec["freeze"] = self.freeze and self.kind != "none"
         rec["I_cos"] = self.I_max * math.cos(math.radians(self.angle))
         rec["I_sin"] = self.I_max * math.sin(math.radians(self.angle))
         for name in _PLAIN:
@@ -229,6 +229,7 @@ def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
     return [
         ("m", f, (9,)),  # measurements of this tick
         ("omega", f),  # omega_u after the power limiter
+        ("drop", f, (2,)),  # voltage over the threshold impedance
         *((name, f, (size,)) if size > 1 else (name, f) for name, size, _ in INNER_STATE),
     ]
 
@@ -248,7 +249,7 @@ def faded(value):
 
 @inlined
 def take_measurements(state, y):
-    """Copy what the stage needs from y (11,), p.u., in the arithmetic of the law."""
+    """What the stage needs from y (11,), p.u."""
     for j in range(3):
         state.m[j] = y[j]
     for j in range(6):
@@ -257,20 +258,19 @@ def take_measurements(state, y):
 
 @inlined
 def measure_frequency(law, state):
-    """One tick of the PLL on v; ``state.omega_pll`` is then the measured omega_g, p.u."""
-    m = state.m
-    c, s = state.pll[0], state.pll[1]
+    """One tick of the PLL on v: omega_pll is then the measured omega_g, p.u."""
+    m, cosine, sine = state.m, state.pll[0], state.pll[1]
     size = math.sqrt(m[V_D] * m[V_D] + m[V_Q] * m[V_Q])
-    error = m[V_Q] * c - m[V_D] * s
+    error = m[V_Q] * cosine - m[V_D] * sine
     if size > law.least_v:  # else there is no voltage to follow
         error = error / size
     state.omega_pll += law.T_k_pll * error
     h = (state.omega_pll + law.k_pll * error - m[OMEGA]) * law.half_turn
     # times (1 + j h) / (1 - j h), whose modulus is 1; the root takes the rounding out
     a, b = law.one - h * h, h + h
-    c_next, s_next = a * c - b * s, a * s + b * c
-    length = math.sqrt(c_next * c_next + s_next * s_next)
-    state.pll[0], state.pll[1] = c_next / length, s_next / length
+    turned_d, turned_q = a * cosine - b * sine, a * sine + b * cosine
+    length = math.sqrt(turned_d * turned_d + turned_q * turned_q)
+    state.pll[0], state.pll[1] = turned_d / length, turned_q / length
 
 
 @inlined
@@ -332,15 +332,16 @@ def _stator(law, state, E_d, E_q):
 
 @inlined
 def _drop(law, state):
-    """The voltage over the threshold impedance, 0 below the threshold."""
-    if law.k_thr == 0:
-        return law.one - law.one, law.one - law.one
-    d, q = state.i_f[0], state.i_f[1]
-    beyond = math.sqrt(d * d + q * q) - law.I_thr
-    beyond = max(beyond, law.one - law.one)
-    R = law.k_thr * beyond
-    X = R * state.omega * law.sigma
-    return R * d - X * q, R * q + X * d
+    """The voltage k_thr (|i_f| - I_thr) (1 + j omega sigma) i_f over the threshold impedance; 0
+    below the threshold."""
+    state.drop[0] = state.drop[1] = 0
+    if law.k_thr > 0:
+        d, q = state.i_f[0], state.i_f[1]
+        beyond = math.sqrt(d * d + q * q) - law.I_thr
+        if beyond > 0:
+            R = law.k_thr * beyond
+            X = R * state.omega * law.sigma
+            state.drop[0], state.drop[1] = R * d - X * q, R * q + X * d
 
 
 @inlined
@@ -348,8 +349,9 @@ def _voltage_loop(law, state, E_d, E_q):
     """One tick of the cascaded voltage loop: i* from v* - v; it integrates only within the
     limit."""
     m, X = state.m, state.omega * law.X_v
-    drop_d, drop_q = _drop(law, state)
-    E_d, E_q = E_d - drop_d, E_q - drop_q
+    _drop(law, state)
+    E_d -= state.drop[0]
+    E_q -= state.drop[1]
     error_d = E_d - law.R_v * m[I_OD] + X * m[I_OQ] - m[V_D]
     error_q = E_q - law.R_v * m[I_OQ] - X * m[I_OD] - m[V_Q]
     B = state.omega * law.C_f
@@ -359,7 +361,7 @@ def _voltage_loop(law, state, E_d, E_q):
     if not state.limited:
         state.x_v[0] += law.T_k_vi * error_d
         state.x_v[1] += law.T_k_vi * error_q
-    state.limited = state.limited != 0 or drop_d != 0 or drop_q != 0
+    state.limited = state.limited != 0 or state.drop[0] != 0 or state.drop[1] != 0
 
 
 @inlined
@@ -417,8 +419,8 @@ def shape(law, state):
 
 @inlined
 def settle_inner(law, state, e_d, e_q):
-    """Set the stage so that it goes on with the bridge voltage e: at the start, and when another
-    law takes over. What its structure cannot absorb goes into ``state.away``.
+    """The state of the stage with which the bridge's voltage goes on at e: at the start, and when
+    another law takes over. What the structure cannot absorb goes into away.
 
     Args:
         law, state: as for ``shape``; ``state.now`` is the law's output.
@@ -446,16 +448,16 @@ def settle_inner(law, state, e_d, e_q):
             state.i_ref[1] += lack_q / law.k_c
         through_d, through_q = state.i_ref[0], state.i_ref[1]
         state.x_v[0], state.x_v[1] = through_d, through_q
-        drop_d, drop_q = law.one - law.one, law.one - law.one
+        state.drop[0] = state.drop[1] = 0
         if law.inner != STATOR:
-            drop_d, drop_q = _drop(law, state)
+            _drop(law, state)
             B = state.omega * law.C_f
             state.x_v[0] = through_d - law.k_ff * m[I_OD] + B * m[V_Q]
             state.x_v[1] = through_q - law.k_ff * m[I_OQ] - B * m[V_D]
             through_d, through_q = m[I_OD], m[I_OQ]
         X = state.omega * law.X_v
-        need_d = m[V_D] + law.R_v * through_d - X * through_q + drop_d
-        need_q = m[V_Q] + law.R_v * through_q + X * through_d + drop_q
+        need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]
+        need_q = m[V_Q] + law.R_v * through_q + X * through_d + state.drop[1]
     state.away[0], state.away[1] = need_d - state.now[2], need_q
 
 

@@ -132,7 +132,7 @@ def pack_law(
 
 @inlined
 def set_inputs(law, state, ref, y):
-    """Map this tick's references and measurements (shape (5,), p.u.) into the state record."""
+    """The references and measurements of this tick, p.u., and what the error map makes of them."""
     for j in range(NY):
         state.ref[j] = state.r[j] = ref[j]
         state.y[j] = y[j]
@@ -162,6 +162,15 @@ def output(law, state):
     for i in (0, 2):
         state.raw[i] = _row(law, state, i) + law.D_y[i, 2] * state.y[2]
         state.now[i] = limited(state.raw[i], law.low[i], law.high[i])
+
+
+@inlined
+def look(law, state, ref, y, u):
+    """u[k] without a step."""
+    set_inputs(law, state, ref, y)
+    output(law, state)
+    for i in range(NU):
+        u[i] = state.now[i]
 
 
 @inlined
@@ -209,7 +218,7 @@ def advance(law, state):
 
 @inlined
 def step(law, state, ref, y, u):
-    """One tick: u[k] into ``u`` and the state to k+1.
+    """One tick: u[k] into u, and the state to k+1.
 
     Args:
         law, state: records of ``law_dtype`` and ``state_dtype``.
@@ -219,16 +228,19 @@ def step(law, state, ref, y, u):
     Fields of a record are the fastest for ref, y and u: numba counts references to an array
     atomically whenever it passes one on, but not to a part of a record.
     """
-    set_inputs(law, state, ref, y)
-    output(law, state)
+    look(law, state, ref, y, u)
     advance(law, state)
-    for i in range(NU):
-        u[i] = state.now[i]
 
 
 @inlined
 def step_with_inner(law, state, ref, y, out):
-    """As ``step``, with the inner stage: ``out`` (4,) from ``ref`` (5,) and ``y`` (11,)."""
+    """One tick with the inner stage: (i_u, omega_u, e_d, e_q) into out, and the state to k+1.
+
+    Args:
+        law, state, ref: as for ``step``.
+        y: shape (11,), p.u.
+        out: output, shape (4,), p.u.
+    """
     take_measurements(state, y)
     set_inputs(law, state, ref, y)
     if law.k_pll > 0:  # omega_g is measured

@@ -9,20 +9,27 @@ there it goes into ``state.offset``, which decays with the law's T_off.
 from __future__ import annotations
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.kernel import output, set_inputs
+from gfm_runtime.inner import settle_inner, take_measurements
+from gfm_runtime.kernel import look, output, set_inputs
 from gfm_runtime.signals import NU, NY
 
 
 @compiled
 def settle_into(law, state, ref, y, u, trend):
-    """Set a law's state so that its output at the references ``ref`` (5,) and measurements y (5,),
-    p.u., is u (3,), p.u., and continues with the slope ``trend`` (3,), p.u. per tick.
+    """The state with which the output at ref and y is u, p.u., and goes on with the slope trend,
+    p.u. per tick.
 
     If u lies outside the law's limits the output is the limit, and the difference is a bump.
+
+    Args:
+        law, state: records of ``law_dtype`` and ``state_dtype``.
+        ref, y: shape (5,), p.u.
+        u: shape (3,), p.u.; on return what comes out of the law.
+        trend: shape (3,), p.u. per tick.
     """
     set_inputs(law, state, ref, y)
     for i in range(NU):
-        state.raw[i] = u[i]  # in the law's own precision; output writes raw anew below
+        state.raw[i] = u[i]  # output writes raw anew below
         state.offset[i] = 0
         state.trend[i] = trend[i]
         state.u[i] = state.raw[i] - state.trend[i]
@@ -53,6 +60,14 @@ def settle_into(law, state, ref, y, u, trend):
 
 
 @compiled
+def settle_with_inner(law, state, ref, y, u, trend, e_d, e_q):
+    """As settle_into; and the inner stage goes on with the bridge's voltage e, p.u."""
+    settle_into(law, state, ref, y, u, trend)
+    take_measurements(state, y)
+    settle_inner(law, state, e_d, e_q)
+
+
+@compiled
 def change_law(old, old_state, new, new_state, ref, y, u):
     """u[k] under the new law, prepared so that it equals the old law's u[k]; returns the bump.
 
@@ -64,10 +79,7 @@ def change_law(old, old_state, new, new_state, ref, y, u):
     Returns:
         max |u_new - u_old| in p.u.: rounding, unless the new law's limits are tighter.
     """
-    set_inputs(old, old_state, ref, y)
-    output(old, old_state)
-    for i in range(NU):
-        u[i] = old_state.now[i]
+    look(old, old_state, ref, y, u)
     i_u, omega_u, E_u = u[0], u[1], u[2]
     settle_into(new, new_state, ref, y, u, old_state.trend)
     return max(abs(u[0] - i_u), abs(u[1] - omega_u), abs(u[2] - E_u))

@@ -23,8 +23,7 @@ from gfm_runtime.firmware.c_text import chosen, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields
 from gfm_runtime.firmware.report import read_report
-from gfm_runtime.firmware.stage import VARIABLES
-from gfm_runtime.inner import Inner, settle
+from gfm_runtime.inner import INNER_STATE, Inner, settle
 from gfm_runtime.signals import NU, NY, carried, group
 from gfm_runtime.states import OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
@@ -77,7 +76,7 @@ def test_golden_rows_are_what_the_controller_does(name: str, real: str) -> None:
     u, own = np.zeros(us.shape[1]), np.zeros(NU)
     bench.states["pll"], bench.states["omega_pll"] = (1.0, 0.0), 1.0  # as init leaves them
     bench.states["e"] = (start[2], 0.0)
-    variables = [(v, columns(rows, real, v)[0]) for v, size, _ in VARIABLES if size > 1]
+    variables = [(v, columns(rows, real, v)[0]) for v, size, _ in INNER_STATE if size > 1]
     for k, (op, _, result) in enumerate(rows.words[:, :3]):
         assert (k == 0) == (op == INIT)
         if result == BAD_REF and bench.ctl["state"][0] == RUNNING:
@@ -235,7 +234,7 @@ def test_a_set_point_of_minus_zero_keeps_its_zeros() -> None:
     law = replace(LAWS["droop-1"], u_0=(-0.0, 1.0, 1.0))
     text = export({"x": law}, T_S, "float64", "unrolled")["gfm_x.c"]
     row = re.search(r"t->raw\[0\] = ([^;]*);", text)
-    assert row is not None and row[1].count("->") == 1 + 1 + 2 * NY + NY - 1
+    assert row is not None and row[1].count("->") == 1 + 1 + 2 * NY + NY
 
 
 def test_a_remark_cannot_end_its_comment() -> None:

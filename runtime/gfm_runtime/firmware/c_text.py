@@ -50,6 +50,25 @@ def plain(text: str) -> str:
     return one_line.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").rstrip("\\")
 
 
+def wrapped(line: str, width: int = 100) -> list[str]:
+    """A line of C; a long one goes on, indented, after an operator or a comma."""
+    out, indent = [], line[: len(line) - len(line.lstrip())]
+    while len(line) > width:
+        signs = (" + ", " - ", " && ", " || ", " ? ", " : ", ", ")
+        at = max(line.rfind(sign, len(indent) + 16, width - 2) for sign in signs)
+        if at < 0:
+            break
+        at += line.startswith(", ", at)
+        out.append(line[:at])
+        line = f"{indent}    {line[at:].lstrip()}"
+    return [*out, line]
+
+
+def body(lines: Iterable[str]) -> list[str]:
+    """A function's body."""
+    return ["{", *(part for line in lines for part in wrapped(f"    {line}")), "}", ""]
+
+
 @cache
 def template(name: str) -> str:
     """A file of the folder ``templates``."""

@@ -17,8 +17,8 @@ from typing import Any
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.a2l import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.module import RESULTS
-from gfm_runtime.firmware.stage import SHARED, VARIABLES
-from gfm_runtime.inner import INNER_CONSTANTS
+from gfm_runtime.firmware.tick import SHARED
+from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE
 from gfm_runtime.signals import Signal, carried_rows, group
 
 _INSTANCE = re.compile(r"gfm(_\w+)?_t")
@@ -48,7 +48,7 @@ _PLAIN = {
     "limited": "whether the inner stage limits the current",
     "X": "estimated reactance of the grid",
     "active": "stage of the schedule that is in force",
-    **{name: remark for name, _, remark in VARIABLES if remark},
+    **{name: remark for name, _, remark in INNER_STATE if remark},
 }
 #: members of a law's record
 _OF_RECORD = {

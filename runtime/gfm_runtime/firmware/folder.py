@@ -17,7 +17,7 @@ from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modul
 from gfm_runtime.firmware.proof import script
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
-from gfm_runtime.firmware.stage import SIZE
+from gfm_runtime.firmware.tick import SIZE
 from gfm_runtime.law import Law
 from gfm_runtime.signals import NU, carried
 

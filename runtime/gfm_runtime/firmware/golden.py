@@ -31,12 +31,11 @@ from gfm_runtime.firmware.fixed import (
     to_integers,
 )
 from gfm_runtime.firmware.module import BAD_REF, Module
-from gfm_runtime.firmware.stage import VARIABLES
-from gfm_runtime.inner import settle_inner, take_measurements
+from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
 from gfm_runtime.kernel import state_dtype, step, step_with_inner
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, carried, carried_rows, group, names
 from gfm_runtime.states import BAD_U, BAD_Y, OK
-from gfm_runtime.switchover import change_law, settle_into
+from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
 #: what a row does before its step: nothing, init, a bumpless change to the row's law, or reset and
 #: settle at the last u
@@ -78,7 +77,7 @@ def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
     own = names("u")
     variables = [
         f"{name}{end}"
-        for name, size, _ in VARIABLES
+        for name, size, _ in INNER_STATE
         for end in (("_d", "_q") if size > 1 else ("",))
     ]
     return (
@@ -122,7 +121,7 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         numbers = [refs, ys, u, bump, after["x"][:, :states]]
         numbers += [after[name] for name in ("offset", "u", "trend")]
         if stages:
-            numbers += [after[name] for name, *_ in VARIABLES]
+            numbers += [after[name] for name, *_ in INNER_STATE]
         columns_of = [np.column_stack(integers).astype(word), np.column_stack(numbers).view(word)]
         if stages:
             columns_of.append(after["limited"][:, None].astype(word))
@@ -222,10 +221,11 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             old_state = instances[now[0], now[1]]
             for j in range(NU):
                 c.u[j] = old_state.u[j]
-            settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
             if inner:
-                take_measurements(old_state, c.y)
-                settle_inner(laws[now[0]], old_state, old_state.e[0], old_state.e[1])
+                e_d, e_q = old_state.e[0], old_state.e[1]
+                settle_with_inner(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
+            else:
+                settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
         law, state = laws[now[0]], instances[now[0], now[1]]
         if now[2] == OK:
             now[2] = _refusal(ranges, c.ref, c.y, n_y)

@@ -16,7 +16,8 @@ import numpy as np
 from gfm_runtime.firmware.check import HARNESS, Target, build, need_tools
 from gfm_runtime.firmware.folder import selftest
 from gfm_runtime.firmware.module import Module, check_modules, sources
-from gfm_runtime.firmware.stage import SIZE, VARIABLES
+from gfm_runtime.firmware.tick import SIZE
+from gfm_runtime.inner import INNER_STATE
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.signals import NU, NY, carried
 
@@ -73,7 +74,7 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         where,
         folder,
         np.dtype([*request, ("y", real, (y,))]),
-        np.dtype([*state, *((name, real, (size,)) for name, size, _ in VARIABLES if stages)]),
+        np.dtype([*state, *((name, real, (size,)) for name, size, _ in INNER_STATE if stages)]),
         np.dtype(
             [
                 *answer,

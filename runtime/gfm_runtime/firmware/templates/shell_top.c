@@ -22,24 +22,5 @@ typedef char @P@_real_has_@BITS@_bits[sizeof(@P@_real) * CHAR_BIT == @BITS@ ? 1 
 typedef @P@_real real;
 
 /* What a tick works on beside the state. */
-typedef struct {
-@TICK@    real raw[@N_ROWS@]; /* u before the limits */
-    real u[@N_ROWS@];
-/* @if stages@ */
-    real omega; /* omega_u after the power limiter */
-/* @end@ */
-} tick_t;
-
-/* A NaN passes, as it does in the bench: step finds it. */
-static real limited(real value, real low, real high)
-{
-    value = low > value ? low : value;
-    return high < value ? high : value;
-}
-
-/* 0 for what has decayed: subnormal numbers would take long on many processors. */
-static real faded(real value)
-{
-    return @fabs@(value) < @NEGLIGIBLE@ ? @0@ : value;
-}
-
+@TICK@
+@FUNCTIONS@
