@@ -59,10 +59,10 @@ controller_dtype = np.dtype(
         # gain scheduling: stages first..first+count-1 of the laws share one schedule
         ("stages", "i8"),
         ("stage_law", "i8", (MAX_STAGES,)),
-        ("stage_X", "f8", (MAX_STAGES,)),  # upper end of each stage, p.u.
-        ("hysteresis", "f8"),
-        ("dwell", "i8"),
-        ("since", "i8"),
+        ("above", "f8", (MAX_STAGES,)),  # reactance beyond which the next stage takes over, p.u.
+        ("below", "f8", (MAX_STAGES,)),  # and from which that one gives back, p.u.
+        ("dwell", "i8"),  # least ticks between two changes
+        ("since", "i8"),  # ticks since the last change, until the next one is allowed
     ],
     align=True,
 )
@@ -120,24 +120,31 @@ def follow_plant(ctl, tripped):
         c.state = RUNNING
 
 
+@inlined
+def choose(c, now, X, above, below):
+    """The stage for the reactance X, p.u., with hysteresis and a least time between changes."""
+    stage = now
+    if c.since <= c.dwell:
+        c.since += 1
+    if c.since > c.dwell:
+        while stage + 1 < c.stages and above[stage] < X:
+            stage += 1
+        while stage > 0 and below[stage - 1] > X:
+            stage -= 1
+    return stage
+
+
 @compiled
-def _schedule(ctl, est, y):
-    """Select the stage for the estimated reactance, with hysteresis and a minimum dwell time."""
+def _schedule(c, est, y):
+    """Request the stage for the estimated reactance."""
     X = estimate(est, y[1], y[2], y[4])
-    ctl.since += 1
-    if ctl.since <= ctl.dwell:
-        return
     now = 0
-    for k in range(ctl.stages):
-        if ctl.stage_law[k] == ctl.active:
+    for k in range(c.stages):
+        if c.stage_law[k] == c.active:
             now = k
-    wanted = now
-    while wanted + 1 < ctl.stages and ctl.stage_X[wanted] * (1 + ctl.hysteresis) < X:
-        wanted += 1
-    while wanted > 0 and ctl.stage_X[wanted - 1] * (1 - ctl.hysteresis) > X:
-        wanted -= 1
-    if wanted != now:
-        ctl.request, ctl.since = ctl.stage_law[wanted], 0
+    stage = choose(c, now, X, c.above, c.below)
+    if stage != now:
+        c.request, c.since = c.stage_law[stage], 0
 
 
 @inlined

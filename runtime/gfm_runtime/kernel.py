@@ -174,13 +174,13 @@ def look(law, state, ref, y, u):
 
 
 @inlined
-def _move(law, state):
-    """By how much the states that are next move E_u, p.u."""
-    a = law.one - law.one
+def _leads_away(law, state):
+    """Whether E_u moves away from v: a move towards v lets the current leave its limit."""
+    move = law.one - law.one
     for i in range(law.n):
         if law.row[i] == 2:
-            a += law.C[2, i] * (state.x_next[i] - state.x[i])
-    return a
+            move += law.C[2, i] * (state.x_next[i] - state.x[i])
+    return move * (state.u[2] - state.v_f[0]) > 0
 
 
 @inlined
@@ -208,12 +208,12 @@ def advance(law, state):
         for j in range(n):
             a += law.A[i, j] * state.x[j]
         state.x_next[i] = a
-    # a move of E_u towards v lets the current leave its limit
-    away = state.u[2] - state.v_f[0]
-    held = law.freeze != 0 and state.limited != 0 and _move(law, state) * away > 0
+    if law.freeze != 0 and state.limited != 0 and _leads_away(law, state):
+        for i in range(n):  # the states of E_u stay
+            if law.row[i] == 2:
+                state.x_next[i] = state.x[i]
     for i in range(n):
-        if not (law.row[i] == 2 and held):
-            state.x[i] = faded(state.x_next[i])
+        state.x[i] = faded(state.x_next[i])
 
 
 @inlined

@@ -56,6 +56,7 @@ def wrapped(line: str, width: int = 100) -> list[str]:
     while len(line) > width:
         signs = (" + ", " - ", " && ", " || ", " ? ", " : ", ", ")
         at = max(line.rfind(sign, len(indent) + 16, width - 2) for sign in signs)
+        at = at if at > 0 else line.rfind(" * ", len(indent) + 16, width - 2)
         if at < 0:
             break
         at += line.startswith(", ", at)

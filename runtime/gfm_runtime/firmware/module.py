@@ -251,7 +251,7 @@ def _unrolled(m: Module) -> str:
 def _source(tick: Tick, choices: Choices, keys: Mapping[str, str]) -> str:
     """The source of a law, or of the generic step."""
     text = chosen(template("shell_top.c"), choices) + chosen(template("shell_end.c"), choices)
-    return filled(text, {**keys, **{k: filled(v, keys) for k, v in tick.keys().items()}})
+    return filled(text, {**keys, **tick.keys(keys["P"])})
 
 
 def about(m: Module, T_s: float) -> str:

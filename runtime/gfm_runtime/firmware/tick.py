@@ -36,7 +36,15 @@ from gfm_runtime.switchover import settle_into, settle_with_inner
 SIZE = sum(size for _, size, _ in INNER_STATE)
 #: constants that are the same in all laws, and no members of a law's record in C
 SHARED = ("one",)
-INTEGERS = ("n", "error_map", "row", "limited", *(name for name, _ in INNER_NUMBERS))
+INTEGERS = (
+    "n",
+    "error_map",
+    "row",
+    "limited",
+    "age",
+    "since",
+    *(name for name, _ in INNER_NUMBERS),
+)
 #: variables of one tick only: by the name in ``state_dtype``, the name in C and what it is
 _OF_A_TICK = {
     "ref": ("ref", "references as given"),
@@ -127,12 +135,10 @@ class Tick:
         )
         self._functions = reached([self.step, self.look, self.settle])
         without_unread(self._functions, "t->")
-        roots = {"s": "@P@_t", "t": "tick_t"}
-        roots = roots if own else {"law": "gfm_law_t", **roots}
-        self._text = Text(real, roots, {"t->m": _PLACES}, [self.step] * own)
+        self._real, self._own = real, own
 
     @cached_property
-    def members(self) -> dict[str, Array | Expr]:
+    def members(self) -> dict[str, tuple[str, str]]:
         """The variables of a tick that the functions use, by their names."""
         named = {f"t->{name}": (key, text) for key, (name, text) in _OF_A_TICK.items()}
         used = {
@@ -140,8 +146,16 @@ class Tick:
         }
         return {at: named[at] for at in named if at in used}
 
-    def keys(self) -> Mapping[str, str]:
+    def keys(self, prefix: str) -> Mapping[str, str]:
         """What the templates ask for: the variables of a tick, the functions, and their calls."""
+        roots = {} if self._own else {"law": "gfm_law_t"}
+        roots |= {"s": f"{prefix}_t", "t": "tick_t"}
+        printer = Text(self._real, roots, {"t->m": _PLACES}, [self.step] * self._own)
+
+        def call(one: Function, **at: str) -> str:
+            names = [p.place if isinstance(p, Array) else p.name for p in one.parameters]
+            return printer.call(one, [at.get(name, name) for name in names], {"t": "&t"})
+
         sizes = {"raw": NU, "now": NU, "m": len(_PLACES), "drop": 2, "x_next": self._n}
         lines = ["typedef struct {"]
         for at, (key, text) in self.members.items():
@@ -150,20 +164,15 @@ class Tick:
         lines += ["} tick_t;", ""]
         if any(at == "t->m" for at in self.members):
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
-        if self._text.in_place:
+        if self._own:
             lines += [_IN_PLACE]
-        functions = "\n".join(map(self._text.function, self._functions))
         return {
             "TICK": "\n".join(lines),
-            "FUNCTIONS": functions,
-            "STEP": self._call(self.step, u="out"),
-            "LOOK": self._call(self.look),
-            "SETTLE": self._call(self.settle, e_d="e[0]", e_q="e[1]"),
+            "FUNCTIONS": "\n".join(map(printer.function, self._functions)),
+            "STEP": call(self.step, u="out"),
+            "LOOK": call(self.look),
+            "SETTLE": call(self.settle, e_d="e[0]", e_q="e[1]"),
         }
-
-    def _call(self, one: Function, **at: str) -> str:
-        names = [p.place if isinstance(p, Array) else p.name for p in one.parameters]
-        return self._text.call(one, [at.get(name, name) for name in names], {"t": "&t"})
 
     def operations(self) -> Mapping[str, int]:
         """Operations of a step by their signs, see ``translate.operations``."""

@@ -685,22 +685,11 @@ def _pruned(body: list[Any], uses: Counter[Let], unread: Sequence[Expr]) -> bool
         if idle:
             if isinstance(last, Note):
                 kept.pop()
-        elif isinstance(s, Block) and _same_branch(last, s):
-            last.body += s.body
-            last.other += s.other
         else:
             kept.append(s)
     changed = len(kept) < len(body)
     body[:] = kept
     return changed
-
-
-def _same_branch(a: Any, b: Block) -> bool:
-    fixed = all(not e.args[0].stays for e in _parts(b.value) if e.op == "local")
-    places = any(e.op in ("var", "call") for e in _parts(b.value))
-    return isinstance(a, Block) and a.word == b.word == "if" and a.value == b.value and (
-        fixed and not places
-    )  # fmt: skip
 
 
 def _summed(body: list[Any], uses: Counter[Let]) -> None:
@@ -851,6 +840,7 @@ class Text:
         roots: by the name of a pointer that functions get, in order, the type.
         indices: by place, names of its indices.
         in_place: functions with which all that they call is compiled in one.
+        real_type: what a real number is called.
     """
 
     def __init__(
@@ -859,8 +849,10 @@ class Text:
         roots: Mapping[str, str],
         indices: Mapping[str, Sequence[str]] | None = None,
         in_place: Sequence[Function] = (),
+        real_type: str = "real",
     ) -> None:
         self.real, self.roots, self.in_place = real, roots, in_place
+        self._types = {"real": real_type, "int": "int", "bool": "bool", "void": "void"}
         self.indices = indices or {}
         self.end = "f" if real == np.float32 else ""
 
@@ -876,14 +868,14 @@ class Text:
         for p in one.parameters:
             if isinstance(p, Array):
                 constant = "" if p.place in writes else "const "
-                given.append(f"{constant}{p.kind} {p.place}[]")
+                given.append(f"{constant}{self._types[p.kind]} {p.place}[]")
             else:
-                given.append(f"{p.value.kind} {p.name}")
+                given.append(f"{self._types[p.value.kind]} {p.name}")
         own = "IN_PLACE" if one in self.in_place else "static"
         names = {p.place if isinstance(p, Array) else p.name for p in one.parameters}
         lines = [f"/* {one.about} */"] if one.about else []
         lines = ["\n * ".join(textwrap.wrap(line, 97)) for line in lines]
-        lines += wrapped(f"{own} {one.kind} {one.name}({', '.join(given) or 'void'})")
+        lines += wrapped(f"{own} {self._types[one.kind]} {one.name}({', '.join(given) or 'void'})")
         used = uses | {e.args[0].name for e in one.expressions() if e.op == "local"}
         idle = [f"    (void){name};" for name in sorted(names - used)]
         return "\n".join([*lines, "{", *idle, *self._block(one.body, names, "    "), "}", ""])
@@ -899,7 +891,7 @@ class Text:
                         lines += wrapped(indent + self._put(name, _local(s), value))
                     else:
                         once = self._often[name] == 1 and not s.stays
-                        what = f"{'const ' * once}{value.kind} {name}"
+                        what = f"{'const ' * once}{self._types[value.kind]} {name}"
                         lines += wrapped(f"{indent}{what} = {self.expression(value)};")
                         names.add(name)
                 case Put(to, value):
