@@ -211,7 +211,7 @@ INNER_STATE = (
     ("x_c", 2, "integral of the current loop"),
     ("x_v", 2, "integral of the voltage loop, or current of the virtual stator"),
     ("away", 2, "voltage that a change of law left; decays"),
-    ("e", 2, "the bridge's voltage"),
+    ("e", 2, "the bridge's voltage of the last tick"),
     ("pll", 2, "unit phasor that follows v"),
     ("omega_pll", 1, "frequency of the PLL"),
     ("x_high", 1, "integrals of the power limiter"),
@@ -230,6 +230,7 @@ def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
         ("m", f, (9,)),  # measurements of this tick
         ("omega", f),  # omega_u after the power limiter
         ("drop", f, (2,)),  # voltage over the threshold impedance
+        ("e_now", f, (2,)),  # the bridge's voltage of this tick
         *((name, f, (size,)) if size > 1 else (name, f) for name, size, _ in INNER_STATE),
     ]
 
@@ -369,8 +370,8 @@ def _current_loop(law, state):
     """One tick of the current loop: e from i* - i, before the limit of modulation."""
     m, X = state.m, state.omega * law.L_f
     error_d, error_q = state.i_ref[0] - m[I_D], state.i_ref[1] - m[I_Q]
-    state.e[0] = state.v_f[0] + law.k_c * error_d + state.x_c[0] - X * m[I_Q]
-    state.e[1] = state.v_f[1] + law.k_c * error_q + state.x_c[1] + X * m[I_D]
+    state.e_now[0] = state.v_f[0] + law.k_c * error_d + state.x_c[0] - X * m[I_Q]
+    state.e_now[1] = state.v_f[1] + law.k_c * error_q + state.x_c[1] + X * m[I_D]
     state.x_c[0] += law.T_k_ci * error_d
     state.x_c[1] += law.T_k_ci * error_q
 
@@ -397,7 +398,7 @@ def shape(law, state):
     state.omega = state.now[1]
     if law.inner == NONE:
         state.limited = 0
-        state.e[0], state.e[1] = E_d, E_q
+        state.e_now[0], state.e_now[1] = E_d, E_q
     else:
         if law.P_max < P_HIGH or law.P_min > P_LOW:
             _limit_power(law, state)
@@ -408,11 +409,11 @@ def shape(law, state):
             _voltage_loop(law, state, E_d, E_q)
         _current_loop(law, state)
         most = law.m * state.m[V_DC]
-        size = state.e[0] * state.e[0] + state.e[1] * state.e[1]
+        size = state.e_now[0] * state.e_now[0] + state.e_now[1] * state.e_now[1]
         if size > most * most:  # the limit of the modulation
             scale = most / math.sqrt(size)
-            state.e[0] *= scale
-            state.e[1] *= scale
+            state.e_now[0] *= scale
+            state.e_now[1] *= scale
     for k in range(2):
         state.away[k] = faded(state.away[k] * law.decay)
 

@@ -233,8 +233,8 @@ def step(law, state, ref, y, u):
 
 
 @inlined
-def step_with_inner(law, state, ref, y, out):
-    """One tick with the inner stage: (i_u, omega_u, e_d, e_q) into out, and the state to k+1.
+def look_with_inner(law, state, ref, y, out):
+    """The output of a tick with the inner stage: (i_u, omega_u, e_d, e_q) into out.
 
     Args:
         law, state, ref: as for ``step``.
@@ -248,5 +248,19 @@ def step_with_inner(law, state, ref, y, out):
         state.ref[2] = state.r[2] = state.omega_pll
     output(law, state)
     shape(law, state)
+    out[0], out[1], out[2], out[3] = state.now[0], state.omega, state.e_now[0], state.e_now[1]
+
+
+@inlined
+def advance_with_inner(law, state):
+    """The state of law and stage to k+1."""
     advance(law, state)
-    out[0], out[1], out[2], out[3] = state.now[0], state.omega, state.e[0], state.e[1]
+    for k in range(2):
+        state.e[k] = state.e_now[k]
+
+
+@inlined
+def step_with_inner(law, state, ref, y, out):
+    """One tick with the inner stage: the output into out, and the state to k+1."""
+    look_with_inner(law, state, ref, y, out)
+    advance_with_inner(law, state)

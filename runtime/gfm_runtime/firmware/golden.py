@@ -5,8 +5,9 @@ returns and leaves. All are the bits of numbers of the law's precision, or small
 of its size. The inputs are 30 ticks each of: noise about the operating point; ramps of the
 references; the whole ranges of the signal table at random; the same extreme for long, so that u is
 limited; powers that are subnormal or zeros of both signs; measurements that are not finite or out
-of range, the safe state and its end; changes of law. They come from integers of PCG64, so they are
-the same on every machine. With an inner stage the filter's currents and voltages go with them.
+of range, then a state that is NaN, with the safe state and its end after each; changes of law. They
+come from integers of PCG64, so they are the same on every machine. With an inner stage the filter's
+currents and voltages go with them.
 """
 
 from __future__ import annotations
@@ -32,14 +33,20 @@ from gfm_runtime.firmware.fixed import (
 )
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
-from gfm_runtime.kernel import state_dtype, step, step_with_inner
+from gfm_runtime.kernel import (
+    advance,
+    advance_with_inner,
+    look,
+    look_with_inner,
+    state_dtype,
+)
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, carried, carried_rows, group, names
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
-#: what a row does before its step: nothing, init, a bumpless change to the row's law, or reset and
-#: settle at the last u
-STEP, INIT, SWITCH, RESET = range(4)
+#: what a row does before its step: nothing, init, a bumpless change to the row's law, reset and
+#: settle at the last u, or an error of memory: no number in the law's state, or in its stage's
+STEP, INIT, SWITCH, RESET, SPOIL, SPOIL_STAGE = range(6)
 SEGMENT = 30  # ticks of one kind
 KINDS = 7
 INSIDE = 1e-3  # of a range; stays off its ends, which differ in float32
@@ -227,19 +234,27 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             else:
                 settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
         law, state = laws[now[0]], instances[now[0], now[1]]
+        if op[i] == SPOIL:
+            state.offset[1] = math.nan
+        elif op[i] == SPOIL_STAGE:
+            state.away[0] = math.nan
         if now[2] == OK:
             now[2] = _refusal(ranges, c.ref, c.y, n_y)
         if now[2] == OK:
             if inner:
-                step_with_inner(law, state, c.ref, c.y, c.out)
+                look_with_inner(law, state, c.ref, c.y, c.out)
             else:
-                step(law, state, c.ref, c.y, c.u)
+                look(law, state, c.ref, c.y, c.u)
                 for j in range(NU):
                     c.out[j] = c.u[j]
             for j in range(n_u):
                 if not math.isfinite(c.out[j]):
                     now[2] = BAD_U
         if now[2] == OK:
+            if inner:
+                advance_with_inner(law, state)
+            else:
+                advance(law, state)
             for j in range(n_u):
                 c.held[j] = c.out[j]
         result[i], bump[i] = now[2], c.bump
@@ -303,7 +318,10 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any], stages: bool = False) -> 
             ys[start + 5, where] = wrong[bad]
             if bad == 5:
                 ys[start + 5], refs[start + 5, where] = rest, ref_high[where] + 1
-            op[start + 10] = RESET
+            op[start + 10] = op[start + 20] = RESET
+            op[start + 15] = SPOIL
+            if stages:
+                op[start + 22], op[start + 26] = SPOIL_STAGE, RESET
         elif kind == 6:
             op[start : at.stop : 10] = SWITCH
     if stages:

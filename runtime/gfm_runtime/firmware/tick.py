@@ -28,7 +28,14 @@ from gfm_runtime.firmware.translate import (
     without_unread,
 )
 from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE
-from gfm_runtime.kernel import law_dtype, look, state_dtype, step, step_with_inner
+from gfm_runtime.kernel import (
+    advance,
+    advance_with_inner,
+    law_dtype,
+    look,
+    look_with_inner,
+    state_dtype,
+)
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
 from gfm_runtime.switchover import settle_into, settle_with_inner
 
@@ -56,17 +63,20 @@ _OF_A_TICK = {
     "m": ("m", "measurements that the inner stage uses"),
     "omega": ("omega", "omega_u after the power limiter"),
     "drop": ("drop", "voltage over the threshold impedance"),
+    "e_now": ("e", "the bridge's voltage"),
 }
 _PLACES = ("V_DC", "P", "OMEGA", "I_D", "I_Q", "V_D", "V_Q", "I_OD", "I_OQ")
 assert [getattr(inner, name) for name in _PLACES] == list(range(len(_PLACES)))
 
 
 _IN_PLACE = """\
-/* A tick is compiled in one: calls and the way through memory cost more than the sums. */
+/* A step is compiled in one: calls and the way through memory cost more than the sums. */
 #ifdef __GNUC__
-#define IN_PLACE static __attribute__((flatten))
+#define IN_PLACE __attribute__((flatten))
+#define APART __attribute__((noinline))
 #else
-#define IN_PLACE static
+#define IN_PLACE
+#define APART
 #endif
 """
 
@@ -128,12 +138,15 @@ class Tick:
         u, trend = Array("u", (NU,)), Array("trend", (NU,))
         out = Array("out", (NU_INNER if stages else NU,))
         e = [Expr("var", (f"e[{k}]",)) for k in range(2)] if stages else []
-        self.step = translate.function(step_with_inner if stages else step, [*records, ref, y, out])
         self.look = translate.function(look, [*records, ref, y, u])
+        self.output, self.advance = self.look, translate.function(advance, records)
+        if stages:
+            self.output = translate.function(look_with_inner, [*records, ref, y, out])
+            self.advance = translate.function(advance_with_inner, records)
         self.settle = translate.function(
             settle_with_inner if stages else settle_into, [*records, ref, y, u, trend, *e]
         )
-        self._functions = reached([self.step, self.look, self.settle])
+        self._functions = reached([self.output, self.advance, self.look, self.settle])
         without_unread(self._functions, "t->")
         self._real, self._own = real, own
 
@@ -150,13 +163,13 @@ class Tick:
         """What the templates ask for: the variables of a tick, the functions, and their calls."""
         roots = {} if self._own else {"law": "gfm_law_t"}
         roots |= {"s": f"{prefix}_t", "t": "tick_t"}
-        printer = Text(self._real, roots, {"t->m": _PLACES}, [self.step] * self._own)
+        printer = Text(self._real, roots, {"t->m": _PLACES})
 
         def call(one: Function, **at: str) -> str:
             names = [p.place if isinstance(p, Array) else p.name for p in one.parameters]
             return printer.call(one, [at.get(name, name) for name in names], {"t": "&t"})
 
-        sizes = {"raw": NU, "now": NU, "m": len(_PLACES), "drop": 2, "x_next": self._n}
+        sizes = {"raw": NU, "now": NU, "m": len(_PLACES), "drop": 2, "e_now": 2, "x_next": self._n}
         lines = ["typedef struct {"]
         for at, (key, text) in self.members.items():
             size = f"[{sizes.get(key, NY)}]" if key != "omega" else ""
@@ -168,16 +181,19 @@ class Tick:
             lines += [_IN_PLACE]
         return {
             "TICK": "\n".join(lines),
+            "IN_PLACE": "IN_PLACE " * self._own,
+            "APART": "APART\n" * self._own,
             "FUNCTIONS": "\n".join(map(printer.function, self._functions)),
-            "STEP": call(self.step, u="out"),
+            "OUTPUT": call(self.output, u="out"),
+            "ADVANCE": call(self.advance),
             "LOOK": call(self.look),
             "SETTLE": call(self.settle, e_d="e[0]", e_q="e[1]"),
         }
 
     def operations(self) -> Mapping[str, int]:
         """Operations of a step by their signs, see ``translate.operations``."""
-        return operations(self.step)
+        return operations(self.output) + operations(self.advance)
 
     def constants(self) -> int:
         """Different constants of a step."""
-        return len(constants(self.step))
+        return len(constants(self.output) | constants(self.advance))

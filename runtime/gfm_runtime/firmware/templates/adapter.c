@@ -58,3 +58,23 @@ static view_t @P@_do_view(int k)
 /* @end@ */
 }
 
+static void @P@_do_spoil(int k, int stage)
+{
+/* @if fixed@ */
+    (void)k;
+    (void)stage;
+/* @else@ */
+    golden_real no_number = 0;
+    no_number /= no_number;
+/* @if stages@ */
+    if (stage) {
+        @P@_of[k].stage.away[0] = no_number;
+        return;
+    }
+/* @else@ */
+    (void)stage;
+/* @end@ */
+    @P@_of[k].offset[1] = no_number;
+/* @end@ */
+}
+

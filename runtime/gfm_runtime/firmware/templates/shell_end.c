@@ -1,5 +1,5 @@
 /* 0, or the reason to refuse these inputs: the state, or the ranges of the signal table. */
-static int refused(const @P@_t *s, const real ref[], const real y[], int *channel)
+@APART@static int refused(const @P@_t *s, const real ref[], const real y[], int *channel)
 {
     if (s->reason != @GUARD@_OK) {
         *channel = s->channel;
@@ -51,7 +51,7 @@ void @P@_reset(@P@_t *s)
     s->channel = -1;
 }
 
-int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+@IN_PLACE@int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 {
     tick_t t;
     real out[@GUARD@_NU];
@@ -60,7 +60,7 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
         s->reason = reason;
         return reason;
     }
-    @STEP@;
+    @OUTPUT@;
 /* @if stages@ */
     if (!((out[0] - out[0]) + (out[1] - out[1]) + (out[2] - out[2]) + (out[3] - out[3]) == @0@)) {
 /* @else@ */
@@ -78,6 +78,7 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
         s->reason = @GUARD@_BAD_U;
         return s->reason;
     }
+    @ADVANCE@;
     for (i = 0; i < @GUARD@_NU; i++) {
         u[i] = out[i];
     }
@@ -97,7 +98,17 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
 int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[]@E@)
 {
     tick_t t;
-    int channel, reason = refused(s, ref, y, &channel);
+    real rest = @0@;
+    int i, channel, reason = refused(s, ref, y, &channel);
+    for (i = 0; i < @N_ROWS@; i++) {
+        rest += (u[i] - u[i]) + (trend[i] - trend[i]);
+    }
+/* @if stages@ */
+    rest += (e[0] - e[0]) + (e[1] - e[1]);
+/* @end@ */
+    if (reason == @GUARD@_OK && !(rest == @0@)) {
+        reason = @GUARD@_BAD_U;
+    }
     if (reason == @GUARD@_OK) {
         @SETTLE@;
     }
