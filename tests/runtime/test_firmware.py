@@ -246,16 +246,16 @@ def test_a_remark_cannot_end_its_comment() -> None:
 
 CHOICE = """int f(void)
 {
-    /* @if one@ */
-        a();
-        /* @if two@ */
-            b();
-        /* @end@ */
-    /* @elif three@ */
-        c();
-    /* @else@ */
-        d();
-    /* @end@ */
+/* @if one@ */
+    a();
+/* @if two@ */
+    b();
+/* @end@ */
+/* @elif three@ */
+    c();
+/* @else@ */
+    d();
+/* @end@ */
 }
 /* @if two@ */
 int g(void);
@@ -263,18 +263,17 @@ int g(void);
 """
 
 
-def test_a_choice_is_made_or_left_to_c() -> None:
-    made = chosen(CHOICE, {"one": True, "two": True, "three": True})
-    assert made == "int f(void)\n{\n    a();\n    b();\n}\nint g(void);\n"
-    made = chosen(CHOICE, {"one": False, "two": False, "three": True})
-    assert made == "int f(void)\n{\n    c();\n}\n"
-    made = chosen(CHOICE, {"one": False, "two": "x", "three": False})
-    assert made == "int f(void)\n{\n    d();\n}\nint g(void);\n"
-    left = chosen(CHOICE, {"one": "p", "two": False, "three": "q"})
-    assert left == (
-        "int f(void)\n{\n    if (p) {\n        a();\n    } else if (q) {\n        c();\n"
-        "    } else {\n        d();\n    }\n}\n"
-    )
+@pytest.mark.parametrize(
+    ("one", "two", "three", "calls"),
+    [
+        (True, True, True, "ab"), (True, False, True, "a"), (False, True, True, "c"),
+        (False, False, False, "d"),
+    ],
+)  # fmt: skip
+def test_a_choice_is_made(one: bool, two: bool, three: bool, calls: str) -> None:
+    made = chosen(CHOICE, {"one": one, "two": two, "three": three})
+    body = "".join(f"    {name}();\n" for name in calls)
+    assert made == f"int f(void)\n{{\n{body}}}\n" + "int g(void);\n" * two
 
 
 def test_the_header_of_a_stage_is_the_signal_table() -> None:

@@ -7,7 +7,6 @@ law's record. Variables that a tick leaves are members of an instance ``s``, the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -150,15 +149,6 @@ class Tick:
         without_unread(self._functions, "t->")
         self._real, self._own = real, own
 
-    @cached_property
-    def members(self) -> dict[str, tuple[str, str]]:
-        """The variables of a tick that the functions use, by their names."""
-        named = {f"t->{name}": (key, text) for key, (name, text) in _OF_A_TICK.items()}
-        used = {
-            e.args[0] for f in self._functions for e in f.places() if e.args[0].startswith("t->")
-        }
-        return {at: named[at] for at in named if at in used}
-
     def keys(self, prefix: str) -> Mapping[str, str]:
         """What the templates ask for: the variables of a tick, the functions, and their calls."""
         roots = {} if self._own else {"law": "gfm_law_t"}
@@ -170,12 +160,14 @@ class Tick:
             return printer.call(one, [at.get(name, name) for name in names], {"t": "&t"})
 
         sizes = {"raw": NU, "now": NU, "m": len(_PLACES), "drop": 2, "e_now": 2, "x_next": self._n}
+        used = {e.args[0] for f in self._functions for e in f.places()}
         lines = ["typedef struct {"]
-        for at, (key, text) in self.members.items():
-            size = f"[{sizes.get(key, NY)}]" if key != "omega" else ""
-            lines.append(f"    real {at.removeprefix('t->')}{size}; /* {text} */")
+        for key, (name, what) in _OF_A_TICK.items():
+            if f"t->{name}" in used:
+                size = f"[{sizes.get(key, NY)}]" * (key != "omega")
+                lines.append(f"    real {name}{size}; /* {what} */")
         lines += ["} tick_t;", ""]
-        if any(at == "t->m" for at in self.members):
+        if "t->m" in used:
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
         if self._own:
             lines += [_IN_PLACE]

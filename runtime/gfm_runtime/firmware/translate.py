@@ -330,7 +330,7 @@ class Translator:
         self.unroll, self.algebra = unroll, algebra or Algebra()
         self._made: dict[Any, Function] = {}
 
-    def function(self, python: Any, values: Sequence[Any], name: str = "") -> Function:
+    def function(self, python: Any, values: Sequence[Any]) -> Function:
         """A function for arguments of these kinds: records, constants and arrays are part of it,
         and numbers are its parameters."""
         tree, _, _ = _source(python)
@@ -338,8 +338,9 @@ class Translator:
         bound, parameters, env = [], list[Let | Array](), dict[str, Any]()
         for key, value in zip(names, values, strict=True):
             if isinstance(value, Expr) and id(value) in passed:
-                parameters.append(Let(key, Expr("var", (key,), value.kind), stays=True))
-                env[key] = _local(parameters[-1])
+                let = Let(key, Expr("var", (key,), value.kind), stays=True)
+                parameters.append(let)
+                env[key] = _local(let)
             elif isinstance(value, Array):
                 shape = value.shape[len(value.index) :]
                 parameters.append(Array(key, shape, value.kind))
@@ -350,7 +351,7 @@ class Translator:
         made = (python, *bound, *(p.kind if isinstance(p, Array) else "" for p in parameters))
         if made not in self._made:
             doc = (ast.get_docstring(tree) or "").split("\n\n")[0]
-            one = Function(name or tree.name.lstrip("_"), plain(doc), parameters)
+            one = Function(tree.name.lstrip("_"), plain(doc), parameters)
             body = _Body(self, python, env, one)
             body.block(tree.body, one.body)
             tidy(one)
@@ -426,7 +427,7 @@ class _Body:
                 if isinstance(target, ast.Name) and self.env[target.id].op == "local":
                     self.env[target.id].args[0].sums = True
             case ast.If(test, body, other):
-                self.branch(node, self.value(test, out), body, other, out)
+                self.branch(self.value(test, out), body, other, out)
             case ast.For(ast.Name() as name, iterable, body):
                 self.loop(name.id, iterable, body, out)
             case ast.While(test, body):
@@ -483,7 +484,7 @@ class _Body:
             value = _local(let)
         self.env[place] = value
 
-    def share(self, body: Iterable[ast.stmt], out: list[Any]) -> set[str]:
+    def share(self, body: Iterable[ast.stmt], out: list[Any]) -> None:
         """Make variables of the names that these statements change."""
         names = {
             n.id
@@ -499,7 +500,6 @@ class _Body:
                     value.args[0].stays = True
                 else:
                     self.put(name, value, out)
-        return names
 
     def inner(self, body: Sequence[ast.stmt], out: list[Any]) -> None:
         """A body that may not run: after it, a shared name is its variable."""
@@ -510,7 +510,7 @@ class _Body:
         self.env, self.ended = before, False
 
     def branch(
-        self, node: ast.If, test: Expr, body: list[ast.stmt], other: list[ast.stmt], out: list[Any]
+        self, test: Expr, body: list[ast.stmt], other: list[ast.stmt], out: list[Any]
     ) -> None:
         if test.op == "num":
             self.block(body if test.args[0] else other, out)
@@ -659,8 +659,8 @@ class _Body:
 
 
 def tidy(one: Function, unread: Sequence[Expr] = ()) -> None:
-    """Take out variables that nothing uses and writes to places that nothing reads, make sums of
-    what was added step by step, and one branch of branches with the same condition."""
+    """Take out variables that nothing uses and writes to the places ``unread``, and make sums of
+    what was added step by step."""
     while _pruned(one.body, _uses(one), unread):
         pass
     _summed(one.body, _uses(one))
@@ -809,9 +809,8 @@ def operations(entry: Function) -> Counter[str]:
     out: Counter[str] = Counter()
     for e in entry.expressions():
         if e.op == "call":
-            out += (
-                operations(e.args[0]) if isinstance(e.args[0], Function) else Counter([e.args[0]])
-            )
+            what = e.args[0]
+            out += operations(what) if isinstance(what, Function) else Counter([what])
         elif e.op in _COMPARES and e.args[0].kind == "real":
             out["<"] += 1
         elif e.kind == "real" and e.op in ("+", "-", "*", "/"):
