@@ -537,6 +537,7 @@ class _Body:
             for one in rounds:
                 self.env[name] = one
                 self.block(body, out)
+            self.env.pop(name, None)
             return
         shared = set(self.shared)
         self.share(body, out)
