@@ -21,7 +21,7 @@ from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
 from gfm_runtime.firmware.c_text import chosen, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SWITCH
-from gfm_runtime.firmware.module import BAD_REF, fields
+from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
 from gfm_runtime.inner import INNER_STATE, Inner, settle
 from gfm_runtime.signals import NU, NY, carried, group
@@ -469,6 +469,30 @@ def test_the_command_exports_an_inner_stage(tmp_path: Path) -> None:
     laws = {name: load_law(name, "cascaded").laws[0] for name in ("vsg-2", "droop-1")}
     for name, text in export(laws, T_S, "float32", "unrolled", 120 * math.pi).items():
         assert (tmp_path / name).read_text(encoding="utf-8") == text
+
+
+def test_export_of_all_in_fixed_point_leaves_out_what_is_scheduled(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["firmware", "export", "all", "--real", "fixed", "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert said.err == (
+        "gfmhil: mimo-gfm-scheduled: left out, since fixed point does not cover schedules\n"
+    )
+    assert len(said.out) < 200 + len(str(tmp_path)) and "files gfm_*" in said.out
+    assert (tmp_path / "gfm_vsg_1.c").is_file()
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_the_third_output_of_a_stage_is_e_d(real: str) -> None:
+    """It is a component, which can be negative."""
+    made = make_modules({"x": load_law("vsg-2", "cascaded").laws[0]}, T_S, real)
+    header = sources(made, T_S, "unrolled")["gfm_x.h"]
+    assert "GFM_X_U_E_D, /* d component of the bridge's voltage, p.u. of V_n, -3 to 3 */" in header
+    assert "GFM_X_U_E_U" not in header
+    rows = golden(made, 2100)
+    of = rows.words[:, rows.columns.index("u_E_d")].copy().view(real)
+    assert (of < 0).any()
 
 
 def test_what_the_command_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.models.model import ModelError, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
-from gfm_runtime.signals import carried
+from gfm_runtime.signals import command_rows
 
 _NUMBERS = ("Real", "Float64")
 
@@ -61,7 +61,7 @@ class FmuModel:
                 raise UserError(f"{where}: parameters.{name}: is no parameter of the FMU")
             self._fixed.append((variables[name], value))
         #: of an FMU of ours: where the outputs begin
-        self._begins = [variables.get(f"start.{name}") for name in carried("u", inner)]
+        self._begins = [variables.get(f"start.{s.name}") for s in command_rows(inner)]
         self._every = ticks_a_step(where, ports.step_s or T_s, T_s)
         self._T_s, self._ticks = T_s, 0
         try:

@@ -116,10 +116,21 @@ def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
     kind, colon, file = text.partition(":")
     if not colon or kind not in KINDS or not file:
         raise UserError(f"controller {text!r}: must be {forms}")
+    _refuse_source(text)
     path = Path(file).absolute()
     if not path.is_file():
         raise UserError(f"{file}: there is no such file")
     return kind, path
+
+
+def _refuse_source(text: str) -> None:
+    file = Path(text.partition(":")[2])
+    if text.startswith(("c:", "dll:")) and file.suffix in (".c", ".h", ".cc", ".cpp"):
+        raise UserError(
+            f"controller {text}: is a source, not a library; compile it by cc -O2 -shared -fPIC "
+            f'-I"$(gfmhil firmware include)" {file} -o {file.with_suffix(".so")} -lm, and name '
+            f"{file.with_suffix('.so')}"
+        )
 
 
 def check_currents(text: str, inner: bool) -> None:
@@ -128,6 +139,7 @@ def check_currents(text: str, inner: bool) -> None:
     Raises:
         UserError: ``text`` is ``c:FILE``, and the run has no inner stage.
     """
+    _refuse_source(text)
     if text.startswith("c:") and not inner:
         raise UserError(
             f"controller {text}: measures currents, which only a run with an inner stage carries: "

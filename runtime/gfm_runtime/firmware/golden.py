@@ -40,7 +40,17 @@ from gfm_runtime.kernel import (
     look_with_inner,
     state_dtype,
 )
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, carried, carried_rows, group, names
+from gfm_runtime.signals import (
+    NU,
+    NU_INNER,
+    NY,
+    NY_INNER,
+    carried,
+    carried_rows,
+    command_rows,
+    group,
+    names,
+)
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
@@ -80,7 +90,7 @@ class Golden:
 
 def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
     """The columns of golden rows whose laws have up to ``states`` states, and inner stages."""
-    y, u, ref = carried("y", stages), carried("u", stages), names("ref")
+    y, u, ref = carried("y", stages), command_rows(stages), names("ref")
     own = names("u")
     variables = [
         f"{name}{end}"
@@ -90,7 +100,7 @@ def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
     return (
         "op", "law", "result",
         *(f"ref_{name}" for name in ref), *(f"y_{name}" for name in y),
-        *(f"u_{name}" for name in u), "bump",
+        *(f"u_{s.name}" for s in u), "bump",
         *(f"x_{i}" for i in range(states)), *(f"offset_{name}" for name in own),
         *(f"last_{name}" for name in own), *(f"trend_{name}" for name in own),
         *([*variables, "limited"] if stages else ()),

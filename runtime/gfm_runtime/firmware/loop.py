@@ -65,7 +65,9 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         (folder / name).write_text(text, encoding="utf-8")
     program = str(HARNESS.joinpath("loop.c"))
     build(folder, folder, where, [m.prefix for m in modules], [program])
-    word = np.dtype(f"i{real.itemsize}")
+    real, word = (
+        dtype.newbyteorder(where.order) for dtype in (real, np.dtype(f"i{real.itemsize}"))
+    )
     y, u = len(carried("y", stages)), len(carried("u", stages))
     request = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
     answer = [("result", word), ("channel", word), ("limited", word), ("count", word)]

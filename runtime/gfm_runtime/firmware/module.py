@@ -35,7 +35,16 @@ from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
-from gfm_runtime.signals import NU, NY, TABLE_VERSION, Signal, carried_rows, group, table_hash
+from gfm_runtime.signals import (
+    NU,
+    NY,
+    TABLE_VERSION,
+    Signal,
+    carried_rows,
+    command_rows,
+    group,
+    table_hash,
+)
 from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
 from gfm_runtime.tustin import discretise
 
@@ -297,7 +306,7 @@ def _wrapped(lines: Sequence[str], width: int = 96) -> list[str]:
 
 def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, str]:
     """What the templates of a module ask for."""
-    y, u, ref = carried_rows("y", stages), carried_rows("u", stages), group("ref")
+    y, u, ref = carried_rows("y", stages), command_rows(stages), group("ref")
     guard = prefix.upper()
     rows = []
     for letter, signals in (("REF", ref), ("Y", y), ("U", u)):
@@ -315,6 +324,7 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         "P": prefix,
         "GUARD": guard,
         **C_TYPES[str(real)],
+        "GUARDS": filled(template("guards.c"), {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
         "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
         "REASONS": _enumerators(guard),
         "Y_CHECKS": _checks("y", y, real),

@@ -64,17 +64,14 @@ static void @P@_do_spoil(int k, int stage)
     (void)k;
     (void)stage;
 /* @else@ */
-    golden_real no_number = 0;
-    no_number /= no_number;
+    golden_real *place = &@P@_of[k].offset[1];
 /* @if stages@ */
-    if (stage) {
-        @P@_of[k].stage.away[0] = no_number;
-        return;
-    }
+    if (stage)
+        place = &@P@_of[k].stage.away[0];
 /* @else@ */
     (void)stage;
 /* @end@ */
-    @P@_of[k].offset[1] = no_number;
+    memset(place, 0xff, sizeof *place); /* NaN */
 /* @end@ */
 }
 

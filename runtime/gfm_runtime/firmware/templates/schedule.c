@@ -1,11 +1,14 @@
 #include "@P@.h"
 
+#include <float.h>
+#include <limits.h>
 #include <math.h>
 #include <stdbool.h>
 #include <string.h>
 
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF
+@GUARDS@
+#if DBL_MANT_DIG != 53
+#error "double is not the IEEE 754 type of 64 bits, in which the estimate is made"
 #endif
 
 typedef @P@_real real;
