@@ -124,11 +124,13 @@ class Controller:
         self.ctl["request"], self.ctl["stages"] = first, 0
         if schedule is not None:
             n = len(schedule.stages)
-            X = sorted(stage.X for stage in schedule.stages)
+            X = np.sort([stage.X for stage in schedule.stages])
+            X[-1] = X_MAX
             self.ctl["stages"] = n
             self.ctl["stage_law"][0, :n] = range(first, first + n)
-            self.ctl["stage_X"][0, :n] = [*X[:-1], X_MAX]
-            self.ctl["hysteresis"], self.ctl["since"] = schedule.hysteresis, 0
+            self.ctl["above"][0, :n] = X * (1 + schedule.hysteresis)
+            self.ctl["below"][0, :n] = X * (1 - schedule.hysteresis)
+            self.ctl["since"] = 0
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
             self.est[:] = make_impedance(self.T_s, schedule.X_0, self.omega_b, schedule.X_f)
             self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))

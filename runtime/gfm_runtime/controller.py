@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.impedance import estimate
-from gfm_runtime.inner import measure_frequency, settle_inner, shape, take_measurements
-from gfm_runtime.kernel import advance, output, set_inputs, step
+from gfm_runtime.inner import settle_inner, take_measurements
+from gfm_runtime.kernel import step, step_with_inner
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.states import (
     BAD_U,
@@ -52,18 +52,17 @@ controller_dtype = np.dtype(
         ("ref_rate", "f8", (NY,)),  # p.u. per tick; 0 is a step
         ("y", "f8", (NY_INNER,)),  # of this tick: the kernel takes fields of a record
         ("u", "f8", (NU,)),
-        # with an inner stage: the references that the law sees, and what goes to the bridge
-        ("ref_seen", "f8", (NY,)),
-        ("out", "f8", (NU_INNER,)),
+        ("ref_seen", "f8", (NY,)),  # with which a law joins, see ``_join``
+        ("out", "f8", (NU_INNER,)),  # with an inner stage: what goes to the bridge
         ("y_low", "f8", (NY_INNER,)),
         ("y_high", "f8", (NY_INNER,)),
         # gain scheduling: stages first..first+count-1 of the laws share one schedule
         ("stages", "i8"),
         ("stage_law", "i8", (MAX_STAGES,)),
-        ("stage_X", "f8", (MAX_STAGES,)),  # upper end of each stage, p.u.
-        ("hysteresis", "f8"),
-        ("dwell", "i8"),
-        ("since", "i8"),
+        ("above", "f8", (MAX_STAGES,)),  # reactance beyond which the next stage takes over, p.u.
+        ("below", "f8", (MAX_STAGES,)),  # and from which that one gives back, p.u.
+        ("dwell", "i8"),  # least ticks between two changes
+        ("since", "i8"),  # ticks since the last change, until the next one is allowed
     ],
     align=True,
 )
@@ -121,43 +120,31 @@ def follow_plant(ctl, tripped):
         c.state = RUNNING
 
 
-@compiled
-def _schedule(ctl, est, y):
-    """Select the stage for the estimated reactance, with hysteresis and a minimum dwell time."""
-    X = estimate(est, y[1], y[2], y[4])
-    ctl.since += 1
-    if ctl.since <= ctl.dwell:
-        return
-    now = 0
-    for k in range(ctl.stages):
-        if ctl.stage_law[k] == ctl.active:
-            now = k
-    wanted = now
-    while wanted + 1 < ctl.stages and ctl.stage_X[wanted] * (1 + ctl.hysteresis) < X:
-        wanted += 1
-    while wanted > 0 and ctl.stage_X[wanted - 1] * (1 - ctl.hysteresis) > X:
-        wanted -= 1
-    if wanted != now:
-        ctl.request, ctl.since = ctl.stage_law[wanted], 0
-
-
 @inlined
-def step_with_inner(law, state, c):
-    """One tick of a law and its inner stage: ``c.out`` (4,) from ``c.ref`` (5,) and ``c.y`` (11,).
+def choose(c, now, X, above, below):
+    """The stage for the reactance X, p.u., with hysteresis and a least time between changes."""
+    stage = now
+    if c.since <= c.dwell:
+        c.since += 1
+    if c.since > c.dwell:
+        while stage + 1 < c.stages and above[stage] < X:
+            stage += 1
+        while stage > 0 and below[stage - 1] > X:
+            stage -= 1
+    return stage
 
-    ``c`` is a record that has the fields ``ref``, ``ref_seen``, ``y``, ``u`` and ``out`` of
-    ``controller_dtype``.
-    """
-    take_measurements(state, c.y)
-    for j in range(NY):
-        c.ref_seen[j] = c.ref[j]
-    if law.k_pll > 0.0:
-        measure_frequency(law, state)
-        c.ref_seen[2] = state.omega_pll
-    set_inputs(law, state, c.ref_seen, c.y)
-    output(law, state, c.u)
-    shape(law, state, c.u, c.out)
-    advance(law, state)
+
+@compiled
+def _schedule(c, est, y):
+    """Request the stage for the estimated reactance."""
+    X = estimate(est, y[1], y[2], y[4])
+    now = 0
+    for k in range(c.stages):
+        if c.stage_law[k] == c.active:
+            now = k
+    stage = choose(c, now, X, c.above, c.below)
+    if stage != now:
+        c.request, c.since = c.stage_law[stage], 0
 
 
 @inlined
@@ -202,7 +189,7 @@ def _join(law, state, c, inner):
     settle_into(law, state, c.ref_seen, c.y, c.u, state.trend)
     if inner:
         take_measurements(state, c.y)
-        settle_inner(law, state, c.u, c.u[2], 0.0)
+        settle_inner(law, state, c.u[2], 0.0)
 
 
 @inlined
@@ -242,10 +229,10 @@ def control(ctl, laws, states, est, y, u):
         c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u)
         if inner:
             take_measurements(states[k], c.y)
-            settle_inner(laws[k], states[k], c.u, c.out[2], c.out[3])
+            settle_inner(laws[k], states[k], c.out[2], c.out[3])
         c.active, c.changes = k, c.changes + 1
     if inner:
-        step_with_inner(laws[c.active], states[c.active], c)
+        step_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
         for i in (1, 0, 2, 3):
             if not math.isfinite(c.out[i]):
                 _go_safe(c, BAD_U, i)

@@ -63,22 +63,46 @@ def _sine_of_half(x_a, y_a, x_b, y_b, half):
 
 
 @inlined
-def map_errors(code, parameters, r, y):
-    """Map r and y (shape (5,), p.u.) in place by the map of that code, in their own precision."""
+def _dc_energy(r, y):
+    """Column 1: the error (V_dcref^2 - v_dc^2)/2."""
     half = r.dtype.type(0.5)
+    r[0] = half * r[0] * r[0]
+    y[0] = half * y[0] * y[0]
+
+
+@inlined
+def _dvoc(r, y):
+    """Columns 2 and 4: the errors P_ref/V_ref^2 - p/V^2 and Q_ref/V_ref^2 - q/V^2."""
+    v_ref = max(r[4], r.dtype.type(V_MIN))
+    v = max(y[4], r.dtype.type(V_MIN))
+    r[1] /= v_ref * v_ref
+    r[3] /= v_ref * v_ref
+    y[1] /= v * v
+    y[3] /= v * v
+
+
+@inlined
+def _hybrid_angle(parameters, r, y):
+    """Column 2: the error sin((delta_ref - delta)/2), delta across the impedance R + jX, p.u."""
+    R, X = parameters[0], parameters[1]
+    x_a, y_a = _across(r[1], r[3], r[4], R, X)
+    x_b, y_b = _across(y[1], y[3], y[4], R, X)
+    r[1] = _sine_of_half(x_a, y_a, x_b, y_b, r.dtype.type(0.5))
+    y[1] = 0
+
+
+@inlined
+def map_errors(code, parameters, r, y):
+    """The error map of that code, in place: what r and y are to the law.
+
+    Args:
+        code: a value of ``ERROR_MAPS``.
+        parameters: shape (2,): R and X, p.u.
+        r, y: shape (5,), p.u., in the law's own precision.
+    """
     if code == DC_ENERGY:
-        r[0] = half * r[0] * r[0]
-        y[0] = half * y[0] * y[0]
+        _dc_energy(r, y)
     elif code == DVOC:
-        v_ref = max(r[4], r.dtype.type(V_MIN))
-        v = max(y[4], r.dtype.type(V_MIN))
-        r[1] /= v_ref * v_ref
-        r[3] /= v_ref * v_ref
-        y[1] /= v * v
-        y[3] /= v * v
+        _dvoc(r, y)
     elif code == HYBRID_ANGLE:
-        R, X = parameters[0], parameters[1]
-        x_a, y_a = _across(r[1], r[3], r[4], R, X)
-        x_b, y_b = _across(y[1], y[3], y[4], R, X)
-        r[1] = _sine_of_half(x_a, y_a, x_b, y_b, half)
-        y[1] = 0
+        _hybrid_angle(parameters, r, y)

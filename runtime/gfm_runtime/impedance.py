@@ -15,6 +15,7 @@ without the angle and would tell nothing.
 from __future__ import annotations
 
 import math
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,8 @@ impedance_dtype = np.dtype(
         ("s_tt", "f8"),
         ("s_pp", "f8"),
         ("omega_slow", "f8"),
-        ("age", "i8"),  # ticks since the start
+        ("age", "i8"),  # ticks since the start, until it has settled
+        ("settled", "i8"),  # how many these are
         ("X", "f8"),  # the estimate, p.u.
     ],
     align=True,
@@ -74,32 +76,34 @@ def make_impedance(
     out = np.zeros(1, impedance_dtype)
     out["T_s"], out["omega_b"], out["X"], out["X_f"] = T_s, omega_b, X_0, X_f
     out["forget"] = T_s / MEMORY_S
+    out["settled"] = next(n for n in count(1) if n * (WASHOUT * T_s) > SETTLED)
     return out
 
 
 @compiled
 def estimate(est, p, omega_u, V):
-    """One tick of the estimator from p, omega_u and V (p.u.); returns X in p.u."""
+    """One tick of the estimator from p, omega_u and V, p.u.; returns X, p.u."""
     if est.age == 0:
         est.p_slow, est.omega_slow = p, omega_u
         est.p_smooth, est.omega_smooth = p, omega_u
-    est.age += 1
+    if est.age < est.settled:
+        est.age += 1
     b = SMOOTH * est.T_s
     est.p_smooth += b * (p - est.p_smooth)
     est.omega_smooth += b * (omega_u - est.omega_smooth)
-    p, omega_u = est.p_smooth, est.omega_smooth
     a = WASHOUT * est.T_s
     # twice through the washout, both of them: an angle under a constant omega_g is a ramp
-    est.omega_slow += a * (omega_u - est.omega_slow)
-    est.theta += est.T_s * est.omega_b * (omega_u - est.omega_slow) - a * est.theta
-    est.p_slow += a * (p - est.p_slow)
-    est.p_slower += a * (p - est.p_slow - est.p_slower)
-    p_fast = p - est.p_slow - est.p_slower
+    est.omega_slow += a * (est.omega_smooth - est.omega_slow)
+    est.theta += est.T_s * est.omega_b * (est.omega_smooth - est.omega_slow) - a * est.theta
+    est.p_slow += a * (est.p_smooth - est.p_slow)
+    est.p_slower += a * (est.p_smooth - est.p_slow - est.p_slower)
+    p_fast = est.p_smooth - est.p_slow - est.p_slower
     est.s_pt += est.forget * (p_fast * est.theta - est.s_pt)
     est.s_tt += est.forget * (est.theta * est.theta - est.s_tt)
     est.s_pp += est.forget * (p_fast * p_fast - est.s_pp)
     coherent = est.s_pt * est.s_pt > COHERENT * est.s_pp * est.s_tt
-    if est.age * a > SETTLED and est.s_tt > EXCITATION and est.s_pt > 0.0 and coherent:
+    if est.age >= est.settled and est.s_tt > EXCITATION and est.s_pt > 0 and coherent:
         K = est.s_pt / est.s_tt
-        est.X = max(V / math.sqrt(K * K + est.p_slow * est.p_slow) - est.X_f, X_MIN)
+        X = V / math.sqrt(K * K + est.p_slow * est.p_slow) - est.X_f
+        est.X = max(X, X_MIN)
     return est.X

@@ -37,10 +37,11 @@ import numpy as np
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.errors import LawError, Mistakes
-from gfm_runtime.signals import SPACE_VECTOR
+from gfm_runtime.signals import NU, SPACE_VECTOR, group
 
 KINDS = {"none": 0, "virtual-stator": 1, "cascaded": 2, "threshold-impedance": 3}
 NONE, STATOR = KINDS["none"], KINDS["virtual-stator"]
+P_LOW, P_HIGH = next((s.low, s.high) for s in group("y") if s.name == "p")  # p.u.
 PRIORITIES = {"circular": 0, "d": 1, "q": 2, "angle": 3}
 _D, _Q, _ANGLE = 1, 2, 3
 
@@ -142,7 +143,7 @@ class Inner:
         """Fill the fields of ``INNER_FIELDS`` in a law's record."""
         turn = omega_b * T_s
         rec["inner"], rec["priority"] = KINDS[self.kind], PRIORITIES[self.priority]
-        rec["freeze"] = self.freeze
+        rec["freeze"] = self.freeze and self.kind != "none"
         rec["I_cos"] = self.I_max * math.cos(math.radians(self.angle))
         rec["I_sin"] = self.I_max * math.sin(math.radians(self.angle))
         for name in _PLAIN:
@@ -150,7 +151,6 @@ class Inner:
         if self.kind != "threshold-impedance":
             rec["k_thr"] = 0.0
         rec["one"], rec["half_turn"], rec["least_v"] = 1.0, turn / 2, _LEAST_V
-        rec["negligible"] = NEGLIGIBLE
         if self.kind == "virtual-stator":
             rec["stator_a"] = self.R_v / self.X_v * turn / 2
             rec["stator_b"] = turn / self.X_v
@@ -192,7 +192,7 @@ _PLAIN = (
 )  # fmt: skip
 _PACKED = (
     "one", "half_turn", "I_cos", "I_sin", "stator_a", "stator_b", "T_k_ci", "T_k_vi", "T_k_Pi",
-    "follow_v", "follow_i", "k_pll", "T_k_pll", "least_v", "negligible",
+    "follow_v", "follow_i", "k_pll", "T_k_pll", "least_v",
 )  # fmt: skip
 
 
@@ -201,6 +201,22 @@ INNER_CONSTANTS = (*_PLAIN, *_PACKED)
 
 #: integers of the stage in ``law_dtype``: places in ``KINDS`` and ``PRIORITIES``, and yes or no
 INNER_NUMBERS = [("inner", "i8"), ("priority", "i8"), ("freeze", "i8")]
+
+
+#: variables of the stage: name, size, what it is, in the converter's dq frame, p.u.
+INNER_STATE = (
+    ("i_ref", 2, "reference current, limited"),
+    ("v_f", 2, "low-pass filtered v"),
+    ("i_f", 2, "low-pass filtered i"),
+    ("x_c", 2, "integral of the current loop"),
+    ("x_v", 2, "integral of the voltage loop, or current of the virtual stator"),
+    ("away", 2, "voltage that a change of law left; decays"),
+    ("e", 2, "the bridge's voltage of the last tick"),
+    ("pll", 2, "unit phasor that follows v"),
+    ("omega_pll", 1, "frequency of the PLL"),
+    ("x_high", 1, "integrals of the power limiter"),
+    ("x_low", 1, ""),
+)
 
 
 def inner_fields(f: np.dtype[Any]) -> list[Any]:
@@ -212,24 +228,29 @@ def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
     """The inner stage's variables in ``state_dtype``."""
     return [
         ("m", f, (9,)),  # measurements of this tick
-        ("i_ref", f, (2,)),
-        ("v_f", f, (2,)),
-        ("i_f", f, (2,)),
-        ("x_c", f, (2,)),  # integral of the current loop
-        ("x_v", f, (2,)),  # that of the voltage loop, or the virtual stator's current
-        ("away", f, (2,)),  # voltage left by a bumpless change, decays
-        ("e", f, (2,)),
         ("omega", f),  # omega_u after the power limiter
-        ("x_high", f),
-        ("x_low", f),
-        ("pll", f, (2,)),  # unit phasor that follows v, in the converter's frame
-        ("omega_pll", f),
+        ("drop", f, (2,)),  # voltage over the threshold impedance
+        ("e_now", f, (2,)),  # the bridge's voltage of this tick
+        *((name, f, (size,)) if size > 1 else (name, f) for name, size, _ in INNER_STATE),
     ]
 
 
 @inlined
+def limited(value, low, high):
+    """The value, or the limit that it passes. A NaN stays: the controller finds it."""
+    value = max(value, low)
+    return min(value, high)
+
+
+@inlined
+def faded(value):
+    """0 for a value that has decayed: subnormal numbers can double the time of a tick."""
+    return 0.0 if abs(value) < NEGLIGIBLE else value
+
+
+@inlined
 def take_measurements(state, y):
-    """Copy what the stage needs from y (11,), p.u., in the arithmetic of the law."""
+    """What the stage needs from y (11,), p.u."""
     for j in range(3):
         state.m[j] = y[j]
     for j in range(6):
@@ -238,24 +259,24 @@ def take_measurements(state, y):
 
 @inlined
 def measure_frequency(law, state):
-    """One tick of the PLL on v; ``state.omega_pll`` is then the measured omega_g, p.u."""
-    m, c, s = state.m, state.pll[0], state.pll[1]
+    """One tick of the PLL on v: omega_pll is then the measured omega_g, p.u."""
+    m, cosine, sine = state.m, state.pll[0], state.pll[1]
     size = math.sqrt(m[V_D] * m[V_D] + m[V_Q] * m[V_Q])
-    error = m[V_Q] * c - m[V_D] * s
+    error = m[V_Q] * cosine - m[V_D] * sine
     if size > law.least_v:  # else there is no voltage to follow
         error = error / size
     state.omega_pll += law.T_k_pll * error
     h = (state.omega_pll + law.k_pll * error - m[OMEGA]) * law.half_turn
     # times (1 + j h) / (1 - j h), whose modulus is 1; the root takes the rounding out
     a, b = law.one - h * h, h + h
-    c, s = a * c - b * s, a * s + b * c
-    length = math.sqrt(c * c + s * s)
-    state.pll[0], state.pll[1] = c / length, s / length
+    turned_d, turned_q = a * cosine - b * sine, a * sine + b * cosine
+    length = math.sqrt(turned_d * turned_d + turned_q * turned_q)
+    state.pll[0], state.pll[1] = turned_d / length, turned_q / length
 
 
 @inlined
-def _limit_power(law, state, omega):
-    """omega_u, p.u., lowered while p is above P_max and raised while it is below P_min."""
+def _limit_power(law, state):
+    """omega_u lowered while p is above P_max and raised while it is below P_min, p.u."""
     over, under = state.m[P] - law.P_max, law.P_min - state.m[P]
     state.x_high += law.T_k_Pi * over
     if state.x_high < 0:
@@ -265,15 +286,15 @@ def _limit_power(law, state, omega):
         state.x_low = 0
     lower, raise_by = law.k_P * over + state.x_high, law.k_P * under + state.x_low
     if lower > 0:
-        omega = omega - lower
+        state.omega -= lower
     if raise_by > 0:
-        omega = omega + raise_by
-    return min(max(omega, law.low[1]), law.high[1])
+        state.omega += raise_by
+    state.omega = limited(state.omega, law.low[1], law.high[1])
 
 
 @inlined
 def _limit_current(law, state):
-    """Cut i* to I_max, and remember whether that was needed."""
+    """i* cut to I_max, and whether that was needed."""
     d, q = state.i_ref[0], state.i_ref[1]
     size = d * d + q * q
     most = law.I_max * law.I_max
@@ -283,13 +304,13 @@ def _limit_current(law, state):
     if law.priority == _ANGLE:
         state.i_ref[0], state.i_ref[1] = law.I_cos, law.I_sin
     elif law.priority == _D:
-        d = min(max(d, -law.I_max), law.I_max)
+        d = limited(d, -law.I_max, law.I_max)
         rest = math.sqrt(most - d * d)
-        state.i_ref[0], state.i_ref[1] = d, min(max(q, -rest), rest)
+        state.i_ref[0], state.i_ref[1] = d, limited(q, -rest, rest)
     elif law.priority == _Q:
-        q = min(max(q, -law.I_max), law.I_max)
+        q = limited(q, -law.I_max, law.I_max)
         rest = math.sqrt(most - q * q)
-        state.i_ref[0], state.i_ref[1] = min(max(d, -rest), rest), q
+        state.i_ref[0], state.i_ref[1] = limited(d, -rest, rest), q
     else:
         scale = law.I_max / math.sqrt(size)
         state.i_ref[0], state.i_ref[1] = d * scale, q * scale
@@ -312,14 +333,16 @@ def _stator(law, state, E_d, E_q):
 
 @inlined
 def _drop(law, state):
-    """The voltage over the threshold impedance, 0 below the threshold."""
-    d, q = state.i_f[0], state.i_f[1]
-    beyond = math.sqrt(d * d + q * q) - law.I_thr
-    if beyond < 0:
-        beyond = law.one - law.one
-    R = law.k_thr * beyond
-    X = R * state.omega * law.sigma
-    return R * d - X * q, R * q + X * d
+    """The voltage k_thr (|i_f| - I_thr) (1 + j omega sigma) i_f over the threshold impedance; 0
+    below the threshold."""
+    state.drop[0] = state.drop[1] = 0
+    if law.k_thr > 0:
+        d, q = state.i_f[0], state.i_f[1]
+        beyond = math.sqrt(d * d + q * q) - law.I_thr
+        if beyond > 0:
+            R = law.k_thr * beyond
+            X = R * state.omega * law.sigma
+            state.drop[0], state.drop[1] = R * d - X * q, R * q + X * d
 
 
 @inlined
@@ -327,8 +350,9 @@ def _voltage_loop(law, state, E_d, E_q):
     """One tick of the cascaded voltage loop: i* from v* - v; it integrates only within the
     limit."""
     m, X = state.m, state.omega * law.X_v
-    drop_d, drop_q = _drop(law, state)
-    E_d, E_q = E_d - drop_d, E_q - drop_q
+    _drop(law, state)
+    E_d -= state.drop[0]
+    E_q -= state.drop[1]
     error_d = E_d - law.R_v * m[I_OD] + X * m[I_OQ] - m[V_D]
     error_q = E_q - law.R_v * m[I_OQ] - X * m[I_OD] - m[V_Q]
     B = state.omega * law.C_f
@@ -338,7 +362,7 @@ def _voltage_loop(law, state, E_d, E_q):
     if not state.limited:
         state.x_v[0] += law.T_k_vi * error_d
         state.x_v[1] += law.T_k_vi * error_q
-    state.limited = state.limited or drop_d != 0 or drop_q != 0
+    state.limited = state.limited != 0 or state.drop[0] != 0 or state.drop[1] != 0
 
 
 @inlined
@@ -346,8 +370,8 @@ def _current_loop(law, state):
     """One tick of the current loop: e from i* - i, before the limit of modulation."""
     m, X = state.m, state.omega * law.L_f
     error_d, error_q = state.i_ref[0] - m[I_D], state.i_ref[1] - m[I_Q]
-    state.e[0] = state.v_f[0] + law.k_c * error_d + state.x_c[0] - X * m[I_Q]
-    state.e[1] = state.v_f[1] + law.k_c * error_q + state.x_c[1] + X * m[I_D]
+    state.e_now[0] = state.v_f[0] + law.k_c * error_d + state.x_c[0] - X * m[I_Q]
+    state.e_now[1] = state.v_f[1] + law.k_c * error_q + state.x_c[1] + X * m[I_D]
     state.x_c[0] += law.T_k_ci * error_d
     state.x_c[1] += law.T_k_ci * error_q
 
@@ -362,22 +386,22 @@ def _follow(law, state):
 
 
 @inlined
-def shape(law, state, u, out):
-    """One tick of the inner stage, between ``output`` and ``advance`` of the law.
+def shape(law, state):
+    """One tick of the inner stage: the bridge's voltage e from E_u, and omega_u after the power
+    limiter, p.u.
 
     Args:
-        law, state: records of ``law_dtype`` and ``state_dtype``; ``take_measurements`` was called.
-        u: the law's own output (i_u, omega_u, E_u), shape (3,), p.u.
-        out: (i_u, omega_u, e_d, e_q), shape (4,), p.u.
+        law, state: records of ``law_dtype`` and ``state_dtype``, between ``output`` and ``advance``
+            of the law; ``take_measurements`` was called.
     """
-    out[0] = u[0]
-    E_d, E_q = _limited_E(law, state) + state.away[0], state.away[1]
-    state.omega = min(max(state.raw[1], law.low[1]), law.high[1])
+    E_d, E_q = state.now[2] + state.away[0], state.away[1]
+    state.omega = state.now[1]
     if law.inner == NONE:
         state.limited = 0
-        state.e[0], state.e[1] = E_d, E_q
+        state.e_now[0], state.e_now[1] = E_d, E_q
     else:
-        state.omega = _limit_power(law, state, state.omega)
+        if law.P_max < P_HIGH or law.P_min > P_LOW:
+            _limit_power(law, state)
         _follow(law, state)
         if law.inner == STATOR:
             _stator(law, state, E_d, E_q)
@@ -385,51 +409,39 @@ def shape(law, state, u, out):
             _voltage_loop(law, state, E_d, E_q)
         _current_loop(law, state)
         most = law.m * state.m[V_DC]
-        size = state.e[0] * state.e[0] + state.e[1] * state.e[1]
-        if size > most * most:
+        size = state.e_now[0] * state.e_now[0] + state.e_now[1] * state.e_now[1]
+        if size > most * most:  # the limit of the modulation
             scale = most / math.sqrt(size)
-            state.e[0] *= scale
-            state.e[1] *= scale
+            state.e_now[0] *= scale
+            state.e_now[1] *= scale
     for k in range(2):
-        state.away[k] *= law.decay
-        if abs(state.away[k]) < law.negligible:
-            state.away[k] = 0
-    out[1], out[2], out[3] = state.omega, state.e[0], state.e[1]
+        state.away[k] = faded(state.away[k] * law.decay)
 
 
 @inlined
-def _limited_E(law, state):
-    return min(max(state.raw[2], law.low[2]), law.high[2])
-
-
-@inlined
-def settle_inner(law, state, u, e_d, e_q):
-    """Set the stage so that it goes on with the bridge voltage e: at the start, and when another
-    law takes over. What its structure cannot absorb goes into ``state.away``.
+def settle_inner(law, state, e_d, e_q):
+    """The state of the stage with which the bridge's voltage goes on at e: at the start, and when
+    another law takes over. What the structure cannot absorb goes into away.
 
     Args:
-        law, state: as for ``shape``.
-        u: the law's output (i_u, omega_u, E_u), shape (3,), p.u.
+        law, state: as for ``shape``; ``state.now`` is the law's output.
         e_d, e_q: p.u.
     """
-    m, omega = state.m, u[1]
-    state.omega, state.omega_pll = omega, omega
+    m = state.m
+    state.omega = state.omega_pll = state.now[1]
     size = math.sqrt(m[V_D] * m[V_D] + m[V_Q] * m[V_Q])
     state.pll[0], state.pll[1] = law.one, 0
     if size > law.least_v:
         state.pll[0], state.pll[1] = m[V_D] / size, m[V_Q] / size
     state.x_high, state.x_low, state.limited = 0, 0, 0
     for k in range(2):
-        state.v_f[k], state.i_f[k] = m[V_D + k], m[I_D + k]
+        state.v_f[k], state.i_f[k], state.i_ref[k] = m[V_D + k], m[I_D + k], m[I_D + k]
         state.x_c[k] = state.x_v[k] = 0
-    state.away[0], state.away[1] = 0, 0
     state.e[0], state.e[1] = e_d, e_q
-    e_d, e_q = state.e[0], state.e[1]  # in the law's own precision
-    need_d, need_q = e_d, e_q
-    X = state.omega * law.L_f
-    lack_d, lack_q = e_d - m[V_D] + X * m[I_Q], e_q - m[V_Q] - X * m[I_D]
-    state.i_ref[0], state.i_ref[1] = m[I_D], m[I_Q]
+    need_d, need_q = state.e[0], state.e[1]  # in the law's own precision
     if law.inner != NONE:
+        X = state.omega * law.L_f
+        lack_d, lack_q = need_d - m[V_D] + X * m[I_Q], need_q - m[V_Q] - X * m[I_D]
         if law.T_k_ci > 0:
             state.x_c[0], state.x_c[1] = lack_d, lack_q
         else:
@@ -437,21 +449,23 @@ def settle_inner(law, state, u, e_d, e_q):
             state.i_ref[1] += lack_q / law.k_c
         through_d, through_q = state.i_ref[0], state.i_ref[1]
         state.x_v[0], state.x_v[1] = through_d, through_q
-        drop_d, drop_q = law.one - law.one, law.one - law.one
+        state.drop[0] = state.drop[1] = 0
         if law.inner != STATOR:
-            drop_d, drop_q = _drop(law, state)
+            _drop(law, state)
             B = state.omega * law.C_f
             state.x_v[0] = through_d - law.k_ff * m[I_OD] + B * m[V_Q]
             state.x_v[1] = through_q - law.k_ff * m[I_OQ] - B * m[V_D]
             through_d, through_q = m[I_OD], m[I_OQ]
         X = state.omega * law.X_v
-        need_d = m[V_D] + law.R_v * through_d - X * through_q + drop_d
-        need_q = m[V_Q] + law.R_v * through_q + X * through_d + drop_q
-    state.away[0], state.away[1] = need_d - u[2], need_q
+        need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]
+        need_q = m[V_Q] + law.R_v * through_q + X * through_d + state.drop[1]
+    state.away[0], state.away[1] = need_d - state.now[2], need_q
 
 
 @compiled
 def settle(law, state, u, y, e_d, e_q):
     """``settle_inner`` from Python: one-element arrays of the records, and y (11,), p.u."""
     take_measurements(state[0], y)
-    settle_inner(law[0], state[0], u, e_d, e_q)
+    for i in range(NU):
+        state[0].now[i] = u[i]
+    settle_inner(law[0], state[0], e_d, e_q)

@@ -16,7 +16,18 @@ from numpy.typing import DTypeLike, NDArray
 from gfm_runtime.compiled import inlined
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.errors import LawError
-from gfm_runtime.inner import INNER_NUMBERS, NEGLIGIBLE, Inner, inner_fields, inner_state_fields
+from gfm_runtime.inner import (
+    INNER_NUMBERS,
+    NONE,
+    Inner,
+    faded,
+    inner_fields,
+    inner_state_fields,
+    limited,
+    measure_frequency,
+    shape,
+    take_measurements,
+)
 from gfm_runtime.signals import NU, NY
 from gfm_runtime.tustin import DiscreteLaw
 
@@ -69,6 +80,7 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("r", f, (NY,)),  # mapped references of this tick
             ("y", f, (NY,)),  # mapped measurements of this tick, omega_u the law's own
             ("raw", f, (NU,)),  # u before the limits
+            ("now", f, (NU,)),  # u of this tick, within the limits
             ("offset", f, (NU,)),  # left by a bumpless change, decays
             ("u", f, (NU,)),  # u of the last tick
             ("trend", f, (NU,)),  # filtered u[k] - u[k-1]
@@ -120,7 +132,7 @@ def pack_law(
 
 @inlined
 def set_inputs(law, state, ref, y):
-    """Map this tick's references and measurements (shape (5,), p.u.) into the state record."""
+    """The references and measurements of this tick, p.u., and what the error map makes of them."""
     for j in range(NY):
         state.ref[j] = state.r[j] = ref[j]
         state.y[j] = y[j]
@@ -142,42 +154,51 @@ def _row(law, state, i):
 
 
 @inlined
-def _limited(law, state, i):
-    return min(max(state.raw[i], law.low[i]), law.high[i])
-
-
-@inlined
-def output(law, state, u):
-    """u[k] (shape (3,), p.u.) from the inputs set; omega_u first, since column 3 feeds it back."""
+def output(law, state):
+    """u = u_0 + C x + D_r r + D_y y + offset, p.u., from the inputs set, before and after its
+    limits. omega_u comes first, since column 3 feeds it back."""
     state.raw[1] = _row(law, state, 1) * law.loop
-    u[1] = state.y[2] = _limited(law, state, 1)
+    state.now[1] = state.y[2] = limited(state.raw[1], law.low[1], law.high[1])
     for i in (0, 2):
         state.raw[i] = _row(law, state, i) + law.D_y[i, 2] * state.y[2]
-        u[i] = _limited(law, state, i)
+        state.now[i] = limited(state.raw[i], law.low[i], law.high[i])
 
 
 @inlined
-def _faded(value):
-    """0 for a value that has decayed: subnormal numbers can double the time of a tick."""
-    return 0.0 if abs(value) < NEGLIGIBLE else value
+def look(law, state, ref, y, u):
+    """u[k] without a step."""
+    set_inputs(law, state, ref, y)
+    output(law, state)
+    for i in range(NU):
+        u[i] = state.now[i]
+
+
+@inlined
+def _leads_away(law, state):
+    """Whether E_u moves away from v: a move towards v lets the current leave its limit."""
+    move = law.one - law.one
+    for i in range(law.n):
+        if law.row[i] == 2:
+            move += law.C[2, i] * (state.x_next[i] - state.x[i])
+    return move * (state.u[2] - state.v_f[0]) > 0
 
 
 @inlined
 def advance(law, state):
-    """x[k+1] from this tick's inputs, with back-calculation where the limits clamp u."""
+    """x[k+1] = A x + B_r r + B_y y, with back-calculation W where the limits clamp u; the offset
+    decays, and the trend follows u[k] - u[k-1]."""
     n = law.n
     for i in range(NU):
-        u = _limited(law, state, i)
-        excess = u - state.raw[i]
-        if i == 1 and law.inner != 0:  # the power limiter moves omega_u too
+        excess = state.now[i] - state.raw[i]
+        if i == 1 and law.inner != NONE:  # the power limiter moves omega_u too
             excess = state.omega - state.raw[i]
-        if excess != 0.0:
+        if excess != 0:
             for j in range(n):
                 state.x[j] += law.W[j, i] * excess
-        state.offset[i] = _faded(state.offset[i] * law.decay)
-        trend = state.trend[i]
-        state.trend[i] = _faded(trend + law.follow * (u - state.u[i] - trend))
-        state.u[i] = u
+        state.offset[i] = faded(state.offset[i] * law.decay)
+        change = state.now[i] - state.u[i] - state.trend[i]
+        state.trend[i] = faded(state.trend[i] + law.follow * change)
+        state.u[i] = state.now[i]
     for i in range(n):
         a = law.B_r[i, 0] * state.r[0]
         for j in range(1, NY):
@@ -187,21 +208,17 @@ def advance(law, state):
         for j in range(n):
             a += law.A[i, j] * state.x[j]
         state.x_next[i] = a
-    frozen = law.freeze != 0 and state.limited != 0
-    if frozen:  # a move of E_u towards v lets the current leave its limit
-        move = law.one - law.one
-        for i in range(n):
+    if law.freeze != 0 and state.limited != 0 and _leads_away(law, state):
+        for i in range(n):  # the states of E_u stay
             if law.row[i] == 2:
-                move += law.C[2, i] * (state.x_next[i] - state.x[i])
-        frozen = move * (state.u[2] - state.v_f[0]) > 0
+                state.x_next[i] = state.x[i]
     for i in range(n):
-        if not (frozen and law.row[i] == 2):
-            state.x[i] = _faded(state.x_next[i])
+        state.x[i] = faded(state.x_next[i])
 
 
 @inlined
 def step(law, state, ref, y, u):
-    """One tick: u[k] into ``u`` and the state to k+1.
+    """One tick: u[k] into u, and the state to k+1.
 
     Args:
         law, state: records of ``law_dtype`` and ``state_dtype``.
@@ -211,6 +228,39 @@ def step(law, state, ref, y, u):
     Fields of a record are the fastest for ref, y and u: numba counts references to an array
     atomically whenever it passes one on, but not to a part of a record.
     """
-    set_inputs(law, state, ref, y)
-    output(law, state, u)
+    look(law, state, ref, y, u)
     advance(law, state)
+
+
+@inlined
+def look_with_inner(law, state, ref, y, out):
+    """The output of a tick with the inner stage: (i_u, omega_u, e_d, e_q) into out.
+
+    Args:
+        law, state, ref: as for ``step``.
+        y: shape (11,), p.u.
+        out: output, shape (4,), p.u.
+    """
+    take_measurements(state, y)
+    set_inputs(law, state, ref, y)
+    if law.k_pll > 0:  # omega_g is measured
+        measure_frequency(law, state)
+        state.ref[2] = state.r[2] = state.omega_pll
+    output(law, state)
+    shape(law, state)
+    out[0], out[1], out[2], out[3] = state.now[0], state.omega, state.e_now[0], state.e_now[1]
+
+
+@inlined
+def advance_with_inner(law, state):
+    """The state of law and stage to k+1."""
+    advance(law, state)
+    for k in range(2):
+        state.e[k] = state.e_now[k]
+
+
+@inlined
+def step_with_inner(law, state, ref, y, out):
+    """One tick with the inner stage: the output into out, and the state to k+1."""
+    look_with_inner(law, state, ref, y, out)
+    advance_with_inner(law, state)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Literal
 
 TABLE_VERSION = 2
@@ -145,6 +145,15 @@ def carried_rows(vector: Vector, inner: bool) -> tuple[Signal, ...]:
 def carried(vector: Vector, inner: bool) -> tuple[str, ...]:
     """The names of ``carried_rows``."""
     return tuple(s.name for s in carried_rows(vector, inner))
+
+
+def command_rows(inner: bool) -> tuple[Signal, ...]:
+    """u as firmware and models have it: with an inner stage the third is the bridge's e_d."""
+    i_u, omega_u, E, *E_q = carried_rows("u", inner)
+    if E_q:
+        text = E_q[0].description.replace("q component", "d component")
+        E = replace(E_q[0], name="E_d", symbol="E_d", default=E.default, description=text)
+    return (i_u, omega_u, E, *E_q)
 
 
 def table_hash() -> str:

@@ -9,24 +9,36 @@ there it goes into ``state.offset``, which decays with the law's T_off.
 from __future__ import annotations
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.kernel import output, set_inputs
+from gfm_runtime.inner import settle_inner, take_measurements
+from gfm_runtime.kernel import look, output, set_inputs
 from gfm_runtime.signals import NU, NY
 
 
 @compiled
 def settle_into(law, state, ref, y, u, trend):
-    """Set a law's state so that its output at the references ``ref`` (5,) and measurements y (5,),
-    p.u., is u (3,), p.u., and continues with the slope ``trend`` (3,), p.u. per tick.
+    """The state with which the output at ref and y is u, p.u., and goes on with the slope trend,
+    p.u. per tick.
 
     If u lies outside the law's limits the output is the limit, and the difference is a bump.
+
+    Args:
+        law, state: records of ``law_dtype`` and ``state_dtype``.
+        ref, y: shape (5,), p.u.
+        u: shape (3,), p.u.; on return what comes out of the law.
+        trend: shape (3,), p.u. per tick.
     """
     set_inputs(law, state, ref, y)
     for i in range(NU):
-        state.raw[i] = u[i]  # in the law's own precision; output writes raw anew below
+        state.raw[i] = u[i]  # output writes raw anew below
         state.offset[i] = 0
         state.trend[i] = trend[i]
         state.u[i] = state.raw[i] - state.trend[i]
-    state.y[2] = state.raw[1]
+    i_u, omega_u, E_u = state.raw[0], state.raw[1], state.raw[2]
+    state.y[2] = omega_u
+    for i in range(NU):  # raw is now what the states and the trend have to give
+        state.raw[i] -= law.u_0[i]
+        for j in range(NY):
+            state.raw[i] -= law.D_u0[i, j] * state.ref[j]
     for i in range(law.n):
         a = law.E_r[i, 0] * state.r[0]
         for j in range(1, NY):
@@ -34,19 +46,25 @@ def settle_into(law, state, ref, y, u, trend):
         for j in range(NY):
             a += law.E_y[i, j] * state.y[j]
         for j in range(NU):
-            wanted = state.raw[j] - law.u_0[j]
-            for m in range(NY):
-                wanted -= law.D_u0[j, m] * state.ref[m]
-            a += law.F[i, j] * wanted + law.G[i, j] * state.trend[j]
+            a += law.F[i, j] * state.raw[j] + law.G[i, j] * state.trend[j]
         state.x[i] = a + 0  # never -0, as after a step: code that leaves out zeros gives +0
     # the offset takes the rest: all of it in a row without states, rounding in the others
-    i_u, omega_u, E_u = state.raw[0], state.raw[1], state.raw[2]
-    output(law, state, u)
+    output(law, state)
     state.offset[1] = (omega_u - state.raw[1]) / law.loop
-    output(law, state, u)
+    output(law, state)
     state.offset[0] = i_u - state.raw[0]
     state.offset[2] = E_u - state.raw[2]
-    output(law, state, u)
+    output(law, state)
+    for i in range(NU):
+        u[i] = state.now[i]
+
+
+@compiled
+def settle_with_inner(law, state, ref, y, u, trend, e_d, e_q):
+    """As settle_into; and the inner stage goes on with the bridge's voltage e, p.u."""
+    settle_into(law, state, ref, y, u, trend)
+    take_measurements(state, y)
+    settle_inner(law, state, e_d, e_q)
 
 
 @compiled
@@ -61,8 +79,7 @@ def change_law(old, old_state, new, new_state, ref, y, u):
     Returns:
         max |u_new - u_old| in p.u.: rounding, unless the new law's limits are tighter.
     """
-    set_inputs(old, old_state, ref, y)
-    output(old, old_state, u)
+    look(old, old_state, ref, y, u)
     i_u, omega_u, E_u = u[0], u[1], u[2]
     settle_into(new, new_state, ref, y, u, old_state.trend)
     return max(abs(u[0] - i_u), abs(u[1] - omega_u), abs(u[2] - E_u))

@@ -148,9 +148,7 @@ def test_a_mistake_of_the_option_names_it(tmp_path, capsys):
     stage = file(tmp_path, 'type = "cascaded"\nI_mx = 1.0\n')
     assert main([*run, stage]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == (
-        f"gfmhil: inner stage {stage}: I_mx = 1.0: unknown key; did you mean 'I_max'?"
-    )
+    assert line == (f"gfmhil: inner stage {stage}: I_mx = 1.0: unknown key; did you mean 'I_max'?")
 
 
 def test_an_operating_point_beyond_the_limit_says_what_it_needs(tmp_path, capsys):

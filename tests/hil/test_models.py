@@ -301,6 +301,7 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
         ("exe:x", "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
         ("dll:", "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
         ("dll:none.so", "none.so: there is no such file"),
+        ("c:mine.c", "is a source, not a library; compile it by cc -O2 -shared -fPIC"),
         ("dll:{text}", "cannot be loaded"),
         ("fmu:{text}", "is no FMU that FMPy reads"),
     ],

@@ -21,10 +21,9 @@ from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
 from gfm_runtime.firmware.c_text import chosen, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SWITCH
-from gfm_runtime.firmware.module import BAD_REF, fields
+from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
-from gfm_runtime.firmware.stage import VARIABLES
-from gfm_runtime.inner import Inner, settle
+from gfm_runtime.inner import INNER_STATE, Inner, settle
 from gfm_runtime.signals import NU, NY, carried, group
 from gfm_runtime.states import OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
@@ -77,7 +76,7 @@ def test_golden_rows_are_what_the_controller_does(name: str, real: str) -> None:
     u, own = np.zeros(us.shape[1]), np.zeros(NU)
     bench.states["pll"], bench.states["omega_pll"] = (1.0, 0.0), 1.0  # as init leaves them
     bench.states["e"] = (start[2], 0.0)
-    variables = [(v, columns(rows, real, v)[0]) for v, size, _ in VARIABLES if size > 1]
+    variables = [(v, columns(rows, real, v)[0]) for v, size, _ in INNER_STATE if size > 1]
     for k, (op, _, result) in enumerate(rows.words[:, :3]):
         assert (k == 0) == (op == INIT)
         if result == BAD_REF and bench.ctl["state"][0] == RUNNING:
@@ -235,7 +234,7 @@ def test_a_set_point_of_minus_zero_keeps_its_zeros() -> None:
     law = replace(LAWS["droop-1"], u_0=(-0.0, 1.0, 1.0))
     text = export({"x": law}, T_S, "float64", "unrolled")["gfm_x.c"]
     row = re.search(r"t->raw\[0\] = ([^;]*);", text)
-    assert row is not None and row[1].count("->") == 1 + 1 + 2 * NY + NY - 1
+    assert row is not None and row[1].count("->") == 1 + 1 + 2 * NY + NY
 
 
 def test_a_remark_cannot_end_its_comment() -> None:
@@ -247,16 +246,16 @@ def test_a_remark_cannot_end_its_comment() -> None:
 
 CHOICE = """int f(void)
 {
-    /* @if one@ */
-        a();
-        /* @if two@ */
-            b();
-        /* @end@ */
-    /* @elif three@ */
-        c();
-    /* @else@ */
-        d();
-    /* @end@ */
+/* @if one@ */
+    a();
+/* @if two@ */
+    b();
+/* @end@ */
+/* @elif three@ */
+    c();
+/* @else@ */
+    d();
+/* @end@ */
 }
 /* @if two@ */
 int g(void);
@@ -264,18 +263,17 @@ int g(void);
 """
 
 
-def test_a_choice_is_made_or_left_to_c() -> None:
-    made = chosen(CHOICE, {"one": True, "two": True, "three": True})
-    assert made == "int f(void)\n{\n    a();\n    b();\n}\nint g(void);\n"
-    made = chosen(CHOICE, {"one": False, "two": False, "three": True})
-    assert made == "int f(void)\n{\n    c();\n}\n"
-    made = chosen(CHOICE, {"one": False, "two": "x", "three": False})
-    assert made == "int f(void)\n{\n    d();\n}\nint g(void);\n"
-    left = chosen(CHOICE, {"one": "p", "two": False, "three": "q"})
-    assert left == (
-        "int f(void)\n{\n    if (p) {\n        a();\n    } else if (q) {\n        c();\n"
-        "    } else {\n        d();\n    }\n}\n"
-    )
+@pytest.mark.parametrize(
+    ("one", "two", "three", "calls"),
+    [
+        (True, True, True, "ab"), (True, False, True, "a"), (False, True, True, "c"),
+        (False, False, False, "d"),
+    ],
+)  # fmt: skip
+def test_a_choice_is_made(one: bool, two: bool, three: bool, calls: str) -> None:
+    made = chosen(CHOICE, {"one": one, "two": two, "three": three})
+    body = "".join(f"    {name}();\n" for name in calls)
+    assert made == f"int f(void)\n{{\n{body}}}\n" + "int g(void);\n" * two
 
 
 def test_the_header_of_a_stage_is_the_signal_table() -> None:
@@ -471,6 +469,30 @@ def test_the_command_exports_an_inner_stage(tmp_path: Path) -> None:
     laws = {name: load_law(name, "cascaded").laws[0] for name in ("vsg-2", "droop-1")}
     for name, text in export(laws, T_S, "float32", "unrolled", 120 * math.pi).items():
         assert (tmp_path / name).read_text(encoding="utf-8") == text
+
+
+def test_export_of_all_in_fixed_point_leaves_out_what_is_scheduled(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["firmware", "export", "all", "--real", "fixed", "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert said.err == (
+        "gfmhil: mimo-gfm-scheduled: left out, since fixed point does not cover schedules\n"
+    )
+    assert len(said.out) < 200 + len(str(tmp_path)) and "files gfm_*" in said.out
+    assert (tmp_path / "gfm_vsg_1.c").is_file()
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_the_third_output_of_a_stage_is_e_d(real: str) -> None:
+    """It is a component, which can be negative."""
+    made = make_modules({"x": load_law("vsg-2", "cascaded").laws[0]}, T_S, real)
+    header = sources(made, T_S, "unrolled")["gfm_x.h"]
+    assert "GFM_X_U_E_D, /* d component of the bridge's voltage, p.u. of V_n, -3 to 3 */" in header
+    assert "GFM_X_U_E_U" not in header
+    rows = golden(made, 2100)
+    of = rows.words[:, rows.columns.index("u_E_d")].copy().view(real)
+    assert (of < 0).any()
 
 
 def test_what_the_command_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -329,3 +329,45 @@ def test_a_state_that_is_not_finite_is_found(library: ctypes.CDLL) -> None:
     vsg.x[0] = np.nan
     assert vsg.step(REF, REF, u) == BAD_U
     assert u.tolist() == [7.0, 8.0, 9.0]
+
+
+def test_the_way_out_of_a_bad_u_leads_to_the_last_good_u(library: ctypes.CDLL) -> None:
+    """A NaN in the state is neither in u nor in the trend that the way out begins with."""
+    vsg, u, zero = Instance(library), np.zeros(3), np.zeros(3)
+    assert vsg.step(REF, REF, u) == OK
+    good = u.copy()
+    vsg.x[0] = np.nan
+    assert vsg.step(REF, REF, u) == BAD_U
+    last = vsg._memory[6:9].copy()  # x, offset, u
+    np.testing.assert_array_equal(last, good)
+    vsg.reset()
+    assert vsg.settle(REF, REF, last, zero) == OK
+    assert vsg.step(REF, REF, u) == OK
+    np.testing.assert_allclose(u, good, rtol=0, atol=1e-14)
+
+
+def test_settle_and_switch_refuse_what_is_not_finite(library: ctypes.CDLL) -> None:
+    vsg, u, bump = Instance(library), np.zeros(3), np.zeros(1)
+    assert vsg.step(REF, REF, u) == OK
+    before, zero = vsg._memory.copy(), np.zeros(3)
+    for bad in (np.nan, np.inf):
+        for k in range(3):
+            wrong = np.where(np.arange(3) == k, bad, [0.0, 1.0, 1.0])
+            assert vsg.settle(REF, REF, wrong.copy(), zero) == BAD_U
+            assert vsg.settle(REF, REF, u.copy(), wrong) == BAD_U
+            assert vsg._call("switch", REF, REF, wrong.copy(), zero, bump) == BAD_U
+    np.testing.assert_array_equal(vsg._memory, before)
+
+
+@pytest.mark.parametrize("laws", [LAWS, STAGED], ids=["plain", "staged"])
+def test_golden_rows_reach_a_bad_u_and_the_way_out(laws: Any) -> None:
+    made = golden(make_modules(dict(list(laws.items())[:3]), T_S, "float64"), 210)
+    at = {name: made.columns.index(name) for name in made.columns}
+    result, op = made.words[:, at["result"]], made.words[:, at["op"]]
+    (reset,) = np.nonzero(op == 3)
+    bad = np.flatnonzero(result == BAD_U)
+    assert set(made.words[bad, at["law"]]) == {0, 1, 2}
+    after = reset[result[reset - 1] == BAD_U]
+    assert len(after) >= 3 and (result[after] == OK).all()
+    kept = [k for name, k in at.items() if name.startswith(("last_", "e_"))]
+    assert np.isfinite(made.words[bad][:, kept].view(np.float64)).all()

@@ -23,7 +23,7 @@ from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control
 from gfm_runtime.firmware import STYLES
-from gfm_runtime.signals import carried, group, names
+from gfm_runtime.signals import carried, command_rows, group, names
 from gfm_runtime.states import BAD_Y, RUNNING
 from gfm_runtime.switchover import settle_into
 
@@ -193,7 +193,10 @@ def test_the_model_says_what_it_is(built: Any, inner: str) -> None:
         )
     ]
     stages = inner != "none"
-    wanted = [[*names("ref"), *carried("y", stages)], [*carried("u", stages), "reason"]]
+    wanted = [
+        [*names("ref"), *carried("y", stages)],
+        [*(s.name for s in command_rows(stages)), "reason"],
+    ]
     assert [[p.Name.decode() for p in port] for port in ports] == wanted
     assert {(p.DataType, p.Width) for port in ports for p in port} == {(REAL64, 1)}
     assert info.NumFloatStates == 0 < info.NumDoubleStates

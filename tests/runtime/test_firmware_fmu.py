@@ -16,7 +16,7 @@ from fmpy.validation import validate_fmu
 
 from gfm_hil.cli import main
 from gfm_runtime.firmware import FMI
-from gfm_runtime.signals import carried, carried_rows, group
+from gfm_runtime.signals import carried_rows, command_rows, group
 from gfm_runtime.states import BAD_Y, RUNNING
 
 from ..support.firmware import T_S, accepted, bench, cc
@@ -60,7 +60,7 @@ class Unit:
         return int(get([self._at["reason"]])[0])
 
     def start(self, u: Any) -> None:
-        self.set([self._at[f"start.{name}"] for name in carried("u", len(u) > 3)], u)
+        self.set([self._at[f"start.{s.name}"] for s in command_rows(len(u) > 3)], u)
         if self.two:
             self.it.setupExperiment(startTime=2.0)
             self.it.enterInitializationMode()
@@ -160,8 +160,8 @@ def test_what_the_unit_says_of_itself(built: Any, fmi: str) -> None:
     rows = {
         **{f"ref.{s.name}": s for s in group("ref")},
         **{f"y.{s.name}": s for s in carried_rows("y", True)},
-        **{f"u.{s.name}": s for s in carried_rows("u", True)},
-        **{f"start.{s.name}": s for s in carried_rows("u", True)},
+        **{f"u.{s.name}": s for s in command_rows(True)},
+        **{f"start.{s.name}": s for s in command_rows(True)},
     }
     found = {v.name: v for v in of.modelVariables}
     assert found.keys() == rows.keys() | {"reason"} | ({"time"} if fmi == "3" else set())

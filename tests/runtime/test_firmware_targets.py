@@ -71,6 +71,40 @@ def test_every_stage_has_the_kernels_bits_on_a_processor(
     assert sum(c.differ for c in found) == 0
 
 
+@pytest.mark.parametrize(
+    ("target", "real"),
+    [("s390x", "float32"), ("s390x", "float64"), ("aarch64", "float64"), ("i386", "float32"),
+     ("i386", "float64"), ("m3", "float32"), ("m3", "float64")],
+)  # fmt: skip
+def test_other_processors_have_the_kernels_bits(tmp_path: Path, target: str, real: str) -> None:
+    """Big-endian, 64 bits, 32 bits with SSE2, and floats in software."""
+    exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle", "dvoc")
+    (tmp_path / "stage").mkdir()
+    staged = {name: STAGED[name] for name in list(STAGED)[:2]}
+    exported(tmp_path / "stage", real, "unrolled", of=staged)
+    for folder in (tmp_path, tmp_path / "stage"):
+        found = check(folder, target, ticks=2100)
+        assert [c.differ for c in found] == [0] * len(found)
+
+
+def test_a_scheduled_law_refuses_what_would_change_bits(tmp_path: Path) -> None:
+    command = ["firmware", "export", "mimo-gfm-scheduled", "-o", str(tmp_path)]
+    assert main(command) == 0
+    source = "gfm_mimo_gfm_scheduled.c"
+    for flags, why in (
+        (["-ffast-math"], "-ffast-math changes"),
+        (["-mfpmath=387"], "rounded to their own type"),
+        (["-D__DBL_MANT_DIG__=24"], "double is not the IEEE 754 type of 64 bits"),
+    ):
+        done = cc(tmp_path, "-std=c99", *flags, "-fsyntax-only", source)
+        assert done.returncode != 0
+        text = "\n".join(line for line in done.stderr.splitlines() if line.startswith(source))
+        assert why in text
+    done = cc(tmp_path, "-std=c99", "-fsyntax-only", source, compiler="s390x-linux-gnu-gcc")
+    if done.returncode:  # its float is evaluated in double by default
+        assert "-fexcess-precision=fast" in done.stderr and "-msse2" not in done.stderr
+
+
 def test_the_table_of_stages_is_what_is_measured(tmp_path: Path) -> None:
     compiler = TARGETS["m4f"].prefix + TARGETS["m4f"].compiler
     version = cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0]

@@ -144,7 +144,7 @@ def test_the_pll_finds_the_frequency_that_column_3_is_told() -> None:
         angle = OMEGA_B * 0.01 * k * T_S
         c.step(measured(v=cmath.exp(1j * angle)), u)
     assert c.states["omega_pll"][0] == pytest.approx(1.01, abs=1e-6)
-    assert c.ctl["ref_seen"][0, 2] == c.states["omega_pll"][0]
+    assert c.states["ref"][0, 2] == c.states["omega_pll"][0]
 
 
 def test_the_power_limiter_lowers_the_frequency_only_beyond_its_limit() -> None:

@@ -41,6 +41,7 @@ from gfm_runtime.firmware import (
 )
 
 ALL = "all"
+_SHOWN = 8  # files of laws that export names one by one
 _MOST = 1_000_000  # golden rows of a law, which fill some hundred megabytes
 
 
@@ -123,14 +124,24 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
 def call_export(options: argparse.Namespace) -> int:
     """Write the folder; returns the exit code."""
     sets = _sets(options.laws, options.inner)
-    laws, omega_b = _laws(sets), _omega_b(options.f_n)
     scheduled = [one for one in sets if one.schedule is not None]
+    if ALL in options.laws and options.real == FIXED and scheduled:
+        sets = [one for one in sets if one.schedule is None]
+        names = ", ".join(one.name for one in scheduled)
+        print(
+            f"gfmhil: {names}: left out, since fixed point does not cover schedules",
+            file=sys.stderr,
+        )
+        scheduled = []
+    laws, omega_b = _laws(sets), _omega_b(options.f_n)
     files = export(laws, options.T_s, options.real, options.style, omega_b, scheduled)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         (options.out / name).parent.mkdir(exist_ok=True)
         write_text(options.out / name, text)
-    print(f"{options.out}: {', '.join(files)}")
+    modules = [name for name in files if name.startswith("gfm_")]
+    shown = [f"{len(modules)} files gfm_*"] if len(modules) > _SHOWN else modules
+    print(f"{options.out}: {', '.join([*shown, *(n for n in files if n not in modules)])}")
     stale = sorted({path.name for path in options.out.glob("gfm_*.[ch]")} - set(files))
     if stale:
         print(

@@ -16,7 +16,7 @@ from gfm_hil.core.files import Archive
 from gfm_hil.models.model import BenchContext, ModelError, Wired, run_name, ticks_a_step
 from gfm_hil.models.ports import PortMap, wire
 from gfm_runtime.regular import open_regular
-from gfm_runtime.signals import carried
+from gfm_runtime.signals import command_rows
 
 _NUMBERS = ("Real", "Float64")
 _MEMBERS = 10_000  # of an archive, at most
@@ -67,7 +67,7 @@ class FmuModel(Wired):
                 raise UserError(f"{where}: parameters.{name}: is no parameter of the FMU")
             self._fixed.append((variables[name], value))
         #: of an FMU of ours: where the outputs begin
-        self._begins = [variables.get(f"start.{name}") for name in carried("u", context.inner)]
+        self._begins = [variables.get(f"start.{s.name}") for s in command_rows(context.inner)]
         self._T_s = context.T_s
         self._every = ticks_a_step(where, ports.step_s or self._T_s, self._T_s)
         try:

@@ -13,7 +13,7 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.models.dll import DllModel
 from gfm_hil.models.fmu import FmuModel
 from gfm_hil.models.library import LibraryModel
-from gfm_hil.models.model import BenchContext, Model
+from gfm_hil.models.model import BenchContext, Model, refuse_source
 from gfm_hil.models.ports import PortMap
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
     kind, colon, file = text.partition(":")
     if not colon or kind not in _KINDS or not file:
         raise UserError(f"controller {text!r}: must be {forms}")
+    refuse_source(text)
     path = Path(file).absolute()
     if not path.is_file():
         raise UserError(f"{file}: there is no such file")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -94,12 +95,28 @@ class Wired:
         raise NotImplementedError
 
 
+def refuse_source(text: str) -> None:
+    """Check that a model is no source.
+
+    Raises:
+        UserError: it is; the message says how to compile it.
+    """
+    file = Path(text.partition(":")[2])
+    if text.startswith(("c:", "dll:")) and file.suffix in (".c", ".h", ".cc", ".cpp"):
+        raise UserError(
+            f"controller {text}: is a source, not a library; compile it by cc -O2 -shared -fPIC "
+            f'-I"$(gfmhil firmware include)" {file} -o {file.with_suffix(".so")} -lm, and name '
+            f"{file.with_suffix('.so')}"
+        )
+
+
 def check_currents(text: str, inner: bool) -> None:
     """Check that a run, with an inner stage or without, carries what a library in C measures.
 
     Raises:
         UserError: ``text`` is ``c:FILE``, and the run has no inner stage.
     """
+    refuse_source(text)
     if text.startswith("c:") and not inner:
         raise UserError(
             f"controller {text}: measures currents, which only a run with an inner stage carries: "

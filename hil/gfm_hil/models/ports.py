@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
-from gfm_runtime.signals import carried, names
+from gfm_runtime.signals import carried, command_rows, names
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 #: the groups that an FMU of ours puts before its names
@@ -129,7 +129,7 @@ def wire(
         UserError: a port or a signal that is not there, a port without a signal, or a signal of u
             that comes from nowhere or twice.
     """
-    known, u = [*names("ref"), *carried("y", inner)], carried("u", inner)
+    known, u = [*names("ref"), *carried("y", inner)], [s.name for s in command_rows(inner)]
     for table, there in (("inputs", inputs), ("outputs", outputs)):
         for port in getattr(ports, table):
             if port not in there:
@@ -180,7 +180,7 @@ def _place(where: str, asked: str | Scaled, known: Sequence[str]) -> tuple[int, 
     """Where a signal is among the known ones, and its scale."""
     wanted = Scaled(signal=asked) if isinstance(asked, str) else asked
     if wanted.signal not in known:
-        if wanted.signal in (*carried("y", True), *carried("u", True)):
+        if wanted.signal in (*carried("y", True), *(s.name for s in command_rows(True))):
             raise UserError(
                 f"{where}: only a run with an inner stage carries {wanted.signal!r}: choose one "
                 "by --inner"

@@ -8,8 +8,7 @@ A template holds keys, ``@KEY@``, and choices, each mark on a line of its own::
         b();
     /* @end@ */
 
-A choice is made when the C code is written, or left to the C code as ``if (...) {``; ``@elif
-NAME@`` is possible too. A choice that begins in the first column is about whole functions.
+A choice is made when the C code is written; ``@elif NAME@`` is possible too.
 """
 
 from __future__ import annotations
@@ -50,6 +49,26 @@ def plain(text: str) -> str:
     return one_line.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").rstrip("\\")
 
 
+def wrapped(line: str, width: int = 100) -> list[str]:
+    """A line of C; a long one goes on, indented, after an operator or a comma."""
+    out, indent = [], line[: len(line) - len(line.lstrip())]
+    while len(line) > width:
+        signs = (" + ", " - ", " && ", " || ", " ? ", " : ", ", ")
+        at = max(line.rfind(sign, len(indent) + 16, width - 2) for sign in signs)
+        at = at if at > 0 else line.rfind(" * ", len(indent) + 16, width - 2)
+        if at < 0:
+            break
+        at += line.startswith(", ", at)
+        out.append(line[:at])
+        line = f"{indent}    {line[at:].lstrip()}"
+    return [*out, line]
+
+
+def body(lines: Iterable[str]) -> list[str]:
+    """A function's body."""
+    return ["{", *(part for line in lines for part in wrapped(f"    {line}")), "}", ""]
+
+
 @cache
 def template(name: str) -> str:
     """A file of the folder ``templates``."""
@@ -65,54 +84,27 @@ def filled(text: str, values: Mapping[str, str]) -> str:
     return re.sub(r"@([\w.-]+)@", lambda found: values[found[1]], text)
 
 
-#: by its name, whether a choice holds, or the C expression that says so at run time
-Choices = Mapping[str, bool | str]
-_MARK = re.compile(r"( *)/\* @(if|elif|else|end)(?: (\w+))?@ \*/\n")
+#: by its name, whether a choice holds
+Choices = Mapping[str, bool]
+_MARK = re.compile(r" */\* @(if|elif|else|end)(?: (\w+))?@ \*/\n")
 
 
 def chosen(text: str, choices: Choices) -> str:
-    """The text with its choices made, or written out in C.
+    """The text with its choices made.
 
     Raises:
         KeyError: the text asks for a choice that ``choices`` does not hold.
     """
     out: list[str] = []
-    open_choices: list[_Choice] = []
+    taken: list[bool | None] = []  # of the open choices; None once another part was taken
     for line in text.splitlines(keepends=True):
         mark = _MARK.fullmatch(line)
         if mark is None:
-            if all(choice.taken for choice in open_choices):
-                moved = sum(4 for choice in open_choices if choice.dedents)
-                out.append(line[moved:] if line[:moved].isspace() else line)
-            continue
-        indent, word, name = mark.groups()
-        if word == "if":
-            open_choices.append(_Choice(indent, choices[name]))
-        elif word == "elif":
-            open_choices[-1].next(choices[name])
-        elif word == "else":
-            open_choices[-1].next(True)
-        *outer, now = open_choices
-        if now.in_c and all(choice.taken for choice in outer):
-            expression = f"({choices[name]}) " if name else ""
-            moved = sum(4 for choice in outer if choice.dedents)
-            opens = {"if": f"if {expression}{{", "elif": f"}} else if {expression}{{",
-                     "else": "} else {", "end": "}"}  # fmt: skip
-            out.append(f"{indent[moved:]}{opens[word]}\n")
-        if word == "end":
-            open_choices.pop()
+            if all(taken):
+                out.append(line)
+        elif mark[1] == "end":
+            taken.pop()
+        else:
+            done = mark[1] != "if" and taken.pop() is not False
+            taken.append(None if done else mark[1] == "else" or bool(choices[mark[2]]))
     return "".join(out)
-
-
-class _Choice:
-    """A choice that is open while its lines are read."""
-
-    def __init__(self, indent: str, holds: bool | str) -> None:
-        self.in_c = isinstance(holds, str) and indent != ""
-        self.dedents = indent != "" and not self.in_c
-        self.taken = self._done = bool(holds)
-
-    def next(self, holds: bool | str) -> None:
-        """``@elif@`` or ``@else@``."""
-        self.taken = self.in_c or (bool(holds) and not self._done)
-        self._done = self._done or self.taken

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.golden import CHECKED, golden
@@ -47,7 +48,8 @@ class Target:
         flags: for the processor.
         link: for the linker.
         machine: QEMU's command, or () for this machine.
-        tick_ns: of the clock that counts instructions.
+        order: of bytes, as numpy has it.
+        tick_ns: of the clock that counts instructions; 0 for QEMU in user mode, which has none.
         real: float32 if that is all that its floating-point unit has.
     """
 
@@ -60,24 +62,26 @@ class Target:
     machine: tuple[str, ...] = ()
     tick_ns: int = 0
     real: str = "float64"
+    order: Literal["<", ">"] = "<"
 
     @property
     def run(self) -> list[str]:
         """The command that runs ``PROGRAM``."""
-        return [*self.machine, *_QEMU, "-kernel", PROGRAM] if self.machine else [f"./{PROGRAM}"]
+        system = (*_QEMU, "-kernel") if self.tick_ns else ()
+        return [*self.machine, *system, f"./{PROGRAM}"]
 
     def instructions(self, ticks: int) -> int:
         """How many instructions so many ticks of the clock are."""
         return round(ticks * self.tick_ns / 2**_SHIFT)
 
 
-def _cortex(cpu: str, fpu: str, machine: str, what: str, real: str) -> Target:
+def _cortex(cpu: str, floats: tuple[str, ...], machine: str, what: str, real: str) -> Target:
     return Target(
         what,
         "arm-none-eabi-",
         "gcc",
         "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm",
-        (f"-mcpu={cpu}", "-mthumb", f"-mfpu={fpu}", "-mfloat-abi=hard"),
+        (f"-mcpu={cpu}", "-mthumb", *floats),
         ("-nostartfiles", "-T", str(HARNESS.joinpath("arm.ld")), "-lm"),
         ("qemu-system-arm", "-machine", machine),
         40,
@@ -85,11 +89,37 @@ def _cortex(cpu: str, fpu: str, machine: str, what: str, real: str) -> Target:
     )
 
 
+def _linux(
+    cpu: str, packages: str, what: str, flags: tuple[str, ...] = (), order: Literal["<", ">"] = "<"
+) -> Target:
+    """A program for Linux on another processor, which QEMU's user mode runs."""
+    return Target(
+        what,
+        f"{'i686' if cpu == 'i386' else cpu}-linux-gnu-",
+        "gcc",
+        f"{packages} qemu-user",
+        flags,
+        ("-static", "-lm"),
+        (f"qemu-{cpu}",),
+        order=order,
+    )
+
+
 TARGETS = {
     "host": Target("this machine, gcc", "", "gcc", "gcc libc6-dev", link=("-lm",)),
     "clang": Target("this machine, clang", "", "clang", "clang libc6-dev", link=("-lm",)),
-    "m4f": _cortex("cortex-m4", "fpv4-sp-d16", "mps2-an386", "Cortex-M4F in QEMU", "float32"),
-    "m7": _cortex("cortex-m7", "fpv5-d16", "mps2-an500", "Cortex-M7 in QEMU", "float64"),
+    "m4f": _cortex(
+        "cortex-m4", ("-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"), "mps2-an386", "Cortex-M4F in QEMU",
+        "float32",
+    ),
+    "m7": _cortex(
+        "cortex-m7", ("-mfpu=fpv5-d16", "-mfloat-abi=hard"), "mps2-an500", "Cortex-M7 in QEMU",
+        "float64",
+    ),
+    "m3": _cortex(
+        "cortex-m3", ("-mfloat-abi=soft",), "mps2-an385", "Cortex-M3, floats in software, in QEMU",
+        "float32",
+    ),
     "rv64": Target(
         "RISC-V rv64gc in QEMU",
         "riscv64-unknown-elf-",
@@ -100,7 +130,18 @@ TARGETS = {
         ("qemu-system-riscv64", "-machine", "virt", "-bios", "none"),
         1,
     ),
-}
+    "s390x": _linux(
+        "s390x", "gcc-s390x-linux-gnu libc6-dev-s390x-cross", "s390x, big-endian, in QEMU",
+        ("-fexcess-precision=fast",), ">",
+    ),
+    "aarch64": _linux(
+        "aarch64", "gcc-aarch64-linux-gnu libc6-dev-arm64-cross", "aarch64 in QEMU"
+    ),
+    "i386": _linux(
+        "i386", "gcc-i686-linux-gnu libc6-dev-i386-cross", "i386 with SSE2 in QEMU",
+        ("-msse2", "-mfpmath=sse"),
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -164,7 +205,7 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
     with tempfile.TemporaryDirectory(prefix="gfmhil-firmware-") as work:
         at = Path(work)
         (at / "golden.bin").write_bytes(
-            rows.words.astype(rows.words.dtype.newbyteorder("<")).tobytes()
+            rows.words.astype(rows.words.dtype.newbyteorder(where.order)).tobytes()
         )
         rest = [folder.resolve() / "selftest.c", Path(str(HARNESS.joinpath("harness.c")))]
         hooks = ["-DGOLDEN_NO_MAIN", "-DGOLDEN_CLOCK=clock_now"]

@@ -19,7 +19,7 @@ from gfm_runtime.firmware.c_text import chosen, filled, identifier, plain, templ
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
 from gfm_runtime.firmware.module import MADE, RESULTS, keys_of
 from gfm_runtime.firmware.schedule import one_module
-from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, group, table_hash
+from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_rows, group, table_hash
 
 _INTERFACE = "IEEE_Cigre_DLLInterface.h"
 
@@ -39,7 +39,7 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
     m, code = one_module(laws, T_s, real, omega_b)
     assert m.law is not None
     schedule = laws.schedule is not None
-    u = carried_rows("u", m.stages)
+    u = command_rows(m.stages)
     single = m.real == np.float32
     keys = keys_of(m) | {
         "MADE": MADE,

@@ -17,10 +17,10 @@ from typing import Any
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.a2l import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.module import RESULTS
-from gfm_runtime.firmware.stage import SHARED, VARIABLES
-from gfm_runtime.inner import INNER_CONSTANTS
+from gfm_runtime.firmware.tick import SHARED
+from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE
 from gfm_runtime.regular import open_regular
-from gfm_runtime.signals import Signal, carried_rows, group
+from gfm_runtime.signals import Signal, carried_rows, command_rows, group
 
 _INSTANCE = re.compile(r"gfm(_\w+)?_t")
 _RECORD = "gfm_law_t"
@@ -50,7 +50,7 @@ _PLAIN = {
     "limited": "whether the inner stage limits the current",
     "X": "estimated reactance of the grid",
     "active": "stage of the schedule that is in force",
-    **{name: remark for name, _, remark in VARIABLES if remark},
+    **{name: remark for name, _, remark in INNER_STATE if remark},
 }
 #: members of a law's record
 _OF_RECORD = {
@@ -273,7 +273,7 @@ def _vector(place: _Place, kind: _Type) -> tuple[Signal, ...]:
     own = re.split(r"[._]", re.sub(r"\[\d+\]", "", place.name))[-1]
     vectors = [("ref", group("ref"))]
     for inner in (False, True):
-        vectors += [("y", carried_rows("y", inner)), ("u", carried_rows("u", inner))]
+        vectors += [("y", carried_rows("y", inner)), ("u", command_rows(inner))]
     fits = (rows for name, rows in vectors if name == own and kind.shape == (len(rows),))
     return next(fits, ())
 

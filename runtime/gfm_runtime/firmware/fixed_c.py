@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, HYBRID_ANGLE, LINEAR
-from gfm_runtime.firmware.c_text import chosen, filled, template
+from gfm_runtime.firmware.c_text import body, chosen, filled, template
 from gfm_runtime.firmware.fixed import (
     BUMP_Q,
     EXCESS,
@@ -25,7 +25,6 @@ from gfm_runtime.firmware.fixed import (
     ratio_of,
 )
 from gfm_runtime.firmware.module import FIXED_CHOICES, MADE, Module, about, keys_of
-from gfm_runtime.firmware.unrolled import body
 from gfm_runtime.signals import NU, U_NAMES, group
 
 ROWS = (1, 0, 2)  # of u: omega_u first, since column 3 feeds it back

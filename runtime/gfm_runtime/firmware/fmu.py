@@ -26,7 +26,7 @@ from gfm_runtime.firmware.c_text import chosen, filled, plain, template
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
 from gfm_runtime.firmware.module import MADE, RESULTS, Module, keys_of
 from gfm_runtime.firmware.schedule import one_module
-from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, group, table_hash
+from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_rows, group, table_hash
 
 Fmi = Literal["2", "3"]
 FMI: tuple[Fmi, ...] = get_args(Fmi)
@@ -101,7 +101,7 @@ def _sources(
 ) -> tuple[dict[str, str], bytes]:
     """The law's ``own`` sources and the others by file name, and modelDescription.xml; the token
     follows from both."""
-    u = carried_rows("u", m.stages)
+    u = command_rows(m.stages)
     inside = (*group("ref"), *carried_rows("y", m.stages))
     interface = template(f"fmi{fmi}.c")
     keys = keys_of(m) | {
@@ -151,7 +151,7 @@ def _variables(m: Module) -> list[_Variable]:
     """All variables but the time, in the order of their value references."""
     inside = [("ref", s) for s in group("ref")]
     inside += [("y", s) for s in carried_rows("y", m.stages)]
-    u = carried_rows("u", m.stages)
+    u = command_rows(m.stages)
     result = "0, or why the bridge must be blocked: "
     result += "; ".join(f"{code} {text}" for code, text in RESULTS.values() if code)
     return [

@@ -17,9 +17,10 @@ from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modul
 from gfm_runtime.firmware.proof import script
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
-from gfm_runtime.firmware.stage import SIZE
+from gfm_runtime.firmware.tick import SIZE
 from gfm_runtime.law import Law
 from gfm_runtime.signals import NU, carried
+from gfm_runtime.states import BAD_U
 
 _PROVE = """
 # cmake --build build --target proof
@@ -78,7 +79,7 @@ def export(
 def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
     adapters, table, names, sizes = [], [], [], []
-    parts = ("init", "reset", "step", "look", "settle", "change", "view")
+    parts = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
     choices = {"stages": stages, "fixed": fixed}
@@ -106,6 +107,8 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         "NY": str(len(carried("y", stages))),
         "NU": str(len(carried("u", stages))),
         "STAGE": str(SIZE),
+        "E_AT": str(columns(0, True).index("e_d") - columns(0, True).index("i_ref_d")),
+        "BAD_U": str(BAD_U),
         "WORDS": str(len(columns(states, stages, fixed))),
         **e,
         "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),

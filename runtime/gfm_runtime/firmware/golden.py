@@ -5,8 +5,9 @@ returns and leaves. All are the bits of numbers of the law's precision, or small
 of its size. The inputs are 30 ticks each of: noise about the operating point; ramps of the
 references; the whole ranges of the signal table at random; the same extreme for long, so that u is
 limited; powers that are subnormal or zeros of both signs; measurements that are not finite or out
-of range, the safe state and its end; changes of law. They come from integers of PCG64, so they are
-the same on every machine. With an inner stage the filter's currents and voltages go with them.
+of range, then a state that is NaN, with the safe state and its end after each; changes of law. They
+come from integers of PCG64, so they are the same on every machine. With an inner stage the filter's
+currents and voltages go with them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.controller import step_with_inner
 from gfm_runtime.firmware.fixed import (
     REFS,
     YS,
@@ -32,16 +32,31 @@ from gfm_runtime.firmware.fixed import (
     to_integers,
 )
 from gfm_runtime.firmware.module import BAD_REF, Module
-from gfm_runtime.firmware.stage import VARIABLES
-from gfm_runtime.inner import settle_inner, take_measurements
-from gfm_runtime.kernel import state_dtype, step
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, carried, carried_rows, group, names
+from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
+from gfm_runtime.kernel import (
+    advance,
+    advance_with_inner,
+    look,
+    look_with_inner,
+    state_dtype,
+)
+from gfm_runtime.signals import (
+    NU,
+    NU_INNER,
+    NY,
+    NY_INNER,
+    carried,
+    carried_rows,
+    command_rows,
+    group,
+    names,
+)
 from gfm_runtime.states import BAD_U, BAD_Y, OK
-from gfm_runtime.switchover import change_law, settle_into
+from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
-#: what a row does before its step: nothing, init, a bumpless change to the row's law, or reset and
-#: settle at the last u
-STEP, INIT, SWITCH, RESET = range(4)
+#: what a row does before its step: nothing, init, a bumpless change to the row's law, reset and
+#: settle at the last u, or an error of memory: no number in the law's state, or in its stage's
+STEP, INIT, SWITCH, RESET, SPOIL, SPOIL_STAGE = range(6)
 SEGMENT = 30  # ticks of one kind
 KINDS = 7
 INSIDE = 1e-3  # of a range; stays off its ends, which differ in float32
@@ -75,17 +90,17 @@ class Golden:
 
 def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
     """The columns of golden rows whose laws have up to ``states`` states, and inner stages."""
-    y, u, ref = carried("y", stages), carried("u", stages), names("ref")
+    y, u, ref = carried("y", stages), command_rows(stages), names("ref")
     own = names("u")
     variables = [
         f"{name}{end}"
-        for name, size, _ in VARIABLES
+        for name, size, _ in INNER_STATE
         for end in (("_d", "_q") if size > 1 else ("",))
     ]
     return (
         "op", "law", "result",
         *(f"ref_{name}" for name in ref), *(f"y_{name}" for name in y),
-        *(f"u_{name}" for name in u), "bump",
+        *(f"u_{s.name}" for s in u), "bump",
         *(f"x_{i}" for i in range(states)), *(f"offset_{name}" for name in own),
         *(f"last_{name}" for name in own), *(f"trend_{name}" for name in own),
         *([*variables, "limited"] if stages else ()),
@@ -123,7 +138,7 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         numbers = [refs, ys, u, bump, after["x"][:, :states]]
         numbers += [after[name] for name in ("offset", "u", "trend")]
         if stages:
-            numbers += [after[name] for name, *_ in VARIABLES]
+            numbers += [after[name] for name, *_ in INNER_STATE]
         columns_of = [np.column_stack(integers).astype(word), np.column_stack(numbers).view(word)]
         if stages:
             columns_of.append(after["limited"][:, None].astype(word))
@@ -173,7 +188,7 @@ def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:
     """What goes into and out of a step, as ``gfm_runtime.controller`` has it; and the u in use."""
     return np.dtype(
         [
-            ("ref", real, (NY,)), ("ref_seen", real, (NY,)), ("y", real, (NY_INNER,)),
+            ("ref", real, (NY,)), ("y", real, (NY_INNER,)),
             ("u", real, (NU,)), ("out", real, (NU_INNER,)), ("held", real, (NU_INNER,)),
             ("zero", real, (NU,)), ("bump", real),
         ],
@@ -216,31 +231,40 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             c.bump = change_law(laws[old], old_state, laws[k], new_state, c.ref, c.y, c.u)
             if inner:
                 take_measurements(new_state, c.y)
-                settle_inner(laws[k], new_state, c.u, old_state.e[0], old_state.e[1])
+                settle_inner(laws[k], new_state, old_state.e[0], old_state.e[1])
             now[0], now[1] = k, 1 - now[1]
         elif op[i] == RESET:
             now[2] = OK
             old_state = instances[now[0], now[1]]
             for j in range(NU):
                 c.u[j] = old_state.u[j]
-            settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
             if inner:
-                take_measurements(old_state, c.y)
-                settle_inner(laws[now[0]], old_state, c.u, old_state.e[0], old_state.e[1])
+                e_d, e_q = old_state.e[0], old_state.e[1]
+                settle_with_inner(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
+            else:
+                settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
         law, state = laws[now[0]], instances[now[0], now[1]]
+        if op[i] == SPOIL:
+            state.offset[1] = math.nan
+        elif op[i] == SPOIL_STAGE:
+            state.away[0] = math.nan
         if now[2] == OK:
             now[2] = _refusal(ranges, c.ref, c.y, n_y)
         if now[2] == OK:
             if inner:
-                step_with_inner(law, state, c)
+                look_with_inner(law, state, c.ref, c.y, c.out)
             else:
-                step(law, state, c.ref, c.y, c.u)
+                look(law, state, c.ref, c.y, c.u)
                 for j in range(NU):
                     c.out[j] = c.u[j]
             for j in range(n_u):
                 if not math.isfinite(c.out[j]):
                     now[2] = BAD_U
         if now[2] == OK:
+            if inner:
+                advance_with_inner(law, state)
+            else:
+                advance(law, state)
             for j in range(n_u):
                 c.held[j] = c.out[j]
         result[i], bump[i] = now[2], c.bump
@@ -304,7 +328,10 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any], stages: bool = False) -> 
             ys[start + 5, where] = wrong[bad]
             if bad == 5:
                 ys[start + 5], refs[start + 5, where] = rest, ref_high[where] + 1
-            op[start + 10] = RESET
+            op[start + 10] = op[start + 20] = RESET
+            op[start + 15] = SPOIL
+            if stages:
+                op[start + 22], op[start + 26] = SPOIL_STAGE, RESET
         elif kind == 6:
             op[start : at.stop : 10] = SWITCH
     if stages:

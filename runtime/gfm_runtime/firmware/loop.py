@@ -16,7 +16,8 @@ import numpy as np
 from gfm_runtime.firmware.check import HARNESS, Target, build, need_tools
 from gfm_runtime.firmware.folder import selftest
 from gfm_runtime.firmware.module import Module, check_modules, sources
-from gfm_runtime.firmware.stage import SIZE, VARIABLES
+from gfm_runtime.firmware.tick import SIZE
+from gfm_runtime.inner import INNER_STATE
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.signals import NU, NY, carried
 
@@ -66,7 +67,9 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         (folder / name).write_text(text, encoding="utf-8")
     program = str(HARNESS.joinpath("loop.c"))
     build(folder, folder, where, [m.prefix for m in modules], [program])
-    word = np.dtype(f"i{real.itemsize}")
+    real, word = (
+        dtype.newbyteorder(where.order) for dtype in (real, np.dtype(f"i{real.itemsize}"))
+    )
     y, u = len(carried("y", stages)), len(carried("u", stages))
     request = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
     answer = [("result", word), ("channel", word), ("limited", word), ("count", word)]
@@ -75,7 +78,7 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         where,
         folder,
         np.dtype([*request, ("y", real, (y,))]),
-        np.dtype([*state, *((name, real, (size,)) for name, size, _ in VARIABLES if stages)]),
+        np.dtype([*state, *((name, real, (size,)) for name, size, _ in INNER_STATE if stages)]),
         np.dtype(
             [
                 *answer,

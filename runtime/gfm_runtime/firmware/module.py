@@ -11,12 +11,13 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_runtime.error_maps import DC_ENERGY, DVOC, ERROR_MAPS, HYBRID_ANGLE, R_MIN, V_MIN
+from gfm_runtime.error_maps import ERROR_MAPS
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import (
     Choices,
@@ -29,25 +30,21 @@ from gfm_runtime.firmware.c_text import (
     template,
 )
 from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
-from gfm_runtime.firmware.stage import (
-    AT_RUN_TIME,
-    CONSTANTS,
-    SHARED,
-    STAGE_PARTS,
-    WITHOUT,
-    check_stage,
-    choices_of,
-    kinds_text,
-    numbers_of,
-    stage_text,
-    variables_text,
-)
-from gfm_runtime.firmware.unrolled import Unrolled
-from gfm_runtime.inner import INNER_CONSTANTS, NEGLIGIBLE
+from gfm_runtime.firmware.tick import SHARED, Tick
+from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
-from gfm_runtime.signals import NU, NY, TABLE_VERSION, Signal, carried_rows, group, table_hash
+from gfm_runtime.signals import (
+    NU,
+    NY,
+    TABLE_VERSION,
+    Signal,
+    carried_rows,
+    command_rows,
+    group,
+    table_hash,
+)
 from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
 from gfm_runtime.tustin import discretise
 
@@ -56,7 +53,7 @@ MADE = "Made by gfmhil firmware export; do not edit."
 Style = Literal["unrolled", "records"]
 STYLES: tuple[Style, ...] = get_args(Style)
 REALS = ("float32", "float64")
-FIXED_CHOICES: Choices = dict(WITHOUT) | {"fixed": True}
+FIXED_CHOICES: Choices = {"stages": False, "fixed": True}
 
 #: what a step returns; the bench's scenario refuses a reference out of range before it gets here
 BAD_REF = len(REASONS)
@@ -122,7 +119,12 @@ class Module:
     @property
     def choices(self) -> Choices:
         """The choices of the templates for its unrolled step."""
-        return choices_of(self.record) if self.stages else WITHOUT
+        return {"stages": self.stages, "fixed": False}
+
+    @cached_property
+    def tick(self) -> Tick:
+        """The functions of its step."""
+        return Tick(self.record, self.real, max(1, self.n), self.stages)
 
     @property
     def real(self) -> np.dtype[Any]:
@@ -181,9 +183,12 @@ def check_modules(modules: Sequence[Module]) -> None:
             raise LawError(where, f"{module.n} states must be 0 to {N_MAX}")
         if int(module.record["error_map"]) not in ERROR_MAPS.values():
             raise LawError(where, f"error map {module.record['error_map']} is not known")
-        wrong = check_stage(module.record) if module.stages else ""
-        if wrong:
-            raise LawError(where, wrong)
+        possible = {"inner": KINDS.values(), "priority": PRIORITIES.values(), "one": (1.0,)}
+        for field, allowed in possible.items() if module.stages else ():
+            if module.record[field] not in allowed:
+                raise LawError(where, f"{field} = {module.record[field]} is not possible")
+        if module.stages and not module.record["k_c"] > 0:
+            raise LawError(where, f"k_c = {module.record['k_c']} is not possible")
         for field in fields(module.stages)[1]:
             if not np.isfinite(module.record[field]).all():
                 raise LawError(where, f"{field} must be finite in {module.real}")
@@ -204,31 +209,21 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         }
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
-    choices = AT_RUN_TIME if stages else WITHOUT
-    common = _keys("gfm", real, states, stages)
-    common |= {"LAW": "const gfm_law_t *law, ", "law": "law, ", "LOOP": "law->loop"}
-    constants = "\n        ".join(textwrap.wrap(", ".join(CONSTANTS), 80))
-    types = common | {"KINDS": kinds_text(), "CONSTANTS": constants}
+    choices = modules[0].choices
+    common = _keys("gfm", real, states, stages) | {"LAW": "const gfm_law_t *law, ", "law": "law, "}
+    names = [name for name in INNER_CONSTANTS if name not in SHARED]
+    types = common | {
+        "KINDS": "; ".join(
+            ", ".join(f"{code} {name}" for name, code in codes.items())
+            for codes in (KINDS, PRIORITIES)
+        ),
+        "CONSTANTS": "\n        ".join(textwrap.wrap(", ".join(names), 80)),
+    }
     common["TYPES"] = filled(chosen(template("records.h"), choices), types).rstrip("\n")
-    columns = common["N_COLUMNS"]
-    common["TICK"] = "".join(
-        f"    real {name}[{size}]; /* {text} */\n"
-        for name, size, text in (
-            ("ref", "GFM_NREF", "references as given"),
-            ("r", "GFM_NREF", "references after the error map"),
-            ("y", columns, "measurements after the error map; omega_u is the law's own"),
-        )
-    )
-    maps = [name for name, code in ERROR_MAPS.items() if code]
-    body = _maps(maps, real) + filled(chosen(template("records.c"), choices), _codes() | common)
-    if stages:
-        body += "".join(stage_text(part, choices, common) for part in STAGE_PARTS)
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
         + filled(chosen(template("interface.h"), choices), common),
-        "gfm.c": filled(chosen(template("shell_top.c"), choices), common)
-        + body
-        + filled(chosen(template("shell_end.c"), choices), common),
+        "gfm.c": _source(Tick(None, real, states, stages), choices, common),
     }
     for m in modules:
         guard = f"{m.prefix.upper()}_H"
@@ -259,22 +254,13 @@ def _header(m: Module, T_s: float) -> str:
 
 
 def _unrolled(m: Module) -> str:
-    loop = literal(m.record["loop"], m.real)
-    keys = keys_of(m) | {"LAW": "", "law": "", "LOOP": loop}
-    stage = ""
-    if m.stages:
-        keys |= numbers_of(m.record)
-        stage = "".join(stage_text(part, m.choices, keys) for part in STAGE_PARTS)
-    used = [name for name, code in ERROR_MAPS.items() if code and code == m.record["error_map"]]
-    keys["TICK"] = Unrolled(m.record, m.stages).tick()
-    return (
-        filled(chosen(template("shell_top.c"), m.choices), keys)
-        + _maps(used, m.real)
-        + Unrolled(m.record, m.stages).text(m.prefix)
-        + "\n"
-        + stage
-        + filled(chosen(template("shell_end.c"), m.choices), keys)
-    )
+    return _source(m.tick, m.choices, keys_of(m) | {"LAW": "", "law": ""})
+
+
+def _source(tick: Tick, choices: Choices, keys: Mapping[str, str]) -> str:
+    """The source of a law, or of the generic step."""
+    text = chosen(template("shell_top.c"), choices) + chosen(template("shell_end.c"), choices)
+    return filled(text, {**keys, **tick.keys(keys["P"])})
 
 
 def about(m: Module, T_s: float) -> str:
@@ -321,7 +307,7 @@ def _wrapped(lines: Sequence[str], width: int = 96) -> list[str]:
 
 def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, str]:
     """What the templates of a module ask for."""
-    y, u, ref = carried_rows("y", stages), carried_rows("u", stages), group("ref")
+    y, u, ref = carried_rows("y", stages), command_rows(stages), group("ref")
     guard = prefix.upper()
     rows = []
     for letter, signals in (("REF", ref), ("Y", y), ("U", u)):
@@ -334,35 +320,31 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
     phi = (f"{guard}_NROWS", f"{guard}_NCOLUMNS") if stages else (f"{guard}_NU", f"{guard}_NY")
     of_phi = f", {phi[0]} = {NU}, {phi[1]} = {NY}" * stages
     rows.append(f"enum {{ {guard}_NX = {max(1, n)}{of_phi} }};")
-    root = "sqrtf" if real == np.float32 else "sqrt"
     where = f"/* The order of ref, y and u: gfmhil's signal table, version {TABLE_VERSION}"
     return {
         "P": prefix,
         "GUARD": guard,
         **C_TYPES[str(real)],
+        "GUARDS": filled(template("guards.c"), {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
         "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
         "REASONS": _enumerators(guard),
         "Y_CHECKS": _checks("y", y, real),
         "REF_CHECKS": _checks("ref", ref, real),
-        "fabs": "fabsf" if real == np.float32 else "fabs",
         "U_DEFAULT": literals([s.default for s in group("u")], real),
         "OMEGA_DEFAULT": literal(u[1].default, real),
         "N_ROWS": phi[0],
         "N_COLUMNS": phi[1],
-        "STAGE": variables_text(prefix) if stages else "",
+        "STAGE": "\n".join(
+            f"    {prefix}_real {name}{f'[{size}]' * (size > 1)};{f' /* {text} */' * bool(text)}"
+            for name, size, text in INNER_STATE
+        ),
         "E": ", const real e[]" * stages,
         "e": ", e" * stages,
         "E_OF": f", const {prefix}_real e[]" * stages,
-        "sqrt": root,
-        **_small(real),
-        "NEGLIGIBLE": literal(NEGLIGIBLE, real),
+        # MISRA C:2012, 10.3 and 10.4, asks for constants of that type
+        "0": "0.0f" if real == np.float32 else "0.0",
+        "1": "1.0f" if real == np.float32 else "1.0",
     }
-
-
-def _small(real: np.dtype[Any]) -> dict[str, str]:
-    """0 and 1 as constants of that type: MISRA C:2012, 10.3 and 10.4, asks for them."""
-    end = "f" if real == np.float32 else ""
-    return {"0": f"0.0{end}", "1": f"1.0{end}"}
 
 
 def keys_of(m: Module) -> dict[str, str]:
@@ -389,25 +371,6 @@ def _checks(vector: str, signals: Sequence[Signal], real: np.dtype[Any]) -> str:
             inside = f"{'fabsf' if real == np.float32 else 'fabs'}({value}) <= {high}"
         lines.append(f"!({inside}) ? {j} /* {s.name}, {s.low:g} to {s.high:g} p.u. */")
     return "\n             : ".join(lines)
-
-
-def _codes() -> dict[str, str]:
-    return {
-        "DC_ENERGY": str(DC_ENERGY),
-        "DVOC": str(DVOC),
-        "HYBRID_ANGLE": str(HYBRID_ANGLE),
-    }
-
-
-def _maps(names: Sequence[str], real: np.dtype[Any]) -> str:
-    """The C functions of the error maps that a module needs."""
-    numbers = {"0.5": 0.5, "V_MIN": V_MIN, "R_MIN": R_MIN}
-    keys = {key: literal(value, real) for key, value in numbers.items()}
-    end = "f" if real == np.float32 else ""
-    keys |= {"sqrt": f"sqrt{end}", "fabs": f"fabs{end}", **_small(real)}
-    _, *parts = template("maps.c").split("/* @map ")
-    by_name = dict(part.split("@ */\n", 1) for part in parts)
-    return "".join(filled(by_name[name], keys) for name in names)
 
 
 def _record(m: Module, states: int) -> str:

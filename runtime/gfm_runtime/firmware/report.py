@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import literal, template
+from gfm_runtime.firmware.c_text import literal
 from gfm_runtime.firmware.deviation import NEAR, deviations
 from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
 from gfm_runtime.firmware.module import (
@@ -29,8 +27,8 @@ from gfm_runtime.firmware.module import (
     check_modules,
     fields,
 )
-from gfm_runtime.firmware.stage import CONSTANTS, SIZE, numbers_of, stage_text
-from gfm_runtime.firmware.unrolled import Unrolled
+from gfm_runtime.firmware.tick import SHARED, SIZE, Tick
+from gfm_runtime.inner import INNER_CONSTANTS
 from gfm_runtime.kernel import law_dtype
 from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import NU, NY, U_NAMES, carried_rows, group, table_hash
@@ -173,10 +171,9 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
     if style == "records":
         n, of = m.n, 2 * NY + NU
         constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
-        constants += len(CONSTANTS) * m.stages
+        constants += (len(INNER_CONSTANTS) - len(SHARED)) * m.stages
     else:
-        text = "".join(Unrolled(m.record, m.stages).step_lines()) + _stage_step(m, style)
-        constants = len(set(re.findall(r"-?0x[\w.]+p[-+]\d+", text)))
+        constants = m.tick.constants()
     return {
         "state": state * m.real.itemsize,
         "constants": constants * m.real.itemsize,
@@ -185,40 +182,20 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
 
 def operations(m: Module, style: Style) -> dict[str, int]:
     """Operations of a step in which all limits clamp, the refusal included; without shifts."""
-    n = m.n
     if m.fixed:
         return _integer_operations(m.fixed)
-    stage = _stage_step(m, style)
-    if style == "records":
-        products = NU * (n + 3 * NY - 1) + 3 + NU * n + 2 * NU + n * (2 * NY + n)
-        sums = NU * (n + 3 * NY) + 2 + NU * n + NU + 3 * NU + n * (2 * NY - 1 + n)
-        text, limits, faded, excess = "", NU, 2 * NU + n, NU
-    else:
-        text = "\n".join(Unrolled(m.record, m.stages).step_lines())
-        products, sums = 0, 0
-        limits, faded, excess = (text.count(part) for part in ("limited(", "faded(", "!= 0"))
-    text += stage
-    limits += stage.count(" limited(")
-    faded += stage.count(" faded(")
-    excess += stage.count(" != 0")
+    generic = style == "records"  # it has the zeros too
+    tick = Tick(m.record, m.real, max(1, m.n), m.stages, generic) if generic else m.tick
+    count = tick.operations()
     carried = (*carried_rows("y", m.stages), *group("ref"))
     ranges = sum(1 if s.low == -s.high else 2 for s in carried)
-    for name, code in ERROR_MAPS.items():
-        if code and code == m.record["error_map"]:
-            text += template("maps.c").split(f"/* @map {name}@ */\n")[1].split("/* @map")[0]
-    said = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
-    half_angle = bool(m.record["error_map"] == HYBRID_ANGLE)
+    finite = 2 * (NU + m.stages) - 1  # whether u is
     return {
-        "multiplications": products + len(re.findall(r" \*=? ", said)),
-        "additions": sums + len(re.findall(r" \+=? | -=? ", said)) + 2 * (NU + m.stages) - 1,
-        "divisions": len(re.findall(r" /=? ", said)),
-        "square_roots": 2 * half_angle + stage.count(" sqrt("),
-        "comparisons": 2 * limits
-        + faded
-        + excess  # whether a limit clamped
-        + len(re.findall(r" [<>]=? ", said))
-        + ranges  # of the inputs
-        + 1,  # whether u is finite
+        "multiplications": count["*"],
+        "additions": count["+"] + count["-"] + finite,
+        "divisions": count["/"],
+        "square_roots": count["sqrt"],
+        "comparisons": count["<"] + ranges + 1,
     }
 
 
@@ -236,19 +213,6 @@ def _integer_operations(law: FixedLaw) -> dict[str, int]:
         "square_roots": 0,
         "comparisons": 2 * (moved + NU + 2 * NY),
     }
-
-
-def _stage_step(m: Module, style: Style) -> str:
-    """The text of the inner stage that a step goes through."""
-    if not m.stages:
-        return ""
-    choices = dict(m.choices)
-    if style == "records":  # it leaves these to the numbers
-        choices |= {"power": choices["stage"], "threshold": choices["voltage"]}
-    keys = dict.fromkeys(("LAW", "law", "P", "GUARD", "sqrt", "least_v"), "")
-    return stage_text(
-        "stage.c", choices, keys | {"sqrt": "sqrt", "0": "0", "1": "1"} | numbers_of(m.record)
-    )
 
 
 def _deviations(law: FixedLaw, record: np.void, T_s: float) -> dict[str, list[dict[str, Any]]]:

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
 
-from gfm_runtime.assembly import X_MAX
+from gfm_runtime.assembly import Controller
 from gfm_runtime.catalogue import LawSet
-from gfm_runtime.firmware.c_text import chosen, filled, literal, plain, template
+from gfm_runtime.controller import choose
+from gfm_runtime.firmware.c_text import chosen, filled, literals, plain, template
 from gfm_runtime.firmware.module import MADE, Module, Style, keys_of, make_modules, sources
-from gfm_runtime.impedance import COHERENT, EXCITATION, SETTLED, WASHOUT, X_MIN, make_impedance
-from gfm_runtime.impedance import SMOOTH as SMOOTHING
+from gfm_runtime.firmware.tick import place
+from gfm_runtime.firmware.translate import Array, Expr, Record, Text, Translator
+from gfm_runtime.impedance import estimate
+from gfm_runtime.signals import group
 
 
 def stage_names(laws: LawSet) -> list[str]:
@@ -59,9 +61,9 @@ def schedule_sources(
     """
     schedule, m = laws.schedule, whole(laws, stages)
     assert schedule is not None and m.law is not None
-    est = make_impedance(T_s, schedule.X_0, omega_b, schedule.X_f)[0]
-    X = [*sorted(stage.X for stage in schedule.stages)[:-1], X_MAX]
-    a, age = WASHOUT * est["T_s"], next(n for n in count(1) if n * (WASHOUT * T_s) > SETTLED)
+    bench = Controller([laws], T_s, [s.default for s in group("ref")], omega_b=omega_b)
+    ctl, n = bench.ctl[0], len(stages)
+    double = np.dtype(np.float64)
     choices = {"stages": m.stages}
     own = style == "unrolled"
     parts = [
@@ -80,9 +82,6 @@ def schedule_sources(
             + "        break;"
             for k, t, law in parts
         )
-
-    def double(value: object) -> str:
-        return literal(value, np.dtype(np.float64))
 
     copied = "(void)memcpy(trend, {s}.trend, sizeof {s}.trend);"
     if m.stages:
@@ -104,22 +103,40 @@ def schedule_sources(
         "INIT": "\n".join(f"    {t}_init(&s->stage_{k});" for k, t, _ in parts),
         "RESET": cases("{t}_reset(&{s});"),
         "STEP": cases("s->reason = {t}_step({law}&{s}, ref, y, u);"),
-        "SETTLED": str(age),
-        "DWELL": str(round(schedule.dwell_s / T_s)),
-        "START": str(int(np.searchsorted(X[:-1], schedule.X_0))),
-        "ABOVE": ", ".join(double(x * (1 + schedule.hysteresis)) for x in X),
-        "BELOW": ", ".join(double(x * (1 - schedule.hysteresis)) for x in X),
+        "START": str(ctl["active"]),
+        "ABOVE": literals(ctl["above"][:n], double),
+        "BELOW": literals(ctl["below"][:n], double),
         "X_0": repr(float(schedule.X_0)),
-        "X_f": double(est["X_f"]),
-        "X_MIN": double(X_MIN),
-        "COHERENT": double(COHERENT),
-        "EXCITATION": double(EXCITATION),
-        "a": double(a),
-        "b": double(SMOOTHING * est["T_s"]),
-        "T_omega": double(est["T_s"] * est["omega_b"]),
-        "forget": double(est["forget"]),
+        "FUNCTIONS": _functions(m.prefix, bench.est[0], ctl, n),
     }
     return {
         f"{m.prefix}{end}": filled(chosen(template(f"schedule{end}"), choices), keys)
         for end in (".h", ".c")
     }
+
+
+def _functions(prefix: str, est: np.void, ctl: np.void, n: int) -> str:
+    """The estimate of the reactance and the choice of a stage, in C."""
+    constant = ("T_s", "omega_b", "X_f", "forget", "settled")
+    grid = Record(
+        {
+            name: est[name] if name in constant else place(name, (), f"g->{name}")
+            for name in est.dtype.names or ()
+        }
+    )
+    scheduled = Record(
+        {"stages": n, "dwell": ctl["dwell"], "since": place("since", (), "s->since")}
+    )
+    ends = [Array(name, (n,)) for name in ("above", "below")]
+    now, X = Expr("var", ("now",), "int"), Expr("var", ("X",))
+    translate = Translator(unroll=True)
+    text = Text(
+        est["X"].dtype, {"g": f"{prefix}_estimate_t", "s": f"{prefix}_t"}, real_type="double"
+    )
+    return "\n".join(
+        text.function(one)
+        for one in (
+            translate.function(estimate, [grid, *(Expr("var", (name,)) for name in "pwV")]),
+            translate.function(choose, [scheduled, now, X, *ends]),
+        )
+    )

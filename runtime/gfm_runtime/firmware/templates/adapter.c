@@ -58,3 +58,20 @@ static view_t @P@_do_view(int k)
 /* @end@ */
 }
 
+static void @P@_do_spoil(int k, int stage)
+{
+/* @if fixed@ */
+    (void)k;
+    (void)stage;
+/* @else@ */
+    golden_real *place = &@P@_of[k].offset[1];
+/* @if stages@ */
+    if (stage)
+        place = &@P@_of[k].stage.away[0];
+/* @else@ */
+    (void)stage;
+/* @end@ */
+    memset(place, 0xff, sizeof *place); /* NaN */
+/* @end@ */
+}
+

@@ -71,10 +71,16 @@ int @P@_look(@LAW@const @P@_t *s, const @P@_real ref[], const @P@_real y[],
 /* @if stages@ */
 /* Sets the state so that the law's own u[k] is u, and goes on with the slope trend (p.u. per tick); and
  * the stage so that the bridge's voltage goes on at e (e_d, e_q), p.u. On return u is what comes out
- * of the law: the same but for rounding, or this law's limit. u, trend and e are not parts of s. */
+ * of the law: the same but for rounding, or this law's limit. u, trend and e are not parts of s. What
+ * is not finite gives BAD_U, and s stays. */
 /* @else@ */
 /* Sets the state so that u[k] is u, and goes on with the slope trend (p.u. per tick). On return u is
- * what comes out: the same but for rounding, or this law's limit. u and trend are not parts of s. */
+ * what comes out: the same but for rounding, or this law's limit. u and trend are not parts of s.
+/* @if fixed@ */
+ * Call it with u and trend in range. */
+/* @else@ */
+ * What is not finite gives BAD_U, and s stays. */
+/* @end@ */
 /* @end@ */
 int @P@_settle(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
     @P@_real u[], const @P@_real trend[]@E_OF@);

@@ -9,13 +9,14 @@ typedef uint@BITS@_t golden_word;
 
 enum { GOLDEN_LAWS = @LAWS@, GOLDEN_NX = @NX@, GOLDEN_NY = @NY@, GOLDEN_NU = @NU@ };
 /* @if stages@ */
-enum { GOLDEN_STAGE = @STAGE@ };
+enum { GOLDEN_STAGE = @STAGE@, GOLDEN_E = @E_AT@, GOLDEN_BAD_U = @BAD_U@ };
 /* @end@ */
 enum { GOLDEN_WORDS = @WORDS@ };
 
 /* One row: the number of words that differ. Rows go in their order; the first row starts anew.
  * row[0] says what comes before the step: 0 nothing, 1 init of the law row[1], 2 a change to it, 3 reset
- * and settle. row[2] is what step returns; its inputs follow, then u and the state after the step. */
+ * and settle, 4 and 5 an error of memory: NaN in the state of the law, and of its stage.
+ * row[2] is what step returns; its inputs follow, then u and the state after the step. */
 unsigned golden_row(const golden_word row[]);
 
 /* With a row that a law steps through: what a step takes that refuses the last reference after all other

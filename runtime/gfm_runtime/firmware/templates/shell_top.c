@@ -5,41 +5,10 @@
 #include <math.h> /* fabs, which is no call, and sqrt */
 #include <stdbool.h>
 
-#ifdef __FAST_MATH__
-#error "-ffast-math changes the results: compile without it, and with -ffp-contract=off"
-#endif
-#if FLT_EVAL_METHOD != 0
-#error "sums must be rounded to their own type: with GCC for i686 use -msse2 -mfpmath=sse"
-#endif
-#if FLT_RADIX != 2 || @DIG@ != @MANTISSA@
-#error "@C_REAL@ is not the IEEE 754 type of @BITS@ bits"
-#endif
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF
-#endif
-typedef char @P@_real_has_@BITS@_bits[sizeof(@P@_real) * CHAR_BIT == @BITS@ ? 1 : -1];
+@GUARDS@
 
 typedef @P@_real real;
 
 /* What a tick works on beside the state. */
-typedef struct {
-@TICK@    real raw[@N_ROWS@]; /* u before the limits */
-    real u[@N_ROWS@];
-/* @if stages@ */
-    real omega; /* omega_u after the power limiter */
-/* @end@ */
-} tick_t;
-
-/* A NaN passes, as it does in the bench: step finds it. */
-static real limited(real value, real low, real high)
-{
-    value = low > value ? low : value;
-    return high < value ? high : value;
-}
-
-/* 0 for what has decayed: subnormal numbers would take long on many processors. */
-static real faded(real value)
-{
-    return @fabs@(value) < @NEGLIGIBLE@ ? @0@ : value;
-}
-
+@TICK@
+@FUNCTIONS@

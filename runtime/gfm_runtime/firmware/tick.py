@@ -1,0 +1,191 @@
+"""The tick of a law in C: the kernel's functions, translated, and what they work on.
+
+In a law of its own the constants are numbers in the code; in the generic step they are those of the
+law's record. Variables that a tick leaves are members of an instance ``s``, the others of ``t``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gfm_runtime import inner
+from gfm_runtime.firmware.translate import (
+    Algebra,
+    Array,
+    Expr,
+    Function,
+    Record,
+    Text,
+    Translator,
+    constants,
+    number,
+    operations,
+    reached,
+    without_unread,
+)
+from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE
+from gfm_runtime.kernel import (
+    advance,
+    advance_with_inner,
+    law_dtype,
+    look,
+    look_with_inner,
+    state_dtype,
+)
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
+from gfm_runtime.switchover import settle_into, settle_with_inner
+
+#: numbers of an inner stage in an instance
+SIZE = sum(size for _, size, _ in INNER_STATE)
+#: constants that are the same in all laws, and no members of a law's record in C
+SHARED = ("one",)
+INTEGERS = (
+    "n",
+    "error_map",
+    "row",
+    "limited",
+    "age",
+    "since",
+    *(name for name, _ in INNER_NUMBERS),
+)
+#: variables of one tick only: by the name in ``state_dtype``, the name in C and what it is
+_OF_A_TICK = {
+    "ref": ("ref", "references as given"),
+    "r": ("r", "references after the error map"),
+    "y": ("y", "measurements after the error map; omega_u is the law's own"),
+    "raw": ("raw", "u before the limits"),
+    "now": ("u", "u within the limits"),
+    "x_next": ("x_next", "states of the next tick"),
+    "m": ("m", "measurements that the inner stage uses"),
+    "omega": ("omega", "omega_u after the power limiter"),
+    "drop": ("drop", "voltage over the threshold impedance"),
+    "e_now": ("e", "the bridge's voltage"),
+}
+_PLACES = ("V_DC", "P", "OMEGA", "I_D", "I_Q", "V_D", "V_Q", "I_OD", "I_OQ")
+assert [getattr(inner, name) for name in _PLACES] == list(range(len(_PLACES)))
+
+
+_IN_PLACE = """\
+/* A step is compiled in one: calls and the way through memory cost more than the sums. */
+#ifdef __GNUC__
+#define IN_PLACE __attribute__((flatten))
+#define APART __attribute__((noinline))
+#else
+#define IN_PLACE
+#define APART
+#endif
+"""
+
+
+def place(name: str, shape: tuple[int, ...], at: str) -> Expr | Array:
+    """A field of a record in C."""
+    kind = "int" if name in INTEGERS else "real"
+    return Array(at, shape, kind) if shape else Expr("var", (at,), kind)
+
+
+def _state(real: np.dtype[Any], n: int) -> Record:
+    of = state_dtype(real)
+    inside = {name for name, *_ in INNER_STATE}
+    fields = {}
+    for name in of.names or ():
+        shape = of[name].shape if not name.startswith("x_n") else (n,)
+        own = f"t->{_OF_A_TICK[name][0]}" if name in _OF_A_TICK else f"s->{name}"
+        fields[name] = place(name, shape, f"s->stage.{name}" if name in inside else own)
+    return Record(fields)
+
+
+def _of_record(real: np.dtype[Any], stages: bool) -> Record:
+    """The law's constants as members of a record in C; without stages those of none."""
+    of = law_dtype(real)
+    fields = {name: place(name, of[name].shape, f"law->{name}") for name in of.names or ()}
+    fields |= {name: number(1.0) for name in SHARED}
+    if not stages:
+        fields |= {name: number(0) for name, _ in INNER_NUMBERS} | {"k_pll": number(0.0)}
+    return Record(fields)
+
+
+class Tick:
+    """The functions of a law's tick.
+
+    Args:
+        record: the law as ``pack_law`` gives it; None for the generic step.
+        real: float32 or float64.
+        n: states that an instance has room for.
+        stages: whether it has an inner stage's variables.
+        all_terms: count zeros too, as the generic step does.
+    """
+
+    def __init__(
+        self,
+        record: np.void | None,
+        real: np.dtype[Any],
+        n: int,
+        stages: bool,
+        all_terms: bool = False,
+    ) -> None:
+        self._n, own = n, record is not None
+        law = _of_record(real, stages)
+        if record is not None:
+            law = Record({name: record[name] for name in record.dtype.names or ()})
+            all_terms = all_terms or bool(np.any(np.signbit(record["u_0"]) & (record["u_0"] == 0)))
+        translate = Translator(own, Algebra(all_terms))
+        records = [law, _state(real, n)]
+        ref, y = Array("ref", (NY,)), Array("y", (NY_INNER if stages else NY,))
+        u, trend = Array("u", (NU,)), Array("trend", (NU,))
+        out = Array("out", (NU_INNER if stages else NU,))
+        e = [Expr("var", (f"e[{k}]",)) for k in range(2)] if stages else []
+        self.look = translate.function(look, [*records, ref, y, u])
+        self.output, self.advance = self.look, translate.function(advance, records)
+        if stages:
+            self.output = translate.function(look_with_inner, [*records, ref, y, out])
+            self.advance = translate.function(advance_with_inner, records)
+        self.settle = translate.function(
+            settle_with_inner if stages else settle_into, [*records, ref, y, u, trend, *e]
+        )
+        self._functions = reached([self.output, self.advance, self.look, self.settle])
+        without_unread(self._functions, "t->")
+        self._real, self._own = real, own
+
+    def keys(self, prefix: str) -> Mapping[str, str]:
+        """What the templates ask for: the variables of a tick, the functions, and their calls."""
+        roots = {} if self._own else {"law": "gfm_law_t"}
+        roots |= {"s": f"{prefix}_t", "t": "tick_t"}
+        printer = Text(self._real, roots, {"t->m": _PLACES})
+
+        def call(one: Function, **at: str) -> str:
+            names = [p.place if isinstance(p, Array) else p.name for p in one.parameters]
+            return printer.call(one, [at.get(name, name) for name in names], {"t": "&t"})
+
+        sizes = {"raw": NU, "now": NU, "m": len(_PLACES), "drop": 2, "e_now": 2, "x_next": self._n}
+        used = {e.args[0] for f in self._functions for e in f.places()}
+        lines = ["typedef struct {"]
+        for key, (name, what) in _OF_A_TICK.items():
+            if f"t->{name}" in used:
+                size = f"[{sizes.get(key, NY)}]" * (key != "omega")
+                lines.append(f"    real {name}{size}; /* {what} */")
+        lines += ["} tick_t;", ""]
+        if "t->m" in used:
+            lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
+        if self._own:
+            lines += [_IN_PLACE]
+        return {
+            "TICK": "\n".join(lines),
+            "IN_PLACE": "IN_PLACE " * self._own,
+            "APART": "APART\n" * self._own,
+            "FUNCTIONS": "\n".join(map(printer.function, self._functions)),
+            "OUTPUT": call(self.output, u="out"),
+            "ADVANCE": call(self.advance),
+            "LOOK": call(self.look),
+            "SETTLE": call(self.settle, e_d="e[0]", e_q="e[1]"),
+        }
+
+    def operations(self) -> Mapping[str, int]:
+        """Operations of a step by their signs, see ``translate.operations``."""
+        return operations(self.output) + operations(self.advance)
+
+    def constants(self) -> int:
+        """Different constants of a step."""
+        return len(constants(self.output) | constants(self.advance))
