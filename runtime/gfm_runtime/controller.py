@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.impedance import estimate
 from gfm_runtime.inner import settle_inner, take_measurements
-from gfm_runtime.kernel import step, step_with_inner
+from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.states import (
     BAD_U,
@@ -232,18 +232,20 @@ def control(ctl, laws, states, est, y, u):
             settle_inner(laws[k], states[k], c.out[2], c.out[3])
         c.active, c.changes = k, c.changes + 1
     if inner:
-        step_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
+        look_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
         for i in (1, 0, 2, 3):
             if not math.isfinite(c.out[i]):
                 _go_safe(c, BAD_U, i)
                 return
+        advance_with_inner(laws[c.active], states[c.active])
         for i in range(NU_INNER):
             u[i] = c.out[i]
         return
-    step(laws[c.active], states[c.active], c.ref, c.y, c.u)
+    look(laws[c.active], states[c.active], c.ref, c.y, c.u)
     for i in (1, 0, 2):  # omega_u first: column 3 takes it to the others
         if not math.isfinite(c.u[i]):
             _go_safe(c, BAD_U, i)
             return
+    advance(laws[c.active], states[c.active])
     for i in range(NU):
         u[i] = c.u[i]

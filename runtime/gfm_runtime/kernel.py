@@ -257,10 +257,3 @@ def advance_with_inner(law, state):
     advance(law, state)
     for k in range(2):
         state.e[k] = state.e_now[k]
-
-
-@inlined
-def step_with_inner(law, state, ref, y, out):
-    """One tick with the inner stage: the output into out, and the state to k+1."""
-    look_with_inner(law, state, ref, y, out)
-    advance_with_inner(law, state)

@@ -20,12 +20,12 @@ from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
 from gfm_runtime.firmware.c_text import chosen, literal, plain
-from gfm_runtime.firmware.golden import INIT, RESET, SWITCH
+from gfm_runtime.firmware.golden import INIT, RESET, SPOIL, SPOIL_STAGE, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
 from gfm_runtime.inner import INNER_STATE, Inner, settle
 from gfm_runtime.signals import NU, NY, carried, group
-from gfm_runtime.states import OK, RUNNING, SAFE
+from gfm_runtime.states import BAD_U, BAD_Y, OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
 
 from ..support.firmware import SOME, STAGED
@@ -94,6 +94,11 @@ def test_golden_rows_are_what_the_controller_does(name: str, real: str) -> None:
                 settle(bench.laws[one], bench.states[one], own, ys[k], *e)
             bench.reset()
             bench.ctl["state"] = RUNNING
+        state = bench.states[int(bench.ctl["active"][0])]
+        if op == SPOIL:
+            state["offset"][1] = np.nan
+        elif op == SPOIL_STAGE:
+            state["away"][0] = np.nan
         control(bench.ctl, bench.laws, bench.states, bench.est, ys[k], u)
         state = bench.states[int(bench.ctl["active"][0])]
         assert (bench.ctl["state"][0] == RUNNING) == (result == OK)
@@ -117,7 +122,8 @@ def test_golden_rows_reach_all_paths(real: str) -> None:
     assert np.sum((ys != 0) & (np.abs(ys) < tiny)) > 1000 and np.isnan(ys).any()
     assert np.isinf(ys).any() and offsets.any()
     ops, law, result = rows.words[:, :3].T
-    assert {*ops} == {0, INIT, SWITCH, RESET} and {*result} == {OK, 1, BAD_REF}
+    assert {*ops} == {0, INIT, SWITCH, RESET, SPOIL}
+    assert {*result} == {OK, BAD_Y, BAD_U, BAD_REF}
     assert sum((np.diff(law.astype(int)) != 0) & (ops[1:] == SWITCH)) == 1, (
         "a change to another law"
     )
