@@ -335,7 +335,7 @@ def shipped_law(name: str) -> str | None:
     """The text of a law of the catalogue, tuned or not; None if no law has this name."""
     for group in ("", "tuned"):
         path = files("gfm_runtime").joinpath("laws", group, f"{name}.toml")
-        if re.fullmatch("[a-z0-9-]+", name) and path.is_file():
+        if re.fullmatch("[a-z0-9-]{1,64}", name) and path.is_file():
             return path.read_text(encoding="utf-8")
     return None
 

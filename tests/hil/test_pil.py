@@ -320,9 +320,11 @@ def test_a_missing_tool_and_a_wrong_target_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(
-        UserError, match=r"pil:m3: must be pil: and one of host, clang, m4f, m7, rv"
+        UserError, match=r"pil:m0: must be pil: and one of host, clang, m4f, m7, m3, rv"
     ):
-        open_model("pil:m3", PortMap(), BenchContext())
+        open_model("pil:m0", PortMap(), BenchContext())
+    with pytest.raises(UserError, match=r"pil:s390x: has the other order of bytes"):
+        open_model("pil:s390x", PortMap(), BenchContext())
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(
         UserError, match=r"m4f: arm-none-eabi-gcc is not there; apt-get install gcc"

@@ -63,6 +63,11 @@ class PilModel:
             raise UserError(
                 f"controller pil:{target}: must be pil: and one of {', '.join(TARGETS)}"
             )
+        if TARGETS[target].order != "<":
+            raise UserError(
+                f"controller pil:{target}: has the other order of bytes than a run's frames; "
+                f"gfmhil firmware check DIR --target {target} steps it through golden rows"
+            )
         try:
             self.real = need_tools(target).real
         except LawError as problem:
