@@ -62,11 +62,11 @@ assert [getattr(inner, name) for name in _PLACES] == list(range(len(_PLACES)))
 
 
 _IN_PLACE = """\
-/* A tick is compiled in one: calls and the way through memory cost more than the sums. */
+/* A step is compiled in one: calls and the way through memory cost more than the sums. */
 #ifdef __GNUC__
-#define IN_PLACE static __attribute__((flatten))
+#define IN_PLACE __attribute__((flatten))
 #else
-#define IN_PLACE static
+#define IN_PLACE
 #endif
 """
 
@@ -140,7 +140,7 @@ class Tick:
         without_unread(self._functions, "t->")
         roots = {"s": "@P@_t", "t": "tick_t"}
         roots = roots if own else {"law": "gfm_law_t", **roots}
-        self._text = Text(real, roots, {"t->m": _PLACES}, [self.output, self.advance] * own)
+        self._text, self._own = Text(real, roots, {"t->m": _PLACES}), own
 
     @cached_property
     def members(self) -> dict[str, Array | Expr]:
@@ -161,12 +161,13 @@ class Tick:
         lines += ["} tick_t;", ""]
         if any(at == "t->m" for at in self.members):
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
-        if self._text.in_place:
+        if self._own:
             lines += [_IN_PLACE]
         functions = "\n".join(map(self._text.function, self._functions))
         return {
             "TICK": "\n".join(lines),
             "FUNCTIONS": functions,
+            "IN_PLACE": "IN_PLACE " * self._own,
             "OUTPUT": self._call(self.output, u="out"),
             "ADVANCE": self._call(self.advance),
             "LOOK": self._call(self.look),

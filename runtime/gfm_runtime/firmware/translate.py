@@ -850,7 +850,6 @@ class Text:
         real: the precision.
         roots: by the name of a pointer that functions get, in order, the type.
         indices: by place, names of its indices.
-        in_place: functions with which all that they call is compiled in one.
     """
 
     def __init__(
@@ -858,9 +857,8 @@ class Text:
         real: np.dtype[Any],
         roots: Mapping[str, str],
         indices: Mapping[str, Sequence[str]] | None = None,
-        in_place: Sequence[Function] = (),
     ) -> None:
-        self.real, self.roots, self.in_place = real, roots, in_place
+        self.real, self.roots = real, roots
         self.indices = indices or {}
         self.end = "f" if real == np.float32 else ""
 
@@ -879,11 +877,10 @@ class Text:
                 given.append(f"{constant}{p.kind} {p.place}[]")
             else:
                 given.append(f"{p.value.kind} {p.name}")
-        own = "IN_PLACE" if one in self.in_place else "static"
         names = {p.place if isinstance(p, Array) else p.name for p in one.parameters}
         lines = [f"/* {one.about} */"] if one.about else []
         lines = ["\n * ".join(textwrap.wrap(line, 97)) for line in lines]
-        lines += wrapped(f"{own} {one.kind} {one.name}({', '.join(given) or 'void'})")
+        lines += wrapped(f"static {one.kind} {one.name}({', '.join(given) or 'void'})")
         used = uses | {e.args[0].name for e in one.expressions() if e.op == "local"}
         idle = [f"    (void){name};" for name in sorted(names - used)]
         return "\n".join([*lines, "{", *idle, *self._block(one.body, names, "    "), "}", ""])

@@ -51,7 +51,7 @@ void @P@_reset(@P@_t *s)
     s->channel = -1;
 }
 
-int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+@IN_PLACE@int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 {
     tick_t t;
     real out[@GUARD@_NU];
