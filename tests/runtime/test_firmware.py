@@ -24,7 +24,7 @@ from gfm_runtime.firmware.golden import INIT, RESET, SPOIL, SPOIL_STAGE, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
 from gfm_runtime.inner import INNER_STATE, Inner, settle
-from gfm_runtime.signals import NU, NY, carried, group
+from gfm_runtime.signals import NU, NY, carried, carried_rows, command_rows, group
 from gfm_runtime.states import BAD_U, BAD_Y, OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
 
@@ -284,9 +284,9 @@ def test_a_choice_is_made(one: bool, two: bool, three: bool, calls: str) -> None
 
 def test_the_header_of_a_stage_is_the_signal_table() -> None:
     text = export(of("vsg-2 cascaded", "no stage"), T_S, "float32", "unrolled")["gfm_no_stage.h"]
-    for letter, vector in (("Y", "y"), ("U", "u")):
+    for letter, rows in (("Y", carried_rows("y", True)), ("U", command_rows(True))):
         found = re.findall(rf"^    GFM_NO_STAGE_{letter}_(\w+),", text, re.MULTILINE)
-        assert found == [name.upper() for name in carried(vector, True)]  # type: ignore[arg-type]
+        assert found == [s.name.upper() for s in rows]
     law = load_law("vsg-2", "cascaded").laws
     text = export({"x": law[0]}, T_S, "float32", "records", 120 * math.pi)["gfm_x.h"]
     assert "Inner stage at f_n = 60 Hz: cascaded, m = 1.3025651232383768, freeze = True" in text

@@ -139,7 +139,7 @@ def call_export(options: argparse.Namespace) -> int:
     for name, text in files.items():
         (options.out / name).parent.mkdir(exist_ok=True)
         write_text(options.out / name, text)
-    modules = [name for name in files if name.startswith("gfm_")]
+    modules = [name for name in files if Path(name).name.startswith("gfm_")]
     shown = [f"{len(modules)} files gfm_*"] if len(modules) > _SHOWN else modules
     print(f"{options.out}: {', '.join([*shown, *(n for n in files if n not in modules)])}")
     stale = sorted({path.name for path in options.out.glob("gfm_*.[ch]")} - set(files))

@@ -17,15 +17,15 @@
 
 void @P@_init(@P@_t *s)
 {
-    static const real u[] = {@U_DEFAULT@};
+    static const real start[] = {@U_DEFAULT@};
     int i;
 /* @if stages@ */
-    s->stage.e[0] = u[2];
+    s->stage.e[0] = start[2];
     s->stage.e[1] = @0@;
 /* @end@ */
     @P@_reset(s);
     for (i = 0; i < @N_ROWS@; i++) {
-        s->u[i] = u[i];
+        s->u[i] = start[i];
     }
 }
 
