@@ -24,7 +24,7 @@ from gfm_runtime.firmware.golden import INIT, RESET, SPOIL, SPOIL_STAGE, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
 from gfm_runtime.inner import INNER_STATE, Inner, settle
-from gfm_runtime.signals import NU, NY, carried, carried_rows, command_rows, group
+from gfm_runtime.signals import NU, NY, carried_rows, command_rows, group
 from gfm_runtime.states import BAD_U, BAD_Y, OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
 
