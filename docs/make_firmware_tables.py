@@ -15,7 +15,7 @@ from _ext.outputs import command
 from gfm_hil.core.files import write_text
 from gfm_runtime import law_names, load_law
 from gfm_runtime.firmware import FIXED, SHIPPED, TARGETS, Checked, check, export, stage_names
-from gfm_runtime.firmware.report import deviation_text
+from gfm_runtime.firmware.report import DEAD_BUS, deviation_text
 from gfm_runtime.inner_file import inner_names
 from gfm_runtime.signals import U_NAMES
 
@@ -110,7 +110,7 @@ def _fixed(folder: Path, in_float32: dict[str, Checked]) -> str:
             cells += ["{}…{}".format(*found.instructions), str(found.code)]
         cells += [deviation_text(one) for kind in kinds for one in proven[c.name][kind]]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", f"{_version('m4f')}, `-O2`.", ""])
+    return "\n".join([*lines, "", f"{_version('m4f')}, `-O2`. {DEAD_BUS}", ""])
 
 
 def _version(target: str) -> str:

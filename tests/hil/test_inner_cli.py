@@ -161,3 +161,16 @@ def test_an_operating_point_beyond_the_limit_says_what_it_needs(tmp_path, capsys
 
 def test_the_resolved_scenario_says_the_stage():
     assert 'inner = "cascaded"' in scenario_toml(load_scenario(JUMP, inner="cascaded"))
+
+
+def test_a_current_loop_too_fast_for_T_s_is_told_with_the_range_of_k_c(tmp_path, capsys):
+    """i[k+1] = i[k] - g i[k-1] is stable for g < 1: k_c < L_f / (omega_b T_s) = 0.0554 p.u."""
+    scenario = tmp_path / "slow.toml"
+    scenario.write_text(
+        'title = "slow"\nduration = 0.5\nlaw = "vsg-2"\ninner = "virtual-stator"\nT_s = 1e-3\n'
+        'link.type = "inproc"\nplant.delay.samples = 1\n'
+        '[[events]]\nt = 0.1\ntype = "reference"\nP_ref = 0.8\n'
+    )
+    run = ["run", str(scenario), "--quiet", "--no-figures", "--out", str(tmp_path / "run")]
+    assert main(run) == 3
+    assert "needs k_c below 0.0554 p.u. (it is 0.15)" in capsys.readouterr().out

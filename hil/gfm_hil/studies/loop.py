@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.closed_loop import frequencies_near as _near
 from gfm_hil.core.errors import UserError
+from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime import DiscreteLaw, law_titles, load_law
 from gfm_runtime.assembly import Controller
@@ -215,8 +217,29 @@ def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
             hz = f"{worst.frequency_hz:.4g} Hz" if worst.frequency_hz else "real"
             of = f" of {title}" if title else ""
             words = f"the linear loop{of} has an unstable mode: {hz}, {worst.sigma:+.3g} 1/s"
-            return law, words
+            return law, words + (_current_loop_too_fast(under) if alone else "")
     return None
+
+
+def _current_loop_too_fast(scenario: Scenario) -> str:
+    """What to change where the current loop of the law's inner stage is too fast for T_s, or "".
+
+    The loop on L_f alone, i[k+1] = i[k] - g i[k-d] with g = k_c omega_b T_s / L_f, is stable for
+    g below 2 sin(pi / (4 d + 2)) (Levin and May, Theor. Popul. Biol. 9, 1976).
+    """
+    (inner, *_) = (law.inner for law in load_law(scenario.law, scenario.inner).laws)
+    if inner is None:
+        return ""
+    delay = scenario.plant.delay
+    d = math.ceil(delay.samples + delay.fraction)
+    turn = 2 * math.pi * nominal_frequency(scenario) * scenario.T_s
+    most = 2 * math.sin(math.pi / (4 * d + 2)) * inner.L_f / turn
+    if inner.k_c < most:
+        return ""
+    return (
+        f"; at T_s = {1e3 * scenario.T_s:g} ms, u {d} ticks late, the current loop needs "
+        f"k_c below {most:.3g} p.u. (it is {inner.k_c:g})"
+    )
 
 
 def _figure(rows: int) -> list[Axes]:

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfm_runtime.error_maps import DVOC
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal
 from gfm_runtime.firmware.deviation import NEAR, deviations
-from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
+from gfm_runtime.firmware.fixed import FIXED, G_MOST, FixedLaw, make_fixed
 from gfm_runtime.firmware.module import (
     REALS,
     STYLES,
@@ -35,6 +36,15 @@ from gfm_runtime.signals import NU, NY, U_NAMES, carried_rows, group, table_hash
 
 FORMAT = 1  # of report.json
 _MOST_BYTES = 64 << 20
+
+
+_MOST_S = max(abs(s.low) for s in group("y") if s.name in ("p", "q"))
+#: what stands beside a bound for dvoc
+DEAD_BUS = (
+    f"dvoc: p/V^2 and q/V^2 saturate at {G_MOST:g} p.u. in fixed point, so with |p| or |q| of "
+    f"{_MOST_S:g} p.u. below V = {math.sqrt(_MOST_S / G_MOST):.2f} p.u.; float64 goes on. "
+    "Its bound is to the law with that saturation."
+)
 
 
 class Exported(NamedTuple):
@@ -263,6 +273,7 @@ def _deviation_table(laws: Sequence[Mapping[str, Any]]) -> list[str]:
         "|---" * 5 + "|",
         *map(_line, rows),
         "",
+        *([DEAD_BUS, ""] if any(law["record"]["error_map"] == DVOC for law in laws) else []),
     ]
 
 
