@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gfm_hil.modbus.droops import Gains
-from gfm_hil.modbus.image import VENDOR, Value
-from gfm_hil.modbus.plan import Function, Plan
-from gfm_hil.modbus.view import View
+from gfm_hil.ports.modbus.droops import Gains
+from gfm_hil.ports.modbus.image import VENDOR, Value
+from gfm_hil.ports.modbus.plan import Function, Plan
+from gfm_hil.ports.modbus.view import View
 from gfm_hil.scenario.events import check_reference
 from gfm_runtime.states import RUNNING
 

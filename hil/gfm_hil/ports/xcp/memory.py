@@ -56,7 +56,7 @@ OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
 
 
 class Controlled(Protocol):
-    """What the memory needs of an operator (``gfm_hil.operator.Operator``)."""
+    """What the memory needs of an operator (``gfm_hil.ports.commands.Operator``)."""
 
     def snapshot(self) -> dict[str, Any]:
         """The newest recorded tick."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.recording.timing import SLACK
 from gfm_hil.scenario.model import Scenario

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.scope.channels import Channel
-from gfm_hil.scope.record import Record
+from gfm_hil.ports.scope.channels import Channel
+from gfm_hil.ports.scope.record import Record
 
 STEP = 8  # blocks of one level in one block of the next
 _AT_ONCE = STEP**5  # most ticks processed per update

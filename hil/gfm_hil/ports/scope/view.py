@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from gfm_hil.scope.pyramid import Pyramid
-from gfm_hil.scope.trigger import HELD, IDLE, Acquisition, Trigger
+from gfm_hil.ports.scope.pyramid import Pyramid
+from gfm_hil.ports.scope.trigger import HELD, IDLE, Acquisition, Trigger
 
 HEAD = {
     "view": "the `id` of the `look` that it answers",

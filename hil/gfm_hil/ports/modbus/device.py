@@ -14,15 +14,15 @@ from typing import Any
 from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.modbus.connection import CLIENT
-from gfm_hil.modbus.curves import Droop, VoltVar
-from gfm_hil.modbus.droops import Gains
-from gfm_hil.modbus.image import VENDOR, Image, Point, Value
-from gfm_hil.modbus.measures import Measures
-from gfm_hil.modbus.operation import Direct, Heartbeat, Operation
-from gfm_hil.modbus.plan import Function, Plan, Refused
-from gfm_hil.modbus.setpoints import SetPoint
-from gfm_hil.modbus.view import Slack, View
+from gfm_hil.ports.modbus.connection import CLIENT
+from gfm_hil.ports.modbus.curves import Droop, VoltVar
+from gfm_hil.ports.modbus.droops import Gains
+from gfm_hil.ports.modbus.image import VENDOR, Image, Point, Value
+from gfm_hil.ports.modbus.measures import Measures
+from gfm_hil.ports.modbus.operation import Direct, Heartbeat, Operation
+from gfm_hil.ports.modbus.plan import Function, Plan, Refused
+from gfm_hil.ports.modbus.setpoints import SetPoint
+from gfm_hil.ports.modbus.view import Slack, View
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 

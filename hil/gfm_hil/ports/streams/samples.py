@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import Role
+from gfm_hil.ports.streams.follow import Rows
 from gfm_hil.recording.columns import recorded_in
 from gfm_hil.recording.timing import SLACK, missed
-from gfm_hil.telemetry.follow import Rows
 
 _GROUPS = ("y", "u", "true", "ref")  # prefixes that become objects
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.announcement import not_running, present
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.xcp.lines import Line, packed
+from gfm_hil.ports.xcp.memory import Memory
+from gfm_hil.ports.xcp.slave import Slave
 from gfm_hil.recording.live import LiveRun
-from gfm_hil.xcp.lines import Line, packed
-from gfm_hil.xcp.memory import Memory
-from gfm_hil.xcp.slave import Slave
 
 _LOOK_S = 0.1
 _NICENESS = 5  # the loop comes first

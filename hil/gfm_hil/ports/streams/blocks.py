@@ -17,8 +17,8 @@ import zmq
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.ports.streams.follow import Rows
 from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF, recorded_in, signals_of
-from gfm_hil.telemetry.follow import Rows
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
 _TOPIC = "gfmhil/"

@@ -15,11 +15,11 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.listener import Listener
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.listener import Listener
+from gfm_hil.ports.streams.follow import Follower
+from gfm_hil.ports.streams.metrics import METRICS
 from gfm_hil.recording.timing import ROUND_TRIP, SLACK, Spread
-from gfm_hil.telemetry.follow import Follower
-from gfm_hil.telemetry.metrics import METRICS
 from gfm_runtime.states import STATES
 
 _FRESH_S = 0.2  # for so long all scrapes get the same metrics

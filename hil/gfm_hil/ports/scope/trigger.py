@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from gfm_hil.scope.pyramid import Pyramid
+from gfm_hil.ports.scope.pyramid import Pyramid
 
 _AT_ONCE = 200_000  # most ticks searched between two pictures; older ones are skipped
 _AUTO_S = 0.5  # or a picture's length, if longer: without an edge, AUTO then shows the newest

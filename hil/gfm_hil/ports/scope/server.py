@@ -21,15 +21,15 @@ from websockets.http11 import Request, Response
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity
-from gfm_hil.core.listener import Listener
 from gfm_hil.core.supervised import supervised
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.listener import Listener
+from gfm_hil.ports.scope.access import HEADERS, Access
+from gfm_hil.ports.scope.channels import make_channels
+from gfm_hil.ports.scope.pyramid import Pyramid
+from gfm_hil.ports.scope.record import Record
+from gfm_hil.ports.scope.session import SEND_S, Session, in_words
 from gfm_hil.scenario.model import INPROC
-from gfm_hil.scope.access import HEADERS, Access
-from gfm_hil.scope.channels import make_channels
-from gfm_hil.scope.pyramid import Pyramid
-from gfm_hil.scope.record import Record
-from gfm_hil.scope.session import SEND_S, Session, in_words
 from gfm_runtime import law_titles
 from gfm_runtime.signals import group
 from gfm_runtime.states import STATES

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 from pymodbus.constants import ExcCodes
 
-from gfm_hil.modbus.image import Value
-from gfm_hil.modbus.view import View
+from gfm_hil.ports.modbus.image import Value
+from gfm_hil.ports.modbus.view import View
 
 
 class Refused(Exception):

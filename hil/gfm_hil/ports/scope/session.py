@@ -17,9 +17,9 @@ from websockets.exceptions import ConnectionClosed
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.identity import Identity, address
 from gfm_hil.core.rate import Rate
-from gfm_hil.scope.access import Access
-from gfm_hil.scope.pyramid import Pyramid
-from gfm_hil.scope.view import Look, View
+from gfm_hil.ports.scope.access import Access
+from gfm_hil.ports.scope.pyramid import Pyramid
+from gfm_hil.ports.scope.view import Look, View
 
 #: carries out an event and returns its tick; raises UserError with the reason of a refusal
 Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]

@@ -11,9 +11,9 @@ import zmq
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.supervised import attempt
-from gfm_hil.telemetry import blocks
-from gfm_hil.telemetry.follow import Follower
-from gfm_hil.telemetry.samples import Sampler
+from gfm_hil.ports.streams import blocks
+from gfm_hil.ports.streams.follow import Follower
+from gfm_hil.ports.streams.samples import Sampler
 
 _LOOK_S = 0.02
 _LINGER_MS = 500  # to send the last messages

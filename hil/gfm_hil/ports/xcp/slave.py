@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gfm_hil.core.identity import Identity, address
-from gfm_hil.xcp.memory import (
+from gfm_hil.ports.xcp.memory import (
     NOT_NOW,
     OUT_OF_RANGE,
     WRITE_PROTECTED,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import address
 from gfm_hil.links.zeromq.options import beyond_loopback
-from gfm_hil.xcp.slave import MOST, Slave
+from gfm_hil.ports.xcp.slave import MOST, Slave
 
 if TYPE_CHECKING:
     import can

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gfm_hil.modbus.image import Value
-from gfm_hil.modbus.plan import Plan
-from gfm_hil.modbus.view import View
+from gfm_hil.ports.modbus.image import Value
+from gfm_hil.ports.modbus.plan import Plan
+from gfm_hil.ports.modbus.view import View
 from gfm_hil.scenario.events import check_reference
 
 

@@ -8,8 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.modbus.image import VENDOR, Value
-from gfm_hil.modbus.view import Slack, View
+from gfm_hil.ports.modbus.image import VENDOR, Value
+from gfm_hil.ports.modbus.view import Slack, View
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import Bases, load_converter
 from gfm_plant.names import TRIPS

@@ -178,7 +178,7 @@ def definition(number: int) -> dict[str, Any]:
 def vendor_model() -> str:
     """The text of the vendor model's file, for clients."""
     name = f"model_{VENDOR}.json"
-    return files("gfm_hil.modbus").joinpath("models", name).read_text(encoding="utf-8")
+    return files("gfm_hil.ports.modbus").joinpath("models", name).read_text(encoding="utf-8")
 
 
 def _walk(group: Any, path: str) -> Iterator[tuple[str, Any]]:

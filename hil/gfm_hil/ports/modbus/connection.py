@@ -22,8 +22,8 @@ from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import SimDevice
 
 from gfm_hil.core.identity import Identity, address
-from gfm_hil.core.listener import Listener
 from gfm_hil.core.rate import Rate
+from gfm_hil.ports.listener import Listener
 
 UNIT = 1
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of the rest, unit

@@ -23,11 +23,11 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.roles import ROLES
 from gfm_hil.core.supervised import supervised
 from gfm_hil.engine.announcement import not_running, present
-from gfm_hil.modbus.connection import CLIENT, UNIT, Server
-from gfm_hil.modbus.device import TICK_S, Device
-from gfm_hil.modbus.image import BASE
-from gfm_hil.modbus.view import Watcher
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.modbus.connection import CLIENT, UNIT, Server
+from gfm_hil.ports.modbus.device import TICK_S, Device
+from gfm_hil.ports.modbus.image import BASE
+from gfm_hil.ports.modbus.view import Watcher
 from gfm_hil.scenario.model import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
