@@ -17,7 +17,7 @@ import numpy as np
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
-from gfm_hil.benchmark.rounds import RUNS, Spread, quickest, seconds, take_turns
+from gfm_hil.bench.rounds import RUNS, Spread, quickest, seconds, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench

@@ -7,8 +7,8 @@ import html
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.benchmark import tables
-from gfm_hil.benchmark.plots import figures
+from gfm_hil.bench import tables
+from gfm_hil.bench.plots import figures
 from gfm_hil.results.report import html_table
 
 _STYLE = """

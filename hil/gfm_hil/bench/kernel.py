@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_hil.benchmark.c_code import FLAGS, T_S, Drive, NoCompiler, Twin, compile_twin
-from gfm_hil.benchmark.rounds import Spread, quickest, ratio, seconds, take_turns
+from gfm_hil.bench.c_code import FLAGS, T_S, Drive, NoCompiler, Twin, compile_twin
+from gfm_hil.bench.rounds import Spread, quickest, ratio, seconds, take_turns
 from gfm_runtime import discretise, get_law
 from gfm_runtime.compiled import compiled
 from gfm_runtime.kernel import pack_law, state_dtype, step

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.benchmark.tables import Table, lockstep_name, times
+from gfm_hil.bench.tables import Table, lockstep_name, times
 from gfm_hil.core.errors import UserError
 
 BELIEVED = 0.05  # limit of a corrected p value

@@ -1,4 +1,4 @@
-/* As `drive` of gfm_hil/benchmark/kernel.py, with the generic step of gfmhil firmware export.
+/* As `drive` of gfm_hil/bench/kernel.py, with the generic step of gfmhil firmware export.
  *
  * It includes the step's source to call its parts: the kernel's step refuses no inputs, so this one
  * does not either.

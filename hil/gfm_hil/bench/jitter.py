@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.attribution import bursts
-from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.cpu_load import Load, cpu_load
-from gfm_hil.benchmark.histogram import summary
-from gfm_hil.benchmark.pair import Pair, Policy, pair
-from gfm_hil.benchmark.rounds import REST, Plan, rounds
+from gfm_hil.bench.attribution import bursts
+from gfm_hil.bench.contenders import memory_folder
+from gfm_hil.bench.cpu_load import Load, cpu_load
+from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.pair import Pair, Policy, pair
+from gfm_hil.bench.rounds import REST, Plan, rounds
 from gfm_hil.realtime.clock import now_ns, sleep_until, wait_until
 from gfm_runtime.compiled import cached
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Literal
 
-from gfm_hil.benchmark.cpu_load import Load
-from gfm_hil.benchmark.pair import Policy
+from gfm_hil.bench.cpu_load import Load
+from gfm_hil.bench.pair import Policy
 
 RUNS = 20  # in a turn
 REST = 0.15  # of a round: the kernel takes 5 % of each second from SCHED_FIFO that only spins

@@ -12,12 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.benchmark import closed_loop, inproc_loop, jitter, kernel, latency
-from gfm_hil.benchmark.c_code import FLAGS
-from gfm_hil.benchmark.contenders import FRAME, check_links
-from gfm_hil.benchmark.cpu_load import LOADS
-from gfm_hil.benchmark.pair import Policy
-from gfm_hil.benchmark.rounds import Plan
+from gfm_hil.bench import closed_loop, inproc_loop, jitter, kernel, latency
+from gfm_hil.bench.c_code import FLAGS
+from gfm_hil.bench.contenders import FRAME, check_links
+from gfm_hil.bench.cpu_load import LOADS
+from gfm_hil.bench.pair import Policy
+from gfm_hil.bench.rounds import Plan
 from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.environment import may_sched_fifo
 from gfm_runtime import get_law, law_names

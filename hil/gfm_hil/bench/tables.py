@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from gfm_hil.benchmark.histogram import SHARES
+from gfm_hil.bench.histogram import SHARES
 
 PERCENTILES = tuple(SHARES)
 

@@ -11,12 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.c_code import NoCompiler, compile_c
-from gfm_hil.benchmark.contenders import Contender, memory_folder, of_links
-from gfm_hil.benchmark.cpu_load import Load, cpu_load
-from gfm_hil.benchmark.histogram import summary
-from gfm_hil.benchmark.pair import pair
-from gfm_hil.benchmark.rounds import REST, Plan, rounds
+from gfm_hil.bench.c_code import NoCompiler, compile_c
+from gfm_hil.bench.contenders import Contender, memory_folder, of_links
+from gfm_hil.bench.cpu_load import Load, cpu_load
+from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.pair import pair
+from gfm_hil.bench.rounds import REST, Plan, rounds
 from gfm_hil.core.errors import UserError
 
 Mode = Literal["lockstep", "realtime"]

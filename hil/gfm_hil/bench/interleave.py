@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.benchmark.result import check_result, write_result
+from gfm_hil.bench.result import check_result, write_result
 from gfm_hil.core.errors import UserError
 
 KINDS = ("latency", "jitter", "kernel", "loop")

@@ -18,8 +18,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.contenders import CEnd, Contender
-from gfm_hil.benchmark.pingpong import LinkEnd
+from gfm_hil.bench.contenders import CEnd, Contender
+from gfm_hil.bench.pingpong import LinkEnd
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
 from gfm_runtime.children import end_with_parent

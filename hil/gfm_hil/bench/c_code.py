@@ -90,7 +90,7 @@ class Twin:
         return np.zeros(1, self._instance)
 
     def drive(self, name: str) -> Drive:
-        """As ``gfm_hil.benchmark.kernel.drive`` for that law, which is part of the library.
+        """As ``gfm_hil.bench.kernel.drive`` for that law, which is part of the library.
 
         Its state is an ``instance``. Arrays are passed by address, without a copy.
         """

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.c_code import load_c
-from gfm_hil.benchmark.peers import Iceoryx2Link, has_iceoryx2
-from gfm_hil.benchmark.pingpong import LONGEST, LinkEnd, Messages, frames, plain
+from gfm_hil.bench.c_code import load_c
+from gfm_hil.bench.peers import Iceoryx2Link, has_iceoryx2
+from gfm_hil.bench.pingpong import LONGEST, LinkEnd, Messages, frames, plain
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links import link_kind, open_link
@@ -102,7 +102,7 @@ class CEnd:
     def ping(
         self, stop: NDArray[np.int64], period_ns: int, duration_ns: int, took: NDArray[np.int64]
     ) -> int:
-        """Send requests; see ``gfm_hil.benchmark.pingpong``."""
+        """Send requests; see ``gfm_hil.bench.pingpong``."""
         return int(
             self._ping(
                 *self._arguments, self._size, _WORD(period_ns), _WORD(duration_ns),

@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.attribution import OURS, attribute, bursts, counts, missed_ticks
-from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.cpu_load import Load, cpu_load
-from gfm_hil.benchmark.histogram import summary
-from gfm_hil.benchmark.inproc_loop import Loop
-from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
-from gfm_hil.benchmark.pair import pair
-from gfm_hil.benchmark.rounds import RUNS, Plan, Spread, quickest, rounds
+from gfm_hil.bench.attribution import OURS, attribute, bursts, counts, missed_ticks
+from gfm_hil.bench.contenders import memory_folder
+from gfm_hil.bench.cpu_load import Load, cpu_load
+from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.inproc_loop import Loop
+from gfm_hil.bench.jitter import HYBRID, lost, pace_both, pace_here
+from gfm_hil.bench.pair import pair
+from gfm_hil.bench.rounds import RUNS, Plan, Spread, quickest, rounds
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links import link_kind, open_link

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.attribution import CAUSES
-from gfm_hil.benchmark.histogram import dense, lower_ends
-from gfm_hil.benchmark.tables import lockstep_name
+from gfm_hil.bench.attribution import CAUSES
+from gfm_hil.bench.histogram import dense, lower_ends
+from gfm_hil.bench.tables import lockstep_name
 from gfm_hil.results.figures import COLOURS, dress
 
 _GREY = "#888888"
