@@ -1,8 +1,8 @@
 from gfm_hil.core.errors import UserError as UserError
 from gfm_hil.results.run import Run as Run
 from gfm_hil.results.run import load_run as load_run
-from gfm_hil.scenario.model import Scenario as Scenario
-from gfm_hil.scenario.model import load_scenario as load_scenario
+from gfm_hil.scenario import Scenario as Scenario
+from gfm_hil.scenario import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
 from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.studies.identification import Identification as Identification

@@ -18,7 +18,7 @@ from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import draw_signals
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 COLUMNS = (*PLANT_INNER, *CONTROLLER_INNER)
 

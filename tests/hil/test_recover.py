@@ -33,7 +33,7 @@ from gfm_hil.recording.run import RecordedRun
 from gfm_hil.results.export import export_run
 from gfm_hil.results.run_folder import finish, recover
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import scenario_toml
 
 from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
 

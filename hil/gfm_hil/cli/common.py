@@ -31,7 +31,7 @@ from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages, 
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import Notice
 from gfm_hil.results.runner import Progress as TellProgress
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run

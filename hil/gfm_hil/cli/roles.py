@@ -28,7 +28,7 @@ from gfm_hil.links import link_names
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
 from gfm_runtime.errors import meant
 

@@ -28,7 +28,7 @@ from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, pre
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_external
 from gfm_hil.results.runner import Notice, external_command, run_network, run_scenario
-from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
+from gfm_hil.scenario import INPROC, Scenario, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.summary import END_METRICS
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture

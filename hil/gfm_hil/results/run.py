@@ -16,7 +16,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.run import RecordedRun, bases
 from gfm_hil.results.waveforms import three_phase
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import write_scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

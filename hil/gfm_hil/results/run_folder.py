@@ -34,8 +34,7 @@ from gfm_hil.recording.parts import check_parts, place_of, remove_parts
 from gfm_hil.recording.run import began, converters_of, read_recording, read_scenario
 from gfm_hil.results.run import Run
 from gfm_hil.results.summary import origin, stages, summarise
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import Scenario, load_scenario, write_scenario
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete

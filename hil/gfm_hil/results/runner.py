@@ -27,8 +27,7 @@ from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
 from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
 from gfm_hil.results.summary import origin, stages, summarise
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import Scenario, write_scenario
 
 __all__ = ["Notice", "Progress", "Run", "run_scenario"]
 

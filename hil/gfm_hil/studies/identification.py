@@ -44,7 +44,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.run import controlled_by
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory, run_scenario
-from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
+from gfm_hil.scenario import INPROC, Scenario, load_scenario
 from gfm_hil.studies.law import Law
 from gfm_hil.studies.loop import scenario_loop
 from gfm_plant import NoEquilibrium, make_plant

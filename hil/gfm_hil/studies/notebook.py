@@ -15,7 +15,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_in_memory, run_network_in_memory
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import execute, processes
 from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
