@@ -18,7 +18,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.models import BenchContext, PortMap, library, open_model
 from gfm_hil.models.model import ModelError
 from gfm_hil.realtime.priority import processors
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
 

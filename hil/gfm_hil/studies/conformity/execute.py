@@ -15,8 +15,8 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
 from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import (
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import (
     model_command,
     run_in_memory,
     run_network_in_memory,
@@ -396,7 +396,7 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     if job.foreign is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
         command = model_command(job.foreign.model, job.foreign.ports)
-        run = run_scenario(scenario, folder, figures=False, controller_command=command)
+        run = run_scenario(scenario, folder, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt
         return run, {}
