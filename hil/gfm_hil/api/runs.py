@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_for_model
+from gfm_hil.engine.compiling import compile_external
 from gfm_hil.engine.processes import Progress
-from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
 from gfm_hil.recording.run import Run, converters_of
 from gfm_hil.results.plots import plot, plot_laws, plot_network, plot_waveforms
 from gfm_hil.results.report import write_report
@@ -75,7 +75,7 @@ def run(
         folder: run folder, new or empty; None for a run in memory.
         controller: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, which computes u in place of the law;
             or ``pil:TARGET``, the law on a processor in QEMU. It takes a folder and a link.
-        ports: file of the map of the model's ports.
+        ports: file of the map of its ports.
         figures: in the folder, figures and report.html.
         progress: is called with the ticks done and the misses so far; with a folder.
         notice: is called with a line for a person who waits; with a folder.
@@ -90,7 +90,7 @@ def run(
         if isinstance(law, Law):
             raise UserError(f"law = {law!r}: save it first, as the folder names its file")
         checked = _checked(scenario, {**changes, "law": law})
-        command = _model_command(checked, controller, ports, notice)
+        command = _external_command(checked, controller, ports, notice)
         report = write_report if figures else None
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
     if controller is not None or ports is not None:
@@ -146,29 +146,29 @@ def _named(made: Run, law: Law) -> Run:
     return replace(made, scenario=scenario, law_text=law.to_toml())
 
 
-def _model_command(
+def _external_command(
     scenario: Scenario, controller: str | None, ports: str | Path | None, notice: Notice
 ) -> list[str]:
-    """The program that steps a model as the controller; empty without one.
+    """The program that steps an external controller; empty without one.
 
     Raises:
-        UserError: there is no such model or map, the run is in process, has no operating point, or
-            does not carry what the model measures.
+        UserError: there is no such controller or map, the run is in process, has no operating point, or
+            does not carry what it measures.
     """
     if controller is None:
         if ports is not None:
-            raise UserError("map: is of a model; name it as controller")
+            raise UserError("ports: are of an external controller; name it as controller")
         return []
     if scenario.link.type == INPROC:
         raise UserError("controller: is a process, and a run in process has none; choose a link")
     real = precision(controller)
     if not controller.startswith(PIL):
-        model_file(controller, FORMS)
+        controller_file(controller, FORMS)
     places = None if ports is None else Path(ports)
     read_map(places)
     check_currents(controller, scenario.has_inner)
-    compile_for_model(scenario, notice, real)
-    return runner.model_command(controller, places)
+    compile_external(scenario, notice, real)
+    return runner.external_command(controller, places)
 
 
 def load_run(folder: str | Path) -> Run:

@@ -14,10 +14,10 @@ from gfm_hil.cli.common import (
     print_run,
     resolve,
 )
+from gfm_hil.controllers import FORMS, BenchContext, open_controller, read_map
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links import link_names
-from gfm_hil.models import FORMS, BenchContext, open_model, read_map
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_part, run_side
@@ -48,21 +48,21 @@ def call(options: argparse.Namespace) -> int:
     given = _given(scenario, endpoints(options))
     if options.model is not None and role == "plant":
         raise UserError("--model: the plant has no model; start the controller with it")
-    model = None
+    external = None
     if options.model is not None:
         ports = read_map(options.map)
         with one_processor(scenario.mode):
-            model = open_model(options.model, ports, _bench_context(scenario))
+            external = open_controller(options.model, ports, _bench_context(scenario))
     folder = new_folder(options.out, role)
     if options.part:  # of `gfmhil run`, which puts the parts together
-        run_part(role, scenario, folder, given, model)
+        run_part(role, scenario, folder, given, external)
         return 0
 
     def notice(text: str) -> None:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
-    run = run_side(role, scenario, folder, given, notice, write_report, model)
+    run = run_side(role, scenario, folder, given, notice, write_report, external)
     if not options.quiet:
         print_run(run, folder)
     return exit_code(run)

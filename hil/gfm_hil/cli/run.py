@@ -25,8 +25,8 @@ from gfm_hil.cli.companion import companion
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
+from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
-from gfm_hil.models import PIL
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gfm_hil.controllers import ExternalController, PilController
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
@@ -20,7 +21,6 @@ from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
-from gfm_hil.models import Model, PilModel
 from gfm_hil.recording.columns import Rows
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
@@ -88,7 +88,7 @@ def run_scenario(
         return finish(scenario, folder, labels, wall_s, report, outside.get(""))
 
 
-def model_command(model: str, ports: Path | None) -> list[str]:
+def external_command(model: str, ports: Path | None) -> list[str]:
     """The ``controller_command`` of a run whose controller steps a model in place of the law.
 
     Args:
@@ -157,7 +157,7 @@ def run_side(
     endpoints: Mapping[str, str],
     notice: Notice = lambda text: None,
     report: Report | None = None,
-    model: Model | PilModel | None = None,
+    external: ExternalController | PilController | None = None,
 ) -> Run | NetworkRun:
     """Run one side alone, whose peer another process or machine runs, and leave a run folder of
     what it recorded, or one for each converter of a network.
@@ -166,7 +166,7 @@ def run_side(
         role: the side.
         scenario, folder, notice, report: as for ``run_scenario``.
         endpoints: by converter, in place of the scenario's.
-        model: computes u in place of the law.
+        external: computes u in place of the law.
 
     Raises:
         UserError: the folder is in use, no operating point, an endpoint that is occupied.
@@ -184,7 +184,7 @@ def run_side(
         for place in places.values():
             stack.enter_context(in_use(place))
         stack.enter_context(cut_short(folder))
-        run_role(role, scenario, folder, dict(endpoints), notice, model)
+        run_role(role, scenario, folder, dict(endpoints), notice, external)
         wall_s = time.monotonic() - began
         runs = {
             name: finish(bench.scenario, place, bench.controller.labels, wall_s, report)
@@ -202,13 +202,13 @@ def run_part(
     scenario: Scenario,
     folder: Path,
     endpoints: Mapping[str, str],
-    model: Model | PilModel | None,
+    external: ExternalController | PilController | None,
 ) -> None:
     """Run one side in the folder of a run that another process has started and completes."""
     with ExitStack() as stack:
         for place in _places(scenario, folder).values():
             stack.enter_context(in_use(place))
-        run_role(role, scenario, folder, dict(endpoints), lambda text: None, model)
+        run_role(role, scenario, folder, dict(endpoints), lambda text: None, external)
 
 
 def _places(scenario: Scenario, folder: Path) -> dict[str, Path]:
