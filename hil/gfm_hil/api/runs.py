@@ -152,8 +152,8 @@ def _external_command(
     """The program that steps an external controller; empty without one.
 
     Raises:
-        UserError: there is no such controller or map, the run is in process, has no operating point, or
-            does not carry what it measures.
+        UserError: there is no such controller or map, or the run is in process, has no operating
+            point, or does not carry what it measures.
     """
     if controller is None:
         if ports is not None:
