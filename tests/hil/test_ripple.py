@@ -10,7 +10,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.ripple import remaining_ripple
+from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.scenario import check_scenario, load_scenario, scenario_toml
 
 T_s, TICKS = 1e-4, 40_000
