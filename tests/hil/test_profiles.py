@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.api.runs import load_run
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.run import load_run
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import check_scenario, load_scenario
 from gfm_hil.scenario.events.grid_profile import GridProfile

@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import Impairment
-from gfm_hil.scenario.events import AnyEvent, Event
+from gfm_hil.scenario.events import AnyEvent
+from gfm_hil.scenario.events.base import Event
 from gfm_hil.scenario.events.grid_profile import LARGEST_FILE
 from gfm_hil.scenario.events.reference import check_reference, reference_field
 from gfm_hil.scenario.expectation import check_expectation
