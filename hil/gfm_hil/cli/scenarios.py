@@ -22,10 +22,10 @@ def call(options: argparse.Namespace) -> int:
                 for n, s in found.items()]  # fmt: skip
         print(json.dumps(rows, indent=2))
         return 0
-    rows = [
+    lines = [
         (name, s.mode, ", ".join(Path(law).name for law in s.laws()), f"{s.duration:g}", s.title)
         for name, s in found.items()
     ]
     heads = ("scenario", "mode", "laws", "s", "title")
-    terminal().print(Table(heads, rows, text=None, fold=2))
+    terminal().print(Table(heads, lines, text=None, fold=2))
     return 0

@@ -55,5 +55,6 @@ def inline(picture: Path | bytes, kind: str = "") -> str:
         kind: png or svg+xml of a content.
     """
     if isinstance(picture, Path):
-        picture, kind = picture.read_bytes(), {".png": "png", ".svg": "svg+xml"}[picture.suffix]
+        kind = {".png": "png", ".svg": "svg+xml"}[picture.suffix]
+        picture = picture.read_bytes()
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
