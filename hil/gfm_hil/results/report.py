@@ -167,7 +167,9 @@ def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def _events(events: Sequence[dict[str, Any]]) -> Table:
     """What each event brought: a column each, or a row each if there are many."""
     columns = event_rows(events)
-    rows: list[list[Any]] = [[title, *(event.get(name) for event in events)] for name, title in columns]
+    rows: list[list[Any]] = [
+        [title, *(event.get(name) for event in events)] for name, title in columns
+    ]
     if len(events) > len(columns):
         rows = [list(row) for row in zip(*rows, strict=True)]
     return Table(rows[0] if rows else (), rows[1:])
