@@ -15,6 +15,7 @@ from typing import Any
 from gfm_hil.core import blas as _blas  # noqa: F401  before NumPy is first imported
 
 _HOMES = {
+    "Watch": "gfm_hil.studies.workers",
     "UserError": "gfm_hil.core.errors",
     "load_run": "gfm_hil.results.run",
     "NetworkRun": "gfm_hil.results.network_run",
@@ -22,22 +23,22 @@ _HOMES = {
     "load_scenario": "gfm_hil.scenario.model",
     "Scenario": "gfm_hil.scenario.model",
     "CampaignResult": "gfm_hil.studies.campaign.result",
-    "Identification": "gfm_hil.studies.identification",
-    "identify": "gfm_hil.studies.identification",
-    "Law": "gfm_hil.studies.law",
-    "laws": "gfm_hil.studies.law",
-    "Loop": "gfm_hil.studies.loop",
-    "run": "gfm_hil.studies.notebook",
-    "run_network": "gfm_hil.studies.notebook",
-    "campaign": "gfm_hil.studies.notebook",
-    "compare": "gfm_hil.studies.notebook",
-    "conform": "gfm_hil.studies.notebook",
+    "FrequencyScan": "gfm_hil.studies.scan",
+    "scan": "gfm_hil.api.studies",
+    "identify": "gfm_hil.api.studies",
+    "Law": "gfm_hil.api.law",
+    "laws": "gfm_hil.api.law",
+    "run": "gfm_hil.api.studies",
+    "run_network": "gfm_hil.api.studies",
+    "campaign": "gfm_hil.api.studies",
+    "compare": "gfm_hil.api.studies",
+    "conform": "gfm_hil.api.studies",
     "Conformity": "gfm_hil.studies.conformity.result",
-    "Comparison": "gfm_hil.studies.notebook",
+    "Comparison": "gfm_hil.api.studies",
     "LawError": "gfm_runtime.errors",
 }
 
-_MODULES = ("design", "envelopes")
+_MODULES = ("design", "envelopes", "plot")
 
 __all__ = sorted([*_HOMES, *_MODULES])
 

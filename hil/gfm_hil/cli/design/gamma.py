@@ -21,8 +21,8 @@ from gfm_hil.cli.design.common import (
     singular_is_users,
 )
 from gfm_hil.core.terminal import terminal
-from gfm_hil.studies.design import gamma
-from gfm_hil.studies.law import Law
+from gfm_hil.api.design import gamma
+from gfm_hil.api.law import Law
 
 
 def add(kinds: Any) -> None:

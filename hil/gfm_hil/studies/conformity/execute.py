@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled
 from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import (
+    Notice,
     model_command,
     run_in_memory,
     run_network_in_memory,
@@ -24,19 +24,25 @@ from gfm_hil.results.runner import (
 )
 from gfm_hil.scenario.model import Link, Scenario
 from gfm_hil.scenario.toml_out import write_scenario
-from gfm_hil.studies.campaign.execute import WorkerLost, processes
-from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, judge_nfp, worst
-from gfm_hil.studies.conformity.model import Criterion, Declared, InEnvelope, Nfp, Part, UnderTest
+from gfm_hil.studies.conformity.criteria import BY_KIND
+from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.judge import cannot, judge
+from gfm_hil.studies.conformity.model import Part
 from gfm_hil.studies.conformity.sets import Case, scenario_of
-from gfm_hil.studies.envelopes import measure_unit
-from gfm_hil.studies.identification import identify
+from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
+from gfm_hil.studies.workers import (
+    RunFailed,
+    Watch,
+    WorkerLost,
+    pool_of,
+    run_tasks,
+)
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 
 if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture
-
-_POLL_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -98,9 +104,6 @@ class Job:
         return "/".join(x for x in (self.case.id, self.part.name) if x)
 
 
-_CAUSES = {"no_trip": 0, "stays_in_step": 1}  # kinds of criteria
-
-
 @dataclass(frozen=True)
 class Found:
     """What became of a part of a test under a law.
@@ -138,7 +141,7 @@ class Found:
         """The clauses that make it not pass; the one first that says most about why: a trip, or a
         loss of step, explains whatever comes after it."""
         told = [v for v in self.verdicts if v.verdict == self.verdict != PASS]
-        return sorted(told, key=lambda v: _CAUSES.get(v.kind, len(_CAUSES)))
+        return sorted(told, key=lambda v: BY_KIND[v.kind].explains)
 
     @property
     def cause(self) -> Verdict | None:
@@ -206,54 +209,40 @@ def make_jobs(
     ]
 
 
-def execute(
-    jobs: Sequence[Job],
-    workers: int,
-    keep: Callable[[Found], None],
-    stopped: Callable[[], bool] = lambda: False,
-    notice: Callable[[str], None] = lambda text: None,
-) -> None:
-    """Run all jobs, or until ``stopped``.
-
-    Args:
-        jobs: what to run.
-        workers: processes; 1 runs all in this one.
-        keep: given every finished part.
-        stopped: asked after each part, or a few times a second.
-        notice: told what a person should know while waiting.
+def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[Found]:
+    """What becomes of all jobs; 1 worker runs all in this process.
 
     Raises:
+        UserError: so many workers cannot be.
         WorkerLost: a worker died, or a run raised an error.
+        KeyboardInterrupt: the watch stopped it before its end.
     """
-    if workers == 1:
-        for job in jobs:
-            if stopped():
-                return
-            keep(run_part(job))
-        return
-    _compile_once(jobs, notice)
-    with ExitStack() as stack:
-        pool: Executor = stack.enter_context(processes(workers))
-        pending = {pool.submit(run_part, job): job for job in jobs}
-        try:
-            while pending and not stopped():
-                done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-                for future in done:
-                    _finish(future, pending.pop(future), keep)
-        finally:
-            for future in pending:
-                future.cancel()
+    found: list[Found] = []
+
+    def keep(one: Found) -> None:
+        found.append(one)
+        bad = sum(f.verdict in (FAIL, CANNOT) for f in found)
+        words = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
+        watch.progress(len(found), len(jobs), words)
+
+    lost = None
+    try:
+        if workers > 1:
+            compile_once(jobs, watch.notice)
+        with pool_of(workers) as pool:
+            run_tasks(run_part, jobs, pool, workers, keep, watch.stopped)
+    except WorkerLost as problem:
+        lost = problem
+    except KeyboardInterrupt:  # of a second signal: the runs under way are lost
+        if not watch.stopped():
+            raise
+    if len(found) < len(jobs):
+        done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
+        raise WorkerLost(f"{lost}; {done}") if lost else KeyboardInterrupt(f"interrupted; {done}")
+    return found
 
 
-def _finish(future: Future[Found], job: Job, keep: Callable[[Found], None]) -> None:
-    problem = future.exception()
-    if problem is not None:
-        words = f"{job.law}, {job.name}: {type(problem).__name__}: {problem}"
-        raise WorkerLost(words) from problem
-    keep(future.result())
-
-
-def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
+def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
     seen: set[tuple[bool, int, bool]] = set()
     for job in jobs:
@@ -289,22 +278,39 @@ def _scenario(job: Job) -> Scenario:
 
 
 def run_part(job: Job) -> Found:
-    """Run, judge and draw a part; what cannot be run cannot be judged."""
-    test, part = job.case.test, job.part
-    criteria = [*test.criteria, *part.criteria]
-    names = job.law, job.case.id, part.name
-    if part.cannot is not None:
-        reason = f"Cannot be judged: {part.cannot}"
+    """Run, judge and draw a part; what cannot be run cannot be judged.
+
+    Raises:
+        RunFailed: an error of the program; the message names law and test.
+    """
+    try:
+        return _run_part(job)
+    except Exception as problem:
+        words = f"{job.law}, {job.name}: {type(problem).__name__}: {problem}"
+        raise RunFailed(words) from problem
+
+
+def _run_part(job: Job) -> Found:
+    criteria = [*job.case.test.criteria, *job.part.criteria]
+    names = job.law, job.case.id, job.part.name
+    if job.part.cannot is not None:
+        reason = f"Cannot be judged: {job.part.cannot}"
         return Found(*names, "none", reason, cannot(criteria, reason))
-    if isinstance(criteria[0], Nfp):
-        return _plot(job, criteria[0])
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
+            if isinstance(criteria[0], Nfp):
+                return _scan(job, criteria[0], scenario)
             run, others = _run(job, scenario, stack)
         except UserError as problem:
-            return _no_run(job, criteria, problem)
-        verdicts = judge(run, criteria, _declared(job, scenario, criteria), others)
+            text = str(problem).replace("\n", "; ").replace(job.file, job.law)
+            reason = f"Cannot be judged: there is no such run: {text}"
+            return Found(*names, "none", reason, cannot(criteria, reason))
+        under = job.under
+        if job.foreign is None:  # a controller that is not ours runs over a link alone
+            for criterion in criteria:
+                under = criterion.declared(under, scenario)
+        verdicts = judge(run, criteria, under, others)
         again, figure = "", None
         if job.folder is not None:
             place = _place(job.folder, job, scenario)
@@ -317,53 +323,22 @@ def run_part(job: Job) -> Found:
         return Found(*names, run.status, reason, verdicts, again, figure)
 
 
-def _declared(job: Job, scenario: Scenario, criteria: Sequence[Criterion]) -> UnderTest:
-    """What the owner declares, with the unit that is measured where it is asked for."""
-    under = job.under
-    if under.unit is not None or not any(isinstance(c, InEnvelope) for c in criteria):
-        return under
-    if job.foreign is not None:  # which runs over a link alone
-        return under
-    try:
-        found = measure_unit(None, scenario)
-    except UserError:
-        return under
-    unit = Declared(D=found.D, H=found.H, X_eff=found.X_eff)
-    return under.model_copy(update={"unit": unit})
-
-
-def _plot(job: Job, asked: Nfp) -> Found:
+def _scan(job: Job, asked: Nfp, scenario: Scenario) -> Found:
     """Measure, judge and draw a network-frequency-perturbation plot."""
     foreign = job.foreign
-    try:
-        scenario = _scenario(job)
-        found = identify(
-            None, scenario, start_hz=asked.from_hz, stop_hz=asked.to_hz, points=asked.points,
-            controller_command=model_command(foreign.model, foreign.ports) if foreign else (),
-        )  # fmt: skip
-    except UserError as problem:
-        return _no_run(job, [asked], problem)
+    found = asked.scan(scenario, model_command(foreign.model, foreign.ports) if foreign else ())
+    verdicts = asked.judge_scan(found)
     again, figure = "", None
     if job.folder is not None:
         place = _place(job.folder, job, scenario)
         if foreign is None:
-            again = shlex.join(
-                ["gfmhil", "identify", str(place / "scenario.toml"), "--from", f"{asked.from_hz:g}",
-                 "--to", f"{asked.to_hz:g}", "--points", str(asked.points)]
-            )  # fmt: skip
+            again = shlex.join(asked.again(str(place / "scenario.toml")))
         if job.figures:
             from gfm_hil.studies.conformity.figure import draw_plot
 
-            figure = draw_plot(place / "figure.png", _title(job, scenario), found, asked)
-    verdicts = judge_nfp(found.frequency, found.nfp, asked)
+            title = _title(job, scenario)
+            figure = draw_plot(place / "figure.png", title, found, asked, verdicts)
     return Found(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
-
-
-def _no_run(job: Job, criteria: Sequence[Criterion], problem: UserError) -> Found:
-    text = str(problem).replace("\n", "; ").replace(job.file, job.law)
-    reason = f"Cannot be judged: there is no such run: {text}"
-    told = cannot(criteria, reason)
-    return Found(job.law, job.case.id, job.part.name, "none", reason, told)
 
 
 def _title(job: Job, scenario: Scenario) -> str:
