@@ -1,10 +1,3 @@
-from gfm_hil.core.errors import UserError as UserError
-from gfm_hil.results.run import Run as Run
-from gfm_hil.results.run import load_run as load_run
-from gfm_hil.scenario.model import Scenario as Scenario
-from gfm_hil.scenario.model import load_scenario as load_scenario
-from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
-from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.api.law import Law as Law
 from gfm_hil.api.law import laws as laws
 from gfm_hil.api.studies import Comparison as Comparison
@@ -15,6 +8,13 @@ from gfm_hil.api.studies import identify as identify
 from gfm_hil.api.studies import run as run
 from gfm_hil.api.studies import run_network as run_network
 from gfm_hil.api.studies import scan as scan
+from gfm_hil.core.errors import UserError as UserError
+from gfm_hil.results.run import Run as Run
+from gfm_hil.results.run import load_run as load_run
+from gfm_hil.scenario.model import Scenario as Scenario
+from gfm_hil.scenario.model import load_scenario as load_scenario
+from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
+from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.studies.scan import FrequencyScan as FrequencyScan
 from gfm_hil.studies.workers import Watch as Watch
 from gfm_runtime.errors import LawError as LawError

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gfmhil
+from gfm_hil.api.law import as_law
 from gfm_hil.results.cycles import cycle_means
 from gfm_hil.results.metrics import METRICS, event_metrics
 from gfm_hil.results.modes import Acting, acting, fast_mode, free_from, swing
 from gfm_hil.scenario.model import check_scenario
-from gfm_hil.studies.law import as_law
 
 T_s, F_N = 1e-3, 50.0
 COLUMNS = ("true_p", "true_omega_u", "true_V", "true_i")

@@ -11,6 +11,7 @@ import numpy as np
 
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.least_stable import least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
 from gfm_design.norms.weights import read_weights
@@ -19,7 +20,6 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
-from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.scenario.model import Scenario, load_scenario
@@ -270,8 +270,8 @@ def margins(
     loop = as_law(law).closed_loop(on, **more)
     if loop.around is not None:
         raise UserError(
-            f"{title_of(loop)}: ranges of elements and grids are those of one converter on its line;"
-            " Law.closed_loop(...).margins() has the other margins"
+            f"{title_of(loop)}: ranges of elements and grids are those of one converter on its"
+            " line; Law.closed_loop(...).margins() has the other margins"
         )
     return _margins(loop)
 

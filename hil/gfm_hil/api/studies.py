@@ -350,6 +350,7 @@ def measure_unit(
         LawError: the law is none.
     """
     with law_files([] if law is None else [law]) as files:
-        named = {"law": file for file in files.values()}
-        scenario = load_scenario(on, in_process=True, **{**changes, **named})
+        for file in files.values():
+            changes = {**changes, "law": file}
+        scenario = load_scenario(on, in_process=True, **changes)
         return envelopes.measure_unit(scenario, degrees, seconds)

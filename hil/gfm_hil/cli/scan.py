@@ -67,7 +67,9 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     if options.command == "identify":
-        print("gfmhil identify is gfmhil scan now; this name goes with version 0.3", file=sys.stderr)
+        print(
+            "gfmhil identify: is gfmhil scan now; this name goes with version 0.3", file=sys.stderr
+        )
     law, scenario = _which(options.what, options.scenario)
     folder = new_folder(options.out, f"scan-{Path(options.what).stem}")
     check_empty(folder)

@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from gfm_design.tuning.paper_tune import EVALUATIONS
+from gfm_hil.api.design import NotTuned, Tuning, tune
+from gfm_hil.api.law import Law
+from gfm_hil.api.tuned_law import problem_name, write_law
 from gfm_hil.cli.common import EXIT_OTHERWISE, watching
 from gfm_hil.cli.design.common import (
     add_judged_on,
@@ -23,9 +26,6 @@ from gfm_hil.cli.design.common import (
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.scenario.model import Scenario
-from gfm_hil.api.design import NotTuned, Tuning, tune
-from gfm_hil.api.law import Law
-from gfm_hil.api.tuned_law import problem_name, write_law
 
 
 def add(kinds: Any) -> None:

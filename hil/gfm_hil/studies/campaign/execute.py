@@ -1,5 +1,4 @@
-"""A campaign: checked, run in chunks on the cores of this machine or on a Dask cluster; what is done
-is kept."""
+"""A campaign: checked, and run in chunks on the cores of this machine or on a Dask cluster."""
 
 from __future__ import annotations
 

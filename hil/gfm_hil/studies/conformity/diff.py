@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
 from gfm_hil.results.report import cell
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_hil.studies.conformity.result import document, status, table
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_runtime.errors import printable
 
 Change = Literal["worse", "better", "gone", "new", "moved"]

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
-from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
+from gfm_hil.engine.compiling import compile_external, compiled_bench, compiled_benches
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import (
     Notice,
-    model_command,
+    external_command,
     run_in_memory,
     run_network_in_memory,
     run_scenario,
@@ -67,7 +67,7 @@ class Foreign:
         """
         if self.model.startswith(PIL):
             return self.model
-        kind, path = model_file(self.model)
+        kind, path = controller_file(self.model)
         return f"{kind}:{path.name}"
 
 
@@ -164,7 +164,7 @@ def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign |
             raise UserError(f"map {ports}: {model} has our signals, and takes no map")
         precision(model)
         return Foreign(model)
-    kind, path = model_file(model, FORMS)
+    kind, path = controller_file(model, FORMS)
     file = None if ports is None else Path(ports).absolute()
     read_map(file)
     return Foreign(f"{kind}:{path}", file)
@@ -255,7 +255,7 @@ def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
                 continue
             if job.foreign is not None:
                 compiled_bench(scenario, notice, ("plant",))
-                compile_for_model(scenario, notice)
+                compile_external(scenario, notice)
             else:
                 (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
             seen.add(kind)
@@ -326,7 +326,7 @@ def _run_part(job: Job) -> Found:
 def _scan(job: Job, asked: Nfp, scenario: Scenario) -> Found:
     """Measure, judge and draw a network-frequency-perturbation plot."""
     foreign = job.foreign
-    found = asked.scan(scenario, model_command(foreign.model, foreign.ports) if foreign else ())
+    found = asked.scan(scenario, external_command(foreign.model, foreign.ports) if foreign else ())
     verdicts = asked.judge_scan(found)
     again, figure = "", None
     if job.folder is not None:
@@ -370,7 +370,7 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     """
     if job.foreign is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        command = model_command(job.foreign.model, job.foreign.ports)
+        command = external_command(job.foreign.model, job.foreign.ports)
         run = run_scenario(scenario, folder, figures=False, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt

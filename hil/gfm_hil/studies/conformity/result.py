@@ -19,6 +19,9 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import printed
 from gfm_hil.results.report import STYLE, cell, figure, finite
 from gfm_hil.studies.conformity.execute import Found, slug
+from gfm_hil.studies.conformity.model import KNOWN
+from gfm_hil.studies.conformity.sets import Case
+from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     FAIL,
@@ -29,9 +32,6 @@ from gfm_hil.studies.conformity.verdict import (
     Verdict,
     worst,
 )
-from gfm_hil.studies.conformity.model import KNOWN
-from gfm_hil.studies.conformity.sets import Case
-from gfm_hil.studies.conformity.under_test import UnderTest
 
 #: characters that XML cannot hold, not even escaped
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

@@ -17,7 +17,7 @@ from gfm_hil.studies.conformity.criteria.settles import Settles
 from gfm_hil.studies.conformity.criteria.stays_in_step import InStep
 from gfm_hil.studies.conformity.criteria.stays_within import StaysWithin
 
-Criterion = Annotated[
+_ALL = (
     StaysWithin
     | Settles
     | PeakDelta
@@ -28,9 +28,10 @@ Criterion = Annotated[
     | NoOscillation
     | InStep
     | InEnvelope
-    | Nfp,
-    Field(discriminator="kind"),
-]
+    | Nfp
+)
+
+Criterion = Annotated[_ALL, Field(discriminator="kind")]
 
 #: by kind
-BY_KIND = {one.model_fields["kind"].annotation.__args__[0]: one for one in get_args(get_args(Criterion)[0])}
+BY_KIND = {get_args(one.model_fields["kind"].annotation)[0]: one for one in get_args(_ALL)}
