@@ -8,6 +8,7 @@ import math
 import shlex
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -25,17 +26,10 @@ from gfm_hil.results.runner import run_in_memory
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies import envelopes
-from gfm_hil.studies.conformity.judge import (
-    CANNOT,
-    FAIL,
-    INFORMATIVE,
-    PASS,
-    Verdict,
-    judge,
-    judge_nfp,
-    worst,
-)
-from gfm_hil.studies.conformity.model import Criterion, Declared, Nfp, Part
+from gfm_hil.studies.conformity.criteria import Criterion
+from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.judge import judge
+from gfm_hil.studies.conformity.model import Part
 from gfm_hil.studies.conformity.sets import (
     Case,
     load_cases,
@@ -44,7 +38,7 @@ from gfm_hil.studies.conformity.sets import (
     scenario_of,
     shipped_sets,
 )
-from gfm_hil.studies.envelopes import measure_unit
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict, worst
 from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 from gfm_plant.options import Grid
@@ -325,7 +319,7 @@ def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_co
     X_p = load_converter("paper").pu()["L_f"]
     assert found.value == pytest.approx(math.sin(math.radians(10)) / (X_p + 1 / scr), rel=5e-3)
 
-    unit = measure_unit(swing, references__P_ref=0.0, plant=plant)
+    unit = gfmhil.envelopes.measure_unit(swing, references__P_ref=0.0, plant=plant)
     assert pytest.approx([D, H], rel=0.01) == [unit.D, unit.H]
 
 
@@ -581,7 +575,7 @@ def test_wrong_test_files_are_told_in_one_line(
         (["--against", "misso"], "did you mean"),
         (["--law", "drop-3"], "drop-3"),
         (["--law", "droop-3", "--inner", "stator"], "stator"),
-        (["--law", "droop-3", "--workers", "0"], "--workers 0"),
+        (["--law", "droop-3", "--workers", "0"], "workers = 0"),
         (["--law", "droop-3", "--converter", "nowhere.toml"], "nowhere.toml"),
         ([], "--law"),
         (["--controller", "vsg-2.so"], "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
@@ -683,7 +677,7 @@ def test_a_plot_is_judged_in_its_bands(band: dict[str, Any], verdict: str, at: A
     hz = np.array([0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0])
     nfp = 50.0 / (1.0 + 1j * hz / 10.0)
     asked = {"from_hz": 1.0, "to_hz": 10.0, **band}
-    (found,) = judge_nfp(hz, nfp, nfp_of(bands=[asked]))
+    (found,) = nfp_of(bands=[asked]).judge_scan(SimpleNamespace(frequency=hz, nfp=nfp))
     assert found.verdict == verdict
     if at is not None:
         x = np.degrees(np.angle(nfp)) if "phase" in next(iter(band)) else np.abs(nfp)
@@ -725,7 +719,7 @@ def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
     assert [v.verdict for v in part.verdicts] == [PASS, FAIL, FAIL]
     report = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert report.count("<figure") == 1 and report.count("<svg") == 2
-    assert "gfmhil identify" in report
+    assert "gfmhil scan" in report
 
 
 def test_a_plot_without_known_limits_is_drawn_and_informative(tmp_path: Path) -> None:
@@ -763,7 +757,7 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
     event: dict[str, Any], answer: Any, factor: float, verdict: str
 ) -> None:
     """On p as it is; the mean over a cycle moves it by less than the envelope is wide."""
-    unit = Declared(D=150.0, H=5.0, X_eff=0.6 - 1 / 3)
+    unit = envelopes.Unit(D=150.0, H=5.0, X_eff=0.6 - 1 / 3)
     under = UNDER.model_copy(update={"unit": unit, "droop": math.inf})
     scenario = Scenario.model_validate(
         {
@@ -772,7 +766,7 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
         }
     )  # fmt: skip
     t = np.arange(40_000) * 1e-4 - 1.0
-    change = answer(envelopes.Unit(unit.D, unit.H, unit.X_eff), np.maximum(t, 0.0))
+    change = answer(unit, np.maximum(t, 0.0))
     run = run_of(scenario, p=0.5 + factor * np.where(t >= 0, change, 0.0))
     asked = one("in_envelope")
     (found,) = judge(run, [asked], under)
@@ -786,7 +780,7 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
 
 
 def test_the_envelope_of_a_ramp_is_not_for_a_converter_with_droop(ramp: Scenario) -> None:
-    under = UNDER.model_copy(update={"unit": Declared(D=150.0, H=5.0, X_eff=0.3)})
+    under = UNDER.model_copy(update={"unit": envelopes.Unit(D=150.0, H=5.0, X_eff=0.3)})
     t = np.arange(ramp.ticks) * ramp.T_s
     omega_g = 1.0 - 0.01 * np.clip((t - 2.0) / 0.5, 0.0, 1.0)
     grid = ramp.plant.model_copy(update={"grid": Grid(scr=3.0, x_over_r=6.0)})
@@ -811,7 +805,7 @@ def test_an_envelope_without_finite_limits_is_no_verdict() -> None:
             "events": [{"t": 1.0, "type": "grid-frequency", "f_hz": 49.0, "rate": 1.0}],
         }
     )  # fmt: skip
-    unit = Declared(D=100.0, H=1e-9, X_eff=0.27)
+    unit = envelopes.Unit(D=100.0, H=1e-9, X_eff=0.27)
     under = UNDER.model_copy(update={"unit": unit})
     (found,) = judge(run_of(scenario, p=np.full(40_000, 0.5)), [one("in_envelope")], under)
     assert found.verdict == CANNOT and "no finite limits at H = 1e-09 s" in found.text

@@ -17,7 +17,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.studies.campaign.axes import find_axes
-from gfm_hil.studies.campaign.loading import load_campaign
+from gfm_hil.studies.campaign.loading import Tell, load_campaign
 from gfm_hil.studies.campaign.result import CampaignResult, verdict
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
@@ -55,7 +55,7 @@ def run_campaign(
         with contextlib.ExitStack() as stack:
             # workers import while the runs are checked
             pool = None if dask else stack.enter_context(pool_of(workers))
-            campaign = load_campaign(given, laws, changes, partial(_tell_checks, watch, began))
+            campaign = load_campaign(given, laws, changes, tell_checks(watch))
             axes = find_axes(campaign, x, y)
             if dask:  # before anything is written
                 pool, workers = stack.enter_context(cluster(dask, campaign))
@@ -80,12 +80,20 @@ def run_campaign(
     return found
 
 
-def _tell_checks(watch: Watch, began: float, done: int, of: int) -> None:
-    if watch.stopped():
-        raise KeyboardInterrupt
-    watch.progress(done, of, "checking the runs")
-    if done == of // 2 and time.monotonic() - began > _PATIENCE_S:
-        watch.notice(f"checking the runs: {done} of {of} done …")
+def tell_checks(watch: Watch) -> Tell:
+    """What tells a watch of the checks of a campaign, in a line once they take long."""
+    began, told = time.monotonic(), False
+
+    def tell(done: int, of: int) -> None:
+        nonlocal told
+        if watch.stopped():
+            raise KeyboardInterrupt
+        watch.progress(done, of, "checking the runs")
+        if not told and time.monotonic() - began >= _PATIENCE_S:
+            told = True
+            watch.notice(f"checking the runs: {done} of {of} done …")
+
+    return tell
 
 
 def _execute(
