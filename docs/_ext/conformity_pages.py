@@ -28,8 +28,8 @@ def keys() -> str:
     """The tables of a test file and of a converter under test."""
     tables = (
         ("top level", model.Test),
-        ("[source]", model.Source),
-        ("[[parts]]", model.Part),
+        ("[source]", model.Publication),
+        ("[[parts]]", model.TestPart),
         ("the file of the converter under test", UnderTest),
     )
     return "\n".join(

@@ -29,7 +29,7 @@ from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
 from gfm_hil.studies.conformity.judge import judge
-from gfm_hil.studies.conformity.model import Part
+from gfm_hil.studies.conformity.model import TestPart
 from gfm_hil.studies.conformity.sets import (
     Case,
     load_cases,
@@ -715,7 +715,7 @@ def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
     text = ", ".join("{" + ", ".join(f"{k} = {v}" for k, v in b.items()) + "}" for b in bands)
     (tmp_path / "plot.toml").write_text(f"{NFP}bands = [{text}]")
     found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
-    (part,) = found.found
+    (part,) = found.parts
     assert [v.verdict for v in part.verdicts] == [PASS, FAIL, FAIL]
     report = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert report.count("<figure") == 1 and report.count("<svg") == 2
@@ -819,7 +819,7 @@ def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
     asked = {"law": "vsg-2", "against": lab, "inner": "virtual-stator"}
     own = gfmhil.conform(**asked, folder=lab.parent / "out")
     assert own.matrix == {("vsg-2", "lab/jump"): PASS}
-    assert "the envelope of D = 1" in own.found[0].verdicts[0].text  # 1 % droop: D = 100
+    assert "the envelope of D = 1" in own.parts[0].verdicts[0].text  # 1 % droop: D = 100
     (figure,) = (lab.parent / "out").rglob("figure.png")
     assert figure.stat().st_size > 10_000
     declared = lab.parent / "light.toml"
@@ -834,7 +834,7 @@ def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
 
 def test_parts_without_a_criterion_are_refused() -> None:
     with pytest.raises(ValueError, match="neither scenario nor criteria"):
-        Part(name="a", cannot="why", scenario={"duration": 1.0})
+        TestPart(name="a", cannot="why", scenario={"duration": 1.0})
     with pytest.raises(UserError, match="must be one of"):
         load_cases(["nowhere"])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult
-from gfm_hil.studies.conformity.execute import execute, foreign_controller, make_jobs
+from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test
 from gfm_hil.studies.envelopes import Unit
@@ -79,35 +79,23 @@ def _named(made: Run, law: Law) -> Run:
     return replace(made, scenario=scenario, law_text=law.to_toml())
 
 
-@dataclass(frozen=True, repr=False)
-class Comparison(Mapping[str, Run]):
+class Comparison(dict[str, Run]):
     """Runs of one scenario by the name of their law."""
-
-    runs: dict[str, Run]
-
-    def __getitem__(self, law: str) -> Run:
-        return self.runs[law]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.runs)
-
-    def __len__(self) -> int:
-        return len(self.runs)
 
     @property
     def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
         """The metrics of each run by law, see ``Run.metrics``."""
-        return {law: one.metrics for law, one in self.runs.items()}
+        return {law: one.metrics for law, one in self.items()}
 
     @property
     def summaries(self) -> dict[str, dict[str, Any]]:
         """The summary of each run by law: the content of comparison.json."""
-        return {law: one.summary for law, one in self.runs.items()}
+        return {law: one.summary for law, one in self.items()}
 
     @property
     def events(self) -> list[dict[str, Any]]:
         """Those of the summary of the run that came furthest."""
-        return max((one.summary["events"] for one in self.runs.values()), key=len)
+        return max((one.summary["events"] for one in self.values()), key=len)
 
     def plot(self) -> list[Axes]:
         """p, frequency, q and v_dc of all laws in one figure."""
@@ -115,8 +103,8 @@ class Comparison(Mapping[str, Run]):
 
         from gfm_hil.results import figures
 
-        first = next(iter(self.runs.values()))
-        columns = {law: one.columns for law, one in self.runs.items()}
+        first = next(iter(self.values()))
+        columns = {law: one.columns for law, one in self.items()}
         figure = pyplot.figure(figsize=figures.SIZE_LAWS, layout="constrained")
         return figures.draw_laws(figure, first.scenario, columns, self.events)
 
@@ -124,14 +112,14 @@ class Comparison(Mapping[str, Run]):
         """Write comparison.json, and comparison.png of the runs that recorded anything."""
         from gfm_hil.results.figures import draw_comparison
 
-        first = next(iter(self.runs.values()))
-        signals = {law: one.columns for law, one in self.runs.items() if "true_p" in one.columns}
+        first = next(iter(self.values()))
+        signals = {law: one.columns for law, one in self.items() if "true_p" in one.columns}
         if signals:
             draw_comparison(folder / "comparison.png", first.scenario, signals, self.events)
         write_text(folder / "comparison.json", json.dumps(self.summaries, indent=2) + "\n")
 
     def __repr__(self) -> str:
-        lines = [f"  {law}: {one.status}" for law, one in self.runs.items()]
+        lines = [f"  {law}: {one.status}" for law, one in self.items()]
         return "\n".join(["<Comparison", *lines, ">"])
 
 
@@ -267,8 +255,8 @@ def conform(
     """
     check_workers(workers)
     given = [law] if isinstance(law, str | Path | Law) else list(law)
-    foreign = foreign_controller(controller, ports)
-    if not given and foreign is None:
+    external = external_controller(controller, ports)
+    if not given and external is None:
         raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
     place = None if folder is None else Path(folder)
@@ -281,9 +269,9 @@ def conform(
         for file in files.values():
             law_file(file)
         converters = Path(temporary) if place is None else place / "converters"
-        jobs = make_jobs(files, cases, inner, under, converters, place, figures, foreign)
+        jobs = make_jobs(files, cases, inner, under, converters, place, figures, external)
         found = execute(jobs, workers, watch)
-    names = [*files, *([foreign.name] if foreign else [])]
+    names = [*files, *([external.name] if external else [])]
     made = Conformity(names, inner, under, cases, found, place)
     if place is not None:
         made.write(place)

@@ -17,7 +17,7 @@ from gfm_hil.cli.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.priority import processors
-from gfm_hil.studies.campaign.execute import run_alone, tell_checks
+from gfm_hil.studies.campaign.execute import checks_progress, run_alone
 from gfm_hil.studies.campaign.loading import load_campaign
 from gfm_hil.studies.campaign.tables import print_campaign, print_record
 from gfm_hil.studies.workers import WorkerLost, processes
@@ -68,7 +68,7 @@ def call(options: argparse.Namespace) -> int:
 def _only(options: argparse.Namespace) -> int:
     """One run of every law, in a worker: there its arithmetic is that of the campaign."""
     with watching(Path(options.file).stem, options.quiet) as watch:
-        made = load_campaign(options.file, tell=tell_checks(watch))
+        made = load_campaign(options.file, tell=checks_progress(watch))
     if not 0 <= options.only < made.file.runs:
         raise UserError(f"--only {options.only}: must lie in [0, {made.file.runs - 1}]")
     folder = new_folder(options.out, f"{made.name}-{options.only}")

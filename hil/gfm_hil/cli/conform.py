@@ -168,7 +168,7 @@ def _print(result: Conformity, wall_s: float) -> None:
             console.print(table)
     verdicts = list(result.matrix.values())
     told = ", ".join(f"{verdicts.count(v)} {v}" for v in SIGNS if v in verdicts)
-    count = len(result.found)
+    count = len(result.parts)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)
     report = Path(result.folder or ".") / "report.html"

@@ -309,10 +309,10 @@ def measure_admittance(
         UserError: a value out of range, no operating point, a loop that is unstable, a run that
             does not complete, or a window whose ends still differ.
     """
-    foreign = tuple(controller_command)
-    _check(scenario, bool(foreign))
+    external = tuple(controller_command)
+    _check(scenario, bool(external))
     name, Y_of, slowest = controlled_by({"controller": ""}), None, None
-    if not foreign:
+    if not external:
         name, Y_of, slowest = _model(scenario)
     bands = _bands(start_hz, stop_hz, points, scenario.T_s, window_s)
     given = settle_s is not None
@@ -327,9 +327,9 @@ def measure_admittance(
             seconds = plan.starts()[-1] * scenario.T_s
             words = f"injection along {axis}: {seconds:.1f} s simulated"
             watch.progress(len(sides), 2, words)
-            spectra, summary = _inject(scenario, plan, axis, foreign)
+            spectra, summary = _inject(scenario, plan, axis, external)
             sides.append(spectra)
-            if foreign:
+            if external:
                 name = controlled_by(summary)
         settled = max(side.ends for side in sides)
         if given or settled <= _SETTLED:
@@ -344,12 +344,12 @@ def measure_admittance(
     return _found(name, scenario, plan, settle_s, settled, sides, Y_of)
 
 
-def _check(scenario: Scenario, foreign: bool) -> None:
+def _check(scenario: Scenario, external: bool) -> None:
     if scenario.network is not None:
         raise UserError("network: a scan measures one converter on its line to the grid")
     if scenario.plant.grid.finite is not None:
         raise UserError("plant.grid.finite: such a grid sets its own frequency; leave it out")
-    if foreign and scenario.link.type == INPROC:
+    if external and scenario.link.type == INPROC:
         raise UserError(f"link.type = {INPROC!r}: another controller needs a link, e.g. zmq")
 
 
@@ -455,7 +455,7 @@ def _omega_b(scenario: Scenario) -> float:
 
 
 def _inject(
-    scenario: Scenario, plan: _Plan, axis: str, foreign: tuple[str, ...]
+    scenario: Scenario, plan: _Plan, axis: str, external: tuple[str, ...]
 ) -> tuple[_Spectra, dict[str, Any]]:
     """The spectra of a run with the injection along one axis, and its summary.
 
@@ -487,10 +487,10 @@ def _inject(
             "expect_ripple": 1000.0,  # the injection is one
             "events": events,
         }
-        made = load_scenario(content, in_process=not foreign)
-        if foreign:
+        made = load_scenario(content, in_process=not external)
+        if external:
             folder = Path(place) / "run"
-            run = run_scenario(made, folder, figures=False, controller_command=foreign)
+            run = run_scenario(made, folder, figures=False, controller_command=external)
         else:
             run = run_in_memory(made)
         if run.status != "completed":

@@ -24,7 +24,7 @@ from gfm_hil.studies.linear_loop import network_loop, scenario_loop
 from gfm_runtime.signals import Y_NAMES
 
 #: what a command found: as JSON, and as a table
-Found = tuple[dict[str, Any], Table]
+Report = tuple[dict[str, Any], Table]
 
 _LEAST = 0.01  # of a participation that the table shows
 
@@ -127,7 +127,7 @@ def _draw_at(draw: Callable[..., object]) -> Callable[[ClosedLoop, argparse.Name
     return lambda loop, options: draw(loop, *_at(options))
 
 
-def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Found:
+def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
     found = loop.margins()
     channels = {c.name: c for c in (*found.u, *found.y)}
     wanted = _at(options) or [c.name for c in found.u]
@@ -137,7 +137,7 @@ def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Found:
     return {"stable": True, "at": {c.name: channel_as_json(c) for c in some}}, loops_table(some)
 
 
-def _modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Found:
+def _modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
     modes = loop.modes()
     table = numbers("σ \\[1/s]", "frequency \\[Hz]", "damping ratio")
     if isinstance(loop, NetworkLoop):
@@ -152,7 +152,7 @@ def _modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Found
     return {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}, table
 
 
-def _step(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Found:
+def _step(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
     of = options.of or stepped_by_default(loop)
     try:
         t, found = loop.step_response(of, options.seconds)

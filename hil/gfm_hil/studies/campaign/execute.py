@@ -55,7 +55,7 @@ def run_campaign(
         with contextlib.ExitStack() as stack:
             # workers import while the runs are checked
             pool = None if dask else stack.enter_context(pool_of(workers))
-            campaign = load_campaign(given, laws, changes, tell_checks(watch))
+            campaign = load_campaign(given, laws, changes, checks_progress(watch))
             axes = find_axes(campaign, x, y)
             if dask:  # before anything is written
                 pool, workers = stack.enter_context(cluster(dask, campaign))
@@ -80,7 +80,7 @@ def run_campaign(
     return found
 
 
-def tell_checks(watch: Watch) -> Tell:
+def checks_progress(watch: Watch) -> Tell:
     """What tells a watch of the checks of a campaign, in a line once they take long."""
     began, told = time.monotonic(), False
 

@@ -33,8 +33,8 @@ def print_campaign(found: CampaignResult) -> None:
     )
     for table in fitting(console, list(result["laws"]), partial(_counts, result["laws"])):
         console.print(table)
-    for law, found in result["laws"].items():
-        console.print(_worst(law, found["worst"], [a for a in found.axes if a]))
+    for law, one in result["laws"].items():
+        console.print(_worst(law, one["worst"], [a for a in found.axes if a]))
     if found.folder is not None:
         where = f"folder: {found.folder}, figure: {found.folder / 'map.png'}"
         console.print(escape(where), soft_wrap=True)

@@ -27,7 +27,7 @@ from gfm_hil.scenario.toml_out import write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
 from gfm_hil.studies.conformity.judge import cannot, judge
-from gfm_hil.studies.conformity.model import Part
+from gfm_hil.studies.conformity.model import TestPart
 from gfm_hil.studies.conformity.sets import Case, scenario_of
 from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Foreign:
+class ExternalController:
     """A model as the controller, in place of a law.
 
     Attributes:
@@ -84,19 +84,19 @@ class Job:
         converters: folder for converter files, which lasts while jobs run.
         folder: where the scenario and the figure go; None writes neither.
         figures: whether to draw one.
-        foreign: the model that computes u in place of the law, or None.
+        external: the model that computes u in place of the law, or None.
     """
 
     law: str
     file: str
     case: Case
-    part: Part
+    part: TestPart
     inner: str | None
     under: UnderTest
     converters: Path
     folder: Path | None
     figures: bool
-    foreign: Foreign | None = None
+    external: ExternalController | None = None
 
     @property
     def name(self) -> str:
@@ -105,7 +105,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Found:
+class PartResult:
     """What became of a part of a test under a law.
 
     Attributes:
@@ -149,7 +149,7 @@ class Found:
         return next(iter(self.wrong), None)
 
 
-def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign | None:
+def external_controller(model: str | None, ports: str | Path | None) -> ExternalController | None:
     """The model that a user names, checked as far as that goes without loading it.
 
     Raises:
@@ -163,11 +163,11 @@ def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign |
         if ports is not None:
             raise UserError(f"map {ports}: {model} has our signals, and takes no map")
         precision(model)
-        return Foreign(model)
+        return ExternalController(model)
     kind, path = controller_file(model, FORMS)
     file = None if ports is None else Path(ports).absolute()
     read_map(file)
-    return Foreign(f"{kind}:{path}", file)
+    return ExternalController(f"{kind}:{path}", file)
 
 
 def slug(name: str) -> str:
@@ -183,24 +183,24 @@ def make_jobs(
     converters: Path,
     folder: Path | None,
     figures: bool,
-    foreign: Foreign | None = None,
+    external: ExternalController | None = None,
 ) -> list[Job]:
     """A job for each part of each test under each law, and then under the model.
 
     Args:
         laws: files by name. The model begins at the operating point of the first one, or, without
             laws, of the law that a scenario has by default.
-        cases, inner, under, converters, folder, figures, foreign: as for ``Job``.
+        cases, inner, under, converters, folder, figures, external: as for ``Job``.
 
     Raises:
         UserError: the model measures currents, and its runs have no inner stage.
     """
-    each: list[tuple[str, str, Foreign | None]] = [(*law, None) for law in laws.items()]
-    if foreign is not None:
+    each: list[tuple[str, str, ExternalController | None]] = [(*law, None) for law in laws.items()]
+    if external is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
         stage = law_file(start).inner if inner is None else named_inner(inner)
-        check_currents(foreign.name, stage is not None)
-        each.append((foreign.name, start, foreign))
+        check_currents(external.name, stage is not None)
+        each.append((external.name, start, external))
     return [
         Job(law, file, case, part, inner, under, converters, folder, figures, model)
         for law, file, model in each
@@ -209,7 +209,7 @@ def make_jobs(
     ]
 
 
-def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[Found]:
+def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]:
     """What becomes of all jobs; 1 worker runs all in this process.
 
     Raises:
@@ -217,9 +217,9 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[Found]:
         WorkerLost: a worker died, or a run raised an error.
         KeyboardInterrupt: the watch stopped it before its end.
     """
-    found: list[Found] = []
+    found: list[PartResult] = []
 
-    def keep(one: Found) -> None:
+    def keep(one: PartResult) -> None:
         found.append(one)
         bad = sum(f.verdict in (FAIL, CANNOT) for f in found)
         words = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
@@ -250,10 +250,10 @@ def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
             continue
         try:
             scenario = _scenario(job)
-            kind = scenario.has_inner, len(scenario.converters), job.foreign is not None
+            kind = scenario.has_inner, len(scenario.converters), job.external is not None
             if kind in seen:
                 continue
-            if job.foreign is not None:
+            if job.external is not None:
                 compiled_bench(scenario, notice, ("plant",))
                 compile_external(scenario, notice)
             else:
@@ -270,14 +270,14 @@ def _scenario(job: Job) -> Scenario:
         UserError: it cannot be run.
     """
     found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
-    if job.foreign is None:
+    if job.external is None:
         return found
     if found.network is not None:
         raise UserError(f"{job.law} is one controller, and the test's network has several")
     return found.model_copy(update={"link": Link(type="shm")})
 
 
-def run_part(job: Job) -> Found:
+def run_part(job: Job) -> PartResult:
     """Run, judge and draw a part; what cannot be run cannot be judged.
 
     Raises:
@@ -290,12 +290,12 @@ def run_part(job: Job) -> Found:
         raise RunFailed(words) from problem
 
 
-def _run_part(job: Job) -> Found:
+def _run_part(job: Job) -> PartResult:
     criteria = [*job.case.test.criteria, *job.part.criteria]
     names = job.law, job.case.id, job.part.name
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"
-        return Found(*names, "none", reason, cannot(criteria, reason))
+        return PartResult(*names, "none", reason, cannot(criteria, reason))
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
@@ -305,40 +305,42 @@ def _run_part(job: Job) -> Found:
         except UserError as problem:
             text = str(problem).replace("\n", "; ").replace(job.file, job.law)
             reason = f"Cannot be judged: there is no such run: {text}"
-            return Found(*names, "none", reason, cannot(criteria, reason))
+            return PartResult(*names, "none", reason, cannot(criteria, reason))
         under = job.under
-        if job.foreign is None:  # a controller that is not ours runs over a link alone
+        if job.external is None:  # a controller that is not ours runs over a link alone
             for criterion in criteria:
                 under = criterion.declared(under, scenario)
         verdicts = judge(run, criteria, under, others)
         again, figure = "", None
         if job.folder is not None:
             place = _place(job.folder, job, scenario)
-            again = _again(place, job.foreign)
+            again = _again(place, job.external)
             if job.figures and run.ticks:
                 from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
 
                 figure = draw_part(place / "figure.png", _title(job, scenario), run, verdicts)
         reason = str(run.summary["reason"])
-        return Found(*names, run.status, reason, verdicts, again, figure)
+        return PartResult(*names, run.status, reason, verdicts, again, figure)
 
 
-def _scan(job: Job, asked: Nfp, scenario: Scenario) -> Found:
+def _scan(job: Job, asked: Nfp, scenario: Scenario) -> PartResult:
     """Measure, judge and draw a network-frequency-perturbation plot."""
-    foreign = job.foreign
-    found = asked.scan(scenario, external_command(foreign.model, foreign.ports) if foreign else ())
+    external = job.external
+    found = asked.scan(
+        scenario, external_command(external.model, external.ports) if external else ()
+    )
     verdicts = asked.judge_scan(found)
     again, figure = "", None
     if job.folder is not None:
         place = _place(job.folder, job, scenario)
-        if foreign is None:
+        if external is None:
             again = shlex.join(asked.again(str(place / "scenario.toml")))
         if job.figures:
             from gfm_hil.studies.conformity.figure import draw_plot
 
             title = _title(job, scenario)
             figure = draw_plot(place / "figure.png", title, found, asked, verdicts)
-    return Found(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
+    return PartResult(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
 
 
 def _title(job: Job, scenario: Scenario) -> str:
@@ -353,12 +355,12 @@ def _place(folder: Path, job: Job, scenario: Scenario) -> Path:
     return place
 
 
-def _again(place: Path, foreign: Foreign | None) -> str:
+def _again(place: Path, external: ExternalController | None) -> str:
     """The command that repeats the run of the scenario in a folder."""
     words = ["gfmhil", "run", str(place / "scenario.toml")]
-    if foreign is not None:
-        words += ["--controller", foreign.model]
-        words += ["--map", str(foreign.ports)] if foreign.ports else []
+    if external is not None:
+        words += ["--controller", external.model]
+        words += ["--map", str(external.ports)] if external.ports else []
     return shlex.join(words)
 
 
@@ -368,9 +370,9 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     Args:
         stack: keeps what a run of a model is read from.
     """
-    if job.foreign is not None:
+    if job.external is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        command = external_command(job.foreign.model, job.foreign.ports)
+        command = external_command(job.external.model, job.external.ports)
         run = run_scenario(scenario, folder, figures=False, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt

@@ -25,7 +25,7 @@ KNOWN: dict[str, str] = {
 }
 
 
-class Source(Schema):
+class Publication(Schema):
     """Where a test comes from."""
 
     document: str = Field(min_length=1, description="name of the document")
@@ -38,8 +38,10 @@ class Source(Schema):
         return f"{self.document}, {self.clause}, {self.revision}"
 
 
-class Part(Schema):
+class TestPart(Schema):
     """One run of a test that has several."""
+
+    __test__ = False  # none of pytest's
 
     name: str = Field(pattern=r"^[A-Za-z0-9.+-]+$", description="letters, digits, . + -")
     title: str = Field("", description="for people")
@@ -52,7 +54,7 @@ class Part(Schema):
     )
 
     @model_validator(mode="after")
-    def _asks_what_it_can(self) -> Part:
+    def _asks_what_it_can(self) -> TestPart:
         if self.cannot is not None and (self.scenario or self.criteria):
             raise ValueError("cannot: such a part has neither scenario nor criteria")
         return self
@@ -65,7 +67,7 @@ class Test(Schema):
 
     title: str = Field(min_length=1, description="of tables and figures")
     description: str = Field("", description="what is done, and what of it is our choice")
-    source: Source = Field(description="where the test comes from")
+    source: Publication = Field(description="where the test comes from")
     f_n: float = Field(ge=1, le=1000, description="nominal frequency, Hz; the converter follows it")
     ratings: dict[str, Annotated[float, Field(ge=1e-3, le=1e3)]] = Field(
         {}, description="in a network: rating of a converter over that under test"
@@ -77,11 +79,11 @@ class Test(Schema):
         description="the run: keys of a scenario file but for title, law, inner and link"
     )
     criteria: list[Criterion] = Field([], description="what is asked of every part")
-    parts: list[Part] = Field([], description="runs of the test; one if none")
+    parts: list[TestPart] = Field([], description="runs of the test; one if none")
 
-    def runs(self) -> list[Part]:
+    def runs(self) -> list[TestPart]:
         """The parts, or the only run as a part without a name."""
-        return self.parts or [Part.model_construct(name="", title="", cannot=None)]
+        return self.parts or [TestPart.model_construct(name="", title="", cannot=None)]
 
     @model_validator(mode="after")
     def _fits_together(self) -> Test:
