@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 import gfmhil
 from gfm_hil.api.law import as_law
-from gfm_hil.results.cycles import cycle_means
-from gfm_hil.results.metrics import METRICS, event_metrics
-from gfm_hil.results.modes import Acting, acting, fast_mode, free_from, swing
+from gfm_hil.run.cycles import cycle_means
+from gfm_hil.run.metrics import METRICS, event_metrics
+from gfm_hil.run.modes import Acting, acting, fast_mode, free_from, swing
 from gfm_hil.scenario.model import check_scenario
 
 T_s, F_N = 1e-3, 50.0

@@ -1,2 +1,2 @@
-"""What ``gfmhil`` offers: laws, loops, runs and studies as objects and functions, which the
-commands call too."""
+"""What ``gfmhil`` re-exports: the objects, and the functions by which a program and the command
+line start a run or a study."""

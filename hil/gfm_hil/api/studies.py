@@ -1,22 +1,17 @@
-"""Runs and studies: in memory and silent, or with a folder and watched by a command."""
+"""Studies: in memory and silent, or with a folder and watched by a command."""
 
 from __future__ import annotations
 
-import json
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gfm_hil.api.law import Law, law_files
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import check_empty, write_text
-from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run import Run
-from gfm_hil.results.run_folder import check_free
-from gfm_hil.results.runner import run_in_memory, run_network_in_memory, run_scenario
+from gfm_hil.core.files import check_empty
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.campaign.execute import run_campaign
@@ -29,150 +24,6 @@ from gfm_hil.studies.scan import FrequencyScan, measure_admittance
 from gfm_hil.studies.workers import SILENT, Watch, check_workers
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-def run(
-    scenario: str | Path | Scenario | dict[str, Any],
-    law: str | Path | Law | None = None,
-    **changes: Any,
-) -> Run:
-    """Run a scenario in this process, in lockstep, and keep the result in memory.
-
-    Args:
-        scenario: name of a shipped one, path of a file, content of a file, or a checked scenario.
-        law: name, law file or ``Law``; the scenario's own if None.
-        changes: keys of the scenario with ``__`` for the dot, e.g. ``duration=2.0`` [s],
-            ``plant__factors__L_g=2.0``.
-
-    Raises:
-        UserError: one line a mistake; or the scenario has no operating point.
-        LawError: the law is none.
-    """
-    with law_files([] if law is None else [law]) as files:
-        for file in files.values():
-            changes = {**changes, "law": file}
-        made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
-    return _named(made, law) if isinstance(law, Law) else made
-
-
-def run_network(scenario: str | Path | Scenario | dict[str, Any], **changes: Any) -> NetworkRun:
-    """Run a scenario with several converters in this process, and keep the result in memory.
-
-    Args:
-        scenario, changes: as for ``run``.
-
-    Raises:
-        UserError: one line a mistake; it has no network; or no operating point.
-    """
-    checked = load_scenario(scenario, in_process=True, **changes)
-    if checked.network is None:
-        raise UserError("network: the scenario has none; use gfmhil.run")
-    return run_network_in_memory(checked)
-
-
-def _named(made: Run, law: Law) -> Run:
-    """The run of a ``Law``: its name in place of its temporary file, and its text."""
-    scenario = made.scenario.model_copy(update={"law": law.name})
-    return replace(made, scenario=scenario, law_text=law.to_toml())
-
-
-class Comparison(dict[str, Run]):
-    """Runs of one scenario by the name of their law."""
-
-    @property
-    def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """The metrics of each run by law, see ``Run.metrics``."""
-        return {law: one.metrics for law, one in self.items()}
-
-    @property
-    def summaries(self) -> dict[str, dict[str, Any]]:
-        """The summary of each run by law: the content of comparison.json."""
-        return {law: one.summary for law, one in self.items()}
-
-    @property
-    def events(self) -> list[dict[str, Any]]:
-        """Those of the summary of the run that came furthest."""
-        return max((one.summary["events"] for one in self.values()), key=len)
-
-    def plot(self) -> list[Axes]:
-        """p, frequency, q and v_dc of all laws in one figure."""
-        from matplotlib import pyplot
-
-        from gfm_hil.results import figures
-
-        first = next(iter(self.values()))
-        columns = {law: one.columns for law, one in self.items()}
-        figure = pyplot.figure(figsize=figures.SIZE_LAWS, layout="constrained")
-        return figures.draw_laws(figure, first.scenario, columns, self.events)
-
-    def write(self, folder: Path) -> None:
-        """Write comparison.json, and comparison.png of the runs that recorded anything."""
-        from gfm_hil.results.figures import draw_comparison
-
-        first = next(iter(self.values()))
-        signals = {law: one.columns for law, one in self.items() if "true_p" in one.columns}
-        if signals:
-            draw_comparison(folder / "comparison.png", first.scenario, signals, self.events)
-        write_text(folder / "comparison.json", json.dumps(self.summaries, indent=2) + "\n")
-
-    def __repr__(self) -> str:
-        lines = [f"  {law}: {one.status}" for law, one in self.items()]
-        return "\n".join(["<Comparison", *lines, ">"])
-
-
-def compare(
-    scenario: str | Path | Scenario | dict[str, Any],
-    laws: Sequence[str | Path | Law],
-    folder: str | Path | None = None,
-    *,
-    watch: Watch = SILENT,
-    **changes: Any,
-) -> Comparison:
-    """Run a scenario under several laws.
-
-    Args:
-        scenario, changes: as for ``run``.
-        laws: names, law files or ``Law``.
-        folder: where to write a run folder for each law, comparison.png and comparison.json; the
-            link and the mode are then those of the scenario. None keeps the runs in memory.
-        watch: of the runs with a folder.
-
-    Raises:
-        UserError: one line a mistake; the folder is in use; or the scenario has no operating point.
-        LawError: a law is none.
-    """
-    if not laws:
-        raise UserError("laws: name some laws to compare")
-    with law_files(laws) as files:
-        if folder is None:
-            names = [*files]
-            each = zip(names, laws, strict=True)
-            return Comparison({name: run(scenario, law, **changes) for name, law in each})
-        scenarios = {n: load_scenario(scenario, law=file, **changes) for n, file in files.items()}
-        return _compare_in(Path(folder), scenarios, watch)
-
-
-def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -> Comparison:
-    """Run scenarios of different laws, each in a folder; an interruption ends all."""
-    first = next(iter(scenarios.values()))
-    check_free(folder, first.ticks * len(scenarios), first.has_inner)
-    runs: dict[str, Run] = {}
-    for name, one in scenarios.items():
-
-        def tell(ticks: int, misses: int, name: str = name, one: Scenario = one) -> None:
-            late = f", {misses} misses" if misses else ""
-            said = f"{name}: {ticks * one.T_s:.2f} s simulated{late}"
-            watch.progress(len(runs) * one.ticks + ticks, len(scenarios) * one.ticks, said)
-
-        runs[name] = run_scenario(one, folder / name, tell, watch.notice)
-        if runs[name].status == "interrupted":
-            break
-    made = Comparison(runs)
-    made.write(folder)
-    return made
 
 
 def campaign(

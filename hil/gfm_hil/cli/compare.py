@@ -10,7 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from gfm_hil.api.studies import compare
+from gfm_hil.api.runs import compare
 from gfm_hil.cli.common import (
     add_scenario_options,
     add_study_options,
@@ -58,7 +58,7 @@ def call(options: argparse.Namespace) -> int:
         for why in filter(None, map(why_it_ended, found.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
         terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
-    return max(exit_code(run.summary) for run in found.values())
+    return max(exit_code(run) for run in found.values())
 
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:

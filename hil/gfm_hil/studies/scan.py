@@ -41,9 +41,8 @@ from gfm_design.margins.admittance import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
-from gfm_hil.recording.run import controlled_by
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory, run_scenario
+from gfm_hil.recording.run import Run, controlled_by
+from gfm_hil.run.runner import run_in_memory, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
 from gfm_hil.studies.linear_loop import scenario_loop
 from gfm_hil.studies.workers import SILENT, Watch
@@ -490,7 +489,7 @@ def _inject(
         made = load_scenario(content, in_process=not external)
         if external:
             folder = Path(place) / "run"
-            run = run_scenario(made, folder, figures=False, controller_command=external)
+            run = run_scenario(made, folder, controller_command=external)
         else:
             run = run_in_memory(made)
         if run.status != "completed":

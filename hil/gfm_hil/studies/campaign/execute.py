@@ -15,7 +15,8 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.results.report import write_report
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.loading import Tell, load_campaign
 from gfm_hil.studies.campaign.result import CampaignResult, verdict
@@ -161,7 +162,7 @@ def run_alone(campaign: Campaign, run: int, law: str, folder: Path) -> Record:
     scenario = scenario.model_copy(update={"title": f"{campaign.file.title}: run {run}"})
     check_empty(folder)
     try:
-        whole = run_scenario(scenario, folder)
+        whole = run_scenario(scenario, folder, report=write_report)
         summary, p = whole.summary, whole.signals["true_p"]
     except UserError as problem:
         summary = {"status": "no-steady-state", "reason": str(problem), "events": []}

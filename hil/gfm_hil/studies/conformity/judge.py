@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 from gfm_hil.studies.conformity.criteria.base import Clause, Moment
 from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import CANNOT, Verdict
 
 
 def judge(
-    run: RecordedRun,
+    run: Run,
     criteria: Sequence[Clause],
     under: UnderTest,
-    others: Mapping[str, RecordedRun] | None = None,
+    others: Mapping[str, Run] | None = None,
 ) -> list[Verdict]:
     """The verdicts of all criteria, each at each of its times.
 

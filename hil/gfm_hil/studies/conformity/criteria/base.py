@@ -2,7 +2,7 @@
 judged.
 
 Powers, voltages, currents and frequencies are judged by their means over one cycle of the nominal
-frequency (``results.cycles``); only how fast p rises, and the angle, are of every tick.
+frequency (``run.cycles``); only how fast p rises, and the angle, are of every tick.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from gfm_hil.core.schema import Schema
-from gfm_hil.recording.run import RecordedRun, nominal_frequency
-from gfm_hil.results import checks
-from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.run import checks
+from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.conformity.under_test import UnderTest
@@ -91,9 +91,9 @@ class Moment:
 
     def __init__(
         self,
-        run: RecordedRun,
+        run: Run,
         under: UnderTest,
-        others: Mapping[str, RecordedRun],
+        others: Mapping[str, Run],
         clause: Clause,
         at: float,
     ) -> None:

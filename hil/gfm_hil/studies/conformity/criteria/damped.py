@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from gfm_hil.results import checks
-from gfm_hil.results.cycles import whole_ticks
-from gfm_hil.results.modes import acting, free_from, swing
+from gfm_hil.run import checks
+from gfm_hil.run.cycles import whole_ticks
+from gfm_hil.run.modes import acting, free_from, swing
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 

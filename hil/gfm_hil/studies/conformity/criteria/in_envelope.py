@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results import checks
-from gfm_hil.results.cycles import whole_ticks
+from gfm_hil.run import checks
+from gfm_hil.run.cycles import whole_ticks
 from gfm_hil.scenario.events import GridFrequency, GridImpedance, PhaseJump
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.conformity.criteria.base import Moment, Vector, Windowed

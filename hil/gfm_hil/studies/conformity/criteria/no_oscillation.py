@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from gfm_hil.results.ripple import remaining_ripple
+from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.studies.conformity.criteria.base import Clause, Moment
 from gfm_hil.studies.conformity.verdict import Verdict
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from gfm_hil.recording.columns import unit_of
-from gfm_hil.results import checks
+from gfm_hil.run import checks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 
