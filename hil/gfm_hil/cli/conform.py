@@ -77,7 +77,10 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "-o", "--out", metavar="DIR", help="folder; runs/conform-<time> by default"
     )
-    command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
+    command.add_argument(
+        "--workers", type=int, default=processors(), metavar="N",
+        help="processes; all cores by default",
+    )  # fmt: skip
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
     command.add_argument("--list", action="store_true", help="list the tests, and run nothing")
     add_study_options(command, "results.json")
@@ -102,8 +105,7 @@ def call(options: argparse.Namespace) -> int:
         found = conform(
             laws, against, folder, inner=options.inner, converter=options.converter,
             controller=options.controller, ports=options.map,
-            workers=processors() if options.workers is None else options.workers,
-            figures=not options.no_figures, watch=watch,
+            workers=options.workers, figures=not options.no_figures, watch=watch,
         )  # fmt: skip
     if options.json:
         print(json.dumps(found.plain(), indent=1))

@@ -24,7 +24,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -265,10 +265,11 @@ class _Plan:
     bands: Sequence[_Band]
     settle: Sequence[int]
     amplitude: float
-    hz: Vector = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hz", np.concatenate([band.hz for band in self.bands]))
+    @property
+    def hz(self) -> Vector:
+        """All tones, Hz."""
+        return np.concatenate([band.hz for band in self.bands])
 
     def starts(self) -> list[int]:
         """The first tick of each band."""
@@ -328,8 +329,7 @@ def measure_admittance(
             watch.progress(len(sides), 2, words)
             spectra, summary = _inject(scenario, plan, axis, external)
             sides.append(spectra)
-            if external:
-                name = controlled_by(summary)
+            name = controlled_by(summary) if external else name
         settled = max(side.ends for side in sides)
         if given or settled <= _SETTLED:
             break

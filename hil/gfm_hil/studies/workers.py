@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import forkserver
 from typing import Any, TypeVar
 
@@ -103,8 +104,8 @@ def run_tasks(
             if stopped():
                 pending = {future for future in pending if not future.cancel()}
             else:
-                while len(pending) < _AHEAD * workers and (task := next(waiting, None)) is not None:
-                    pending.add(pool.submit(function, task))
+                free = _AHEAD * workers - len(pending)
+                pending |= {pool.submit(function, task) for task in islice(waiting, free)}
             if not pending:
                 return
             done, pending = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
