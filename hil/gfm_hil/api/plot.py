@@ -89,17 +89,19 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
     from gfm_hil.results.figures import COLOURS, draw_panel
 
     of = of or stepped_by_default(loop)
+    title = f"after a unit step of {of}"
+    curves: list[tuple[Vector, str, str]]
     try:
-        t, y = loop.step_response(of, seconds)
+        if isinstance(loop, NetworkLoop):
+            colours = _colours(loop)
+            t, each = loop.step_response(of, seconds)
+            curves = [(each[one], colours[one], one) for one in loop.names]
+        else:
+            title = f"{title_of(loop)}: {title}"
+            t, y = loop.step_response(of, seconds)
+            curves = [(y, COLOURS[0], "")]
     except ValueError as problem:
         raise UserError(f"step: {problem}") from None
-    title = f"after a unit step of {of}"
-    if isinstance(loop, NetworkLoop):
-        colours = _colours(loop)
-        curves = [(y[one], colours[one], one) for one in loop.names]
-    else:
-        title = f"{title_of(loop)}: {title}"
-        curves = [(y, COLOURS[0], "")]
     figure, panels = pyplot.subplots(
         len(Y_NAMES), 1, sharex=True, figsize=(8.6, 8.2), layout="constrained"
     )

@@ -322,7 +322,7 @@ def measure_admittance(
             settle_s = min(max(math.log(_SHRINK) / -slowest, 0.2), _LONGEST_S)
     while True:
         plan = _plan(bands, amplitude, settle_s, scenario)
-        sides = []
+        sides: list[_Spectra] = []
         for axis in "dq":
             seconds = plan.starts()[-1] * scenario.T_s
             words = f"injection along {axis}: {seconds:.1f} s simulated"

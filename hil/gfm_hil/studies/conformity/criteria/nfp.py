@@ -13,7 +13,14 @@ from pydantic import Field, model_validator
 from gfm_hil.core.schema import Schema
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.conformity.criteria.base import Clause
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict
+from gfm_hil.studies.conformity.verdict import (
+    CANNOT,
+    FAIL,
+    INFORMATIVE,
+    PASS,
+    Outcome,
+    Verdict,
+)
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
 
 if TYPE_CHECKING:
@@ -118,7 +125,7 @@ class Nfp(Clause):
                     f"or the furthest beyond them between {where}."
                 )
                 limit = f"{' and '.join(limits)}, {where}"
-                verdict = PASS if beyond[k] <= 0 else FAIL
+                verdict: Outcome = PASS if beyond[k] <= 0 else FAIL
                 verdicts.append(made(verdict, float(x[k]), unit, limit, text))
         return verdicts
 
