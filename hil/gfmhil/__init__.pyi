@@ -14,8 +14,8 @@ from gfm_hil.api.studies import conform as conform
 from gfm_hil.api.studies import identify as identify
 from gfm_hil.api.studies import scan as scan
 from gfm_hil.core.errors import UserError as UserError
-from gfm_hil.scenario.model import Scenario as Scenario
-from gfm_hil.scenario.model import load_scenario as load_scenario
+from gfm_hil.scenario import Scenario as Scenario
+from gfm_hil.scenario import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
 from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.studies.scan import FrequencyScan as FrequencyScan

@@ -13,7 +13,7 @@ import pytest
 import gfmhil
 from gfm_design.model.closed_loop import REFERENCES
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfmhil import plot
 
 

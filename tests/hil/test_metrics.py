@@ -14,7 +14,7 @@ from gfm_hil.api.law import as_law
 from gfm_hil.run.cycles import cycle_means
 from gfm_hil.run.metrics import METRICS, event_metrics
 from gfm_hil.run.modes import Acting, acting, fast_mode, free_from, swing
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 T_s, F_N = 1e-3, 50.0
 COLUMNS = ("true_p", "true_omega_u", "true_V", "true_i")

@@ -22,7 +22,7 @@ from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant

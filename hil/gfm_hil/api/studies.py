@@ -12,7 +12,7 @@ from typing import Any
 from gfm_hil.api.law import Law, law_files
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult

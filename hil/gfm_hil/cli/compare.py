@@ -25,7 +25,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.engine.setup import ONE_CONVERTER
 from gfm_hil.results.report import cell, event_rows
-from gfm_hil.scenario.model import find_scenario
+from gfm_hil.scenario import find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:

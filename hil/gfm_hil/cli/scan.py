@@ -17,7 +17,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import find_scenario, shipped_scenarios
+from gfm_hil.scenario import find_scenario, shipped_scenarios
 from gfm_hil.studies.scan import AMPLITUDE, POINTS, WINDOW_S, FrequencyScan
 from gfm_runtime import law_names, tuned_names
 from gfm_runtime.errors import meant

@@ -12,7 +12,7 @@ from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.scenario.model import Scenario, load_scenario, plant_of
+from gfm_hil.scenario import Scenario, load_scenario, plant_of
 from gfm_plant import NoEquilibrium
 from gfm_runtime import DiscreteLaw, discretise, law_titles, load_law
 from gfm_runtime import Law as BuiltLaw

@@ -16,7 +16,7 @@ from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import LawFile

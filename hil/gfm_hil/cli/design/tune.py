@@ -25,7 +25,7 @@ from gfm_hil.cli.design.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 
 def add(kinds: Any) -> None:

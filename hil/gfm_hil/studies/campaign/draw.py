@@ -15,12 +15,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from gfm_hil.core.schema import Schema
+from gfm_hil.core.schema import StrictSchema
 
 _LEAST = 1e-9  # of a normal's probability that must lie within its bounds
 
 
-class _Drawn(Schema):
+class _Drawn(StrictSchema):
     path: str = Field(description="dotted path in the scenario, e.g. plant.factors.L_g")
     also: list[str] = Field([], description="further paths that get the same value")
     label: str | None = Field(None, description="of the figure's axis, the path if none")

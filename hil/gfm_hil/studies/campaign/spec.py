@@ -12,8 +12,8 @@ from typing import Any
 
 from pydantic import Field
 
-from gfm_hil.core.schema import Schema
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.core.schema import StrictSchema
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.draw import Distribution, draw
 
 
@@ -53,7 +53,7 @@ def _words(place: Any, path: str, above: str) -> str:
     return f"path {path!r}: {where} is {place!r} and holds nothing"
 
 
-class Axes(Schema):
+class Axes(StrictSchema):
     """What the figure is drawn over: drawn paths, or sums of them ("a + b")."""
 
     x: str | None = Field(
@@ -66,7 +66,7 @@ class Axes(Schema):
     )
 
 
-class CampaignFile(Schema):
+class CampaignFile(StrictSchema):
     """The whole file."""
 
     title: str = Field(description="of tables and the figure")

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from gfm_hil.core.schema import Schema
+from gfm_hil.core.schema import StrictSchema
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
 
@@ -25,7 +25,7 @@ KNOWN: dict[str, str] = {
 }
 
 
-class Publication(Schema):
+class Publication(StrictSchema):
     """Where a test comes from."""
 
     document: str = Field(min_length=1, description="name of the document")
@@ -38,7 +38,7 @@ class Publication(Schema):
         return f"{self.document}, {self.clause}, {self.revision}"
 
 
-class TestPart(Schema):
+class TestPart(StrictSchema):
     """One run of a test that has several."""
 
     __test__ = False  # none of pytest's
@@ -60,7 +60,7 @@ class TestPart(Schema):
         return self
 
 
-class Test(Schema):
+class Test(StrictSchema):
     """The whole file."""
 
     __test__ = False  # none of pytest's

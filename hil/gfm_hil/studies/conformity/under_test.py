@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from gfm_hil.core.schema import Schema
+from gfm_hil.core.schema import StrictSchema
 from gfm_hil.studies.envelopes import Unit
 from gfm_plant import Plant
 
 
-class UnderTest(Schema):
+class UnderTest(StrictSchema):
     """The converter under test: its plant, and what its owner declares."""
 
     plant: Plant = Field(description="converter and instruments, without a grid")

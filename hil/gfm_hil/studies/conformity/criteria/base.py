@@ -15,19 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from gfm_hil.core.schema import Schema
+from gfm_hil.core.schema import StrictSchema
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.run import checks
 from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
-from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict
 
 Vector = NDArray[np.float64]
 
 
-class Clause(Schema):
+class Clause(StrictSchema):
     """A clause of a test. Its windows count from each time in ``at``; ``window`` is [from, to].
 
     Attributes:

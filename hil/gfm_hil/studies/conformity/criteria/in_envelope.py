@@ -12,8 +12,10 @@ from pydantic import Field
 from gfm_hil.core.errors import UserError
 from gfm_hil.run import checks
 from gfm_hil.run.cycles import whole_ticks
-from gfm_hil.scenario.events import GridFrequency, GridImpedance, PhaseJump
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.events.grid_frequency import GridFrequency
+from gfm_hil.scenario.events.grid_impedance import GridImpedance
+from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.studies.conformity.criteria.base import Moment, Vector, Windowed
 from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import Verdict

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from gfm_hil.core.schema import Schema
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.core.schema import StrictSchema
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.conformity.criteria.base import Clause
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class Band(Schema):
+class Band(StrictSchema):
     """Limits of a gain and a phase between two frequencies."""
 
     from_hz: float = Field(gt=0, description="of the perturbation, Hz")
