@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
 from gfm_hil.api.runs import compare
 from gfm_hil.cli.common import (
@@ -22,9 +20,10 @@ from gfm_hil.cli.common import (
     why_it_ended,
 )
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import fitting, numbers, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.setup import ONE_CONVERTER
-from gfm_hil.results.report import cell, event_rows
+from gfm_hil.results.report import event_rows
+from gfm_hil.results.table import Cell, Table
 from gfm_hil.scenario import find_scenario
 
 
@@ -62,18 +61,13 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
-    def table_of(names: Sequence[str]) -> Table:
-        table = numbers("", *map(escape, names))
-        some = [summaries[name] for name in names]
-        table.add_row("status", *[s["status"] for s in some])
-        for k, event in enumerate(events):
-            table.add_row(f"[bold]{escape(event['label'])} @ {event['t']:g} s[/]")
-            same = [s["events"][k] if k < len(s["events"]) else {} for s in some]
-            for key, title in event_rows(same):
-                if key not in ("label", "t"):
-                    table.add_row("  " + escape(title), *[cell(e.get(key)) for e in same])
-        return table
-
+    rows: list[list[Any]] = [["status", *(s["status"] for s in summaries.values())]]
+    for k, event in enumerate(events):
+        rows.append([Cell(f"{event['label']} @ {event['t']:g} s", "head")])
+        same = [s["events"][k] if k < len(s["events"]) else {} for s in summaries.values()]
+        for key, title in event_rows(same):
+            if key not in ("label", "t"):
+                rows.append(["  " + title, *(e.get(key) for e in same)])
     console = terminal()
-    for table in fitting(console, list(summaries), table_of):
+    for table in Table(["", *summaries], rows).fitting(console):
         console.print(table)
