@@ -25,13 +25,13 @@ from gfm_hil.engine.announcement import announcement
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.modbus.connection import Server
-from gfm_hil.modbus.image import BASE, VENDOR
+from gfm_hil.ports.modbus.connection import Server
+from gfm_hil.ports.modbus.image import BASE, VENDOR
+from gfm_hil.ports.scope import server as scope_server
+from gfm_hil.ports.scope.access import Access
+from gfm_hil.ports.scope.record import open_record
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
-from gfm_hil.scope import server as scope_server
-from gfm_hil.scope.access import Access
-from gfm_hil.scope.record import open_record
 
 from ..support.modbus_device import Bench as MadeUp
 from ..support.processes import free_port

@@ -14,13 +14,13 @@ import pytest
 from gfm_hil.cli import main
 from gfm_hil.core.errors import Unfinished
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
+from gfm_hil.ports.streams.blocks import messages
+from gfm_hil.ports.streams.follow import Rows
+from gfm_hil.ports.streams.samples import Sampler
 from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.results.run_folder import recover
 from gfm_hil.results.runner import run_scenario
-from gfm_hil.telemetry.blocks import messages
-from gfm_hil.telemetry.follow import Rows
-from gfm_hil.telemetry.samples import Sampler
 from gfm_runtime.signals import NU_INNER, NY_INNER
 
 from ..support.links import PATIENT, RIG, assert_same, run_pair

@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from pyarrow import parquet
 from scipy.io import loadmat
 
+from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER
 from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import draw_signals
 from gfm_hil.results.run import Run
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
-from gfm_hil.scope.channels import make_channels
 
 COLUMNS = (*PLANT_INNER, *CONTROLLER_INNER)
 

@@ -17,7 +17,7 @@ import pytest
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
 from gfm_hil.results.run_folder import merge_roles
 from gfm_hil.results.runner import run_network

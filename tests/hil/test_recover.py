@@ -25,6 +25,7 @@ from gfm_hil.core import files
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.setup import make_bench
+from gfm_hil.ports.scope.record import open_record
 from gfm_hil.recording import npz
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.parts import Part
@@ -33,7 +34,6 @@ from gfm_hil.results.export import export_run
 from gfm_hil.results.run_folder import finish, recover
 from gfm_hil.results.runner import run_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
-from gfm_hil.scope.record import open_record
 
 from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
 

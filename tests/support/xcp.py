@@ -9,10 +9,10 @@ from pydantic import TypeAdapter
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
+from gfm_hil.ports.xcp.memory import Memory
+from gfm_hil.ports.xcp.slave import Slave
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.scenario.events import Event
-from gfm_hil.xcp.memory import Memory
-from gfm_hil.xcp.slave import Slave
 
 LAWS = ("mimo-gfm", "vsg-5", "vsg-2")
 MASTER = ("127.0.0.1", 40000)

@@ -19,12 +19,12 @@ from gfm_hil.cli.common import (
     print_summary,
     resolve,
 )
+from gfm_hil.controllers import FORMS, BenchContext, open_controller, read_map
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
-from gfm_hil.models import FORMS, BenchContext, open_model, read_map
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.network_run import NetworkRun
 from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
@@ -59,7 +59,7 @@ def call(options: argparse.Namespace) -> int:
     if options.model is not None:
         ports = read_map(options.map)
         with one_processor(scenario.mode):
-            model = open_model(options.model, ports, _bench_context(scenario))
+            model = open_controller(options.model, ports, _bench_context(scenario))
     folder = new_folder(options.out, role)
     places = {name: folder / name for name in scenario.parts} or {"": folder}
     if options.part:  # of `gfmhil run`, which puts the parts together

@@ -24,10 +24,10 @@ from gfm_hil.cli.companion import companion
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
+from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_for_model
-from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
-from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
+from gfm_hil.engine.compiling import compile_external
+from gfm_hil.results.runner import Notice, external_command, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 
@@ -119,11 +119,11 @@ def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Noti
         raise UserError("--controller: is a process, and a run in process has none; choose --link")
     real = precision(options.controller)
     if not options.controller.startswith(PIL):
-        model_file(options.controller, FORMS)
+        controller_file(options.controller, FORMS)
     read_map(options.map)
     check_currents(options.controller, scenario.has_inner)
-    compile_for_model(scenario, notice, real)
-    return model_command(options.controller, options.map)
+    compile_external(scenario, notice, real)
+    return external_command(options.controller, options.map)
 
 
 def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:

@@ -87,7 +87,7 @@ def run_scenario(
         return finish(scenario, folder, labels, wall_s, figures, outside.get(""))
 
 
-def model_command(model: str, ports: Path | None) -> list[str]:
+def external_command(model: str, ports: Path | None) -> list[str]:
     """The ``controller_command`` of a run whose controller steps a model in place of the law.
 
     Args:
