@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -176,13 +177,16 @@ def test_a_machine_that_answers_after_seconds_completes_the_run(
 
 def hit(tmp_path: Path, scratch: Path, machines: list[int], *numbers: signal.Signals) -> None:
     """Send the machine and its guard, which work below ``scratch``, signals in mid run."""
-    parts = tmp_path / "run" / "parts" / "plant_progress.npy"
-    while not (parts.exists() and np.load(parts)[0] > 100):
+    parts, ticks = tmp_path / "run" / "parts" / "plant_progress.npy", 0
+    while ticks <= 100:
         time.sleep(0.01)
+        with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or not whole, yet
+            ticks = np.load(parts)[0]
     machines.extend(processes_in(scratch))
     for number in numbers:
         for process in machines:
-            os.kill(process, number)
+            with contextlib.suppress(ProcessLookupError):  # it has ended with its guard
+                os.kill(process, number)
         time.sleep(PAUSE_S if number == signal.SIGSTOP else 0.0)
 
 
