@@ -47,7 +47,10 @@ def controller_ticks(end, records, controller, event):
         if why != ReturnReason.GO_ON:
             return why
         changes = ctl[0].changes
-        answer(ctl, laws, states, est, y, u, end.reader[0].state == SAFE)
+        tripped = end.reader[0].state == SAFE
+        if r.every > 1 and (r.tick != r.received or r.left != 0):
+            tripped = False  # not yet in the ticks before it
+        answer(ctl, laws, states, est, y, u, tripped)
         why = reply(end, records, r, controller, event, changes)
         if why != ReturnReason.GO_ON:
             return why

@@ -80,7 +80,7 @@ class Unstuffer:
     def _end(self) -> None:
         message = unstuffed(bytes(self._piece)) if len(self._piece) <= _MOST else None
         self._piece.clear()
-        if not message:
+        if not message or len(message) > LONGEST:
             self.damaged += 1
         else:
             self._found.append(message)
