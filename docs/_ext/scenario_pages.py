@@ -15,6 +15,7 @@ from gfm_hil.scenario import events
 from gfm_hil.scenario import model as scenario
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
+from gfm_plant.components import COMPONENTS, FiniteGrid
 from gfm_runtime import inner_file, lawfile
 
 
@@ -32,7 +33,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[plant.dc_source]", options.DcSource),
     ("[plant.lcl]", options.SecondInductor),
     ("[plant.grid]", options.Grid),
-    ("[plant.grid.finite]", options.FiniteGrid),
+    ("[plant.grid.finite]", FiniteGrid),
     ("[plant.sensors]", options.Sensors),
     ("[plant.adc]", options.AnalogToDigital),
     ("[plant.dac]", options.DigitalToAnalog),
@@ -42,12 +43,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
 NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[network]", scenario.Members),
     ("[network.converters.NAME]", scenario.Member),
-    ("[network.lines.NAME]", options.Line),
-    ("[network.transformers.NAME]", options.Transformer),
-    ("[network.loads.NAME]", options.Load),
-    ("[network.constant_power.NAME]", options.ConstantPowerLoad),
-    ("[network.capacitors.NAME]", options.CapacitorBank),
-    ("[network.machines.NAME]", options.Machine),
+    *((f"[network.{table}.NAME]", kind) for table, kind in COMPONENTS.items()),
 )
 CHECK = ("check", events.SynchroCheck)
 OVERLOAD = ("[[plant.protection.overload]]", options.Overload)

@@ -34,13 +34,19 @@ WORST_CONDITION = 1e8
 
 @dataclass(frozen=True)
 class Branch:
-    """R and L in series from node ``start`` to node ``end``, p.u.; L > 0."""
+    """R and L in series from node ``start`` to node ``end``, p.u.; L > 0.
+
+    ``earthed`` is that of `Transformer`, "" if it is none. One that is not ``switched`` has no
+    breaker and feeds nothing.
+    """
 
     name: str
     start: str
     end: str
     L: float
     R: float
+    earthed: str = ""
+    switched: bool = True
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,9 @@ class Sink:
 
     name: str
     node: str
+
+
+Element = Branch | Capacitor | Shunt | Sink
 
 
 @dataclass(frozen=True)
@@ -163,7 +172,7 @@ def _find_modes(
     for j, sink in enumerate(sinks, len(sources)):
         if sink.node not in charged:
             raise ValueError(
-                f"node {sink.node}: {sink.name} draws constant power, so the node needs a bank of"
+                f"node {sink.node}: {sink.name} draws a current, so the node needs a bank of"
                 " network.capacitors"
             )
         B[n_b + charged[sink.node], j] = -1.0

@@ -47,7 +47,6 @@ from gfm_plant import (
     make_network,
     make_plant,
 )
-from gfm_plant.records import SIZES
 from gfm_plant.synchro_check import AGREED
 from gfm_runtime import Law, LawError, discretise, law_file, load_law
 from gfm_runtime.errors import allowed, meant, printable
@@ -179,9 +178,7 @@ class Member(_Model):
 class Members(NetworkParts):
     """Several converters and what connects them."""
 
-    converters: dict[str, Member] = Field(
-        min_length=1, max_length=max(SIZES), description="by name"
-    )
+    converters: dict[str, Member] = Field(min_length=1, description="by name")
 
 
 class Scenario(_Model):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gfm_design.margins.all_margins import LoopMargins, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.closed_loop import frequencies_near as _near
 from gfm_hil.core.errors import UserError
@@ -38,6 +39,14 @@ class Loop(ClosedLoop):
     ``margins()``, ``gamma()``, ``poles()``, ``step_response()``, ``frequency_response()``,
     ``loop_gain()`` and ``output_impedance()``. The methods here draw them with matplotlib.
     """
+
+    def margins(self) -> LoopMargins:
+        """Gain, phase, disk and delay margins of a sampled loop; takes a second.
+
+        Raises:
+            UnstableLoop: the loop is unstable and has no margins.
+        """
+        return loop_margins(self)
 
     def bode(self, *at: str) -> list[Axes]:
         """Draw gain [dB] and phase [degrees] of L over Hz, see ``loop_gain``.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
-from gfm_design.margins.all_margins import UnstableLoop
+from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.network import NetworkMode
 from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
 from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
@@ -141,7 +141,7 @@ def _input(loop: Loop | NetworkLoop, options: argparse.Namespace) -> str:
 
 
 def _margins(loop: Loop, options: argparse.Namespace) -> Found:
-    found = loop.margins()
+    found = loop_margins(loop)
     channels = {c.name: c for c in (*found.u, *found.y)}
     wanted = _at(options) or [c.name for c in found.u]
     if unknown := [name for name in wanted if name not in channels]:
