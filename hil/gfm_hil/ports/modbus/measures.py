@@ -42,7 +42,8 @@ class Measures:
         """Every model of the device with the points that determine its layout, for ``Image``."""
         b = self._bases
         power = _exponent(b.S_n * _top("p"), 16, signed=True)
-        volt, amp = _exponent(b.V_n * _top("V"), 16), _exponent(b.base_of("I") * _top("p"), 16, signed=True)
+        volt = _exponent(b.V_n * _top("V"), 16)
+        amp = _exponent(b.base_of("I") * _top("p"), 16, signed=True)
         set_point = _exponent(b.S_n * _top("P_ref"), 32, signed=True)
         points: list[dict[str, Any]] = [{}, {}]
         return {
