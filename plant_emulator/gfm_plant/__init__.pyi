@@ -9,7 +9,7 @@ from .emulator import (
     plant_truth,
 )
 from .grid import (
-    Checked,
+    SynchroCheckResult,
     breaker,
     check_synchronism,
     clear_fault,
@@ -39,13 +39,13 @@ __all__ = [
     "TRIP_REASONS",
     "TRUTH",
     "Bases",
-    "Checked",
     "ConverterParameters",
     "Network",
     "NetworkParts",
     "NoEquilibrium",
     "Plant",
     "PlantRecords",
+    "SynchroCheckResult",
     "breaker",
     "check_synchronism",
     "clear_fault",

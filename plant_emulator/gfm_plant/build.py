@@ -21,7 +21,7 @@ from gfm_plant.network import Network
 from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.records import N_RING, converter_par_dtype, converter_state_dtype
-from gfm_plant.wiring import Unit, Wiring
+from gfm_plant.wiring import ConverterCircuit, Wiring
 from gfm_runtime.signals import SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
@@ -210,7 +210,7 @@ def _check_paths(wiring: Wiring) -> None:
 
 def _pack_converter_circuit(
     par: Record, name: str, node: str, options: Plant, first: ConverterParameters
-) -> Unit:
+) -> ConverterCircuit:
     """Pack the elements of a converter, and return them in p.u. of the first one."""
     converter = load_converter(options.converter)
     for what in ("omega_n", "V_n"):
@@ -242,7 +242,7 @@ def _pack_converter_circuit(
         par["i_u_gain"] = 1.0
     else:
         par["k_p"], par["k_i"] = source.k_p, source.k_i
-    return Unit(
+    return ConverterCircuit(
         name, node,
         elements["L_f"] * ratio, elements["R_f"] * ratio, elements["C_f"] / ratio,
         elements["L_g"] * ratio, elements["R_g"] * ratio,

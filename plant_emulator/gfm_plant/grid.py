@@ -375,7 +375,7 @@ def check_synchronism(
 
 
 @dataclass(frozen=True)
-class Checked:
+class SynchroCheckResult:
     """How a synchro-check ended.
 
     Attributes:
@@ -392,7 +392,7 @@ class Checked:
     degrees: float
 
 
-def finish_check(plant: Network) -> Checked | None:
+def finish_check(plant: Network) -> SynchroCheckResult | None:
     """Close the breaker whose synchro-check has agreed, or end a check whose time is over; None if
     there is nothing to do."""
     state, check = int(plant.now[0]["check"]), plant.wiring.check
@@ -406,7 +406,7 @@ def finish_check(plant: Network) -> Checked | None:
     else:
         breaker(plant, True)
     differences = V, speed / plant.wiring.omega_b, math.degrees(angle)
-    return Checked(check.name, state != TIME_OVER, *differences)
+    return SynchroCheckResult(check.name, state != TIME_OVER, *differences)
 
 
 def _breaker(plant: Network, name: str) -> tuple[str, str, str]:

@@ -1,4 +1,4 @@
-"""The grid simulator from tick to tick: its ramps, sags, unbalance and faults."""
+"""The grid simulator from tick to tick: its ramps, sags and unbalance."""
 
 from __future__ import annotations
 

@@ -16,10 +16,10 @@ from gfm_plant.circuit import (
     GROUND,
     Branch,
     Capacitor,
+    CurrentSource,
     Modes,
     Shunt,
-    Sink,
-    Source,
+    VoltageSource,
     find_modes,
     find_voltage,
     join_axes,
@@ -33,7 +33,7 @@ ALPHA, BETA = 0, 1
 
 
 @dataclass(frozen=True)
-class Unit:
+class ConverterCircuit:
     """A converter as the circuit sees it: bridge, filter, and the line to its node.
 
     Attributes:
@@ -159,7 +159,7 @@ class Wiring:
     """
 
     omega_b: float
-    units: tuple[Unit, ...]
+    units: tuple[ConverterCircuit, ...]
     branches: tuple[Branch, ...] = ()
     shunts: tuple[Shunt, ...] = ()
     capacitors: tuple[Capacitor, ...] = ()
@@ -211,10 +211,10 @@ class Wiring:
         return tuple(part for part in each if isinstance(part, Branch))
 
     @property
-    def sinks(self) -> tuple[Sink, ...]:
+    def sinks(self) -> tuple[CurrentSource, ...]:
         """The currents of components."""
         each = (part for name, one in self.fed for part in one.elements(name))
-        return tuple(part for part in each if isinstance(part, Sink))
+        return tuple(part for part in each if isinstance(part, CurrentSource))
 
     def sources(self) -> dict[str, int]:
         """The place of each source in the compiled plant; that of the grid is followed by its
@@ -262,7 +262,7 @@ class Wiring:
         found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
         lines = (*self.branches, *self.fed_branches)
         found |= {b.name: (b.name, b.start, b.end) for b in lines if b.switched}
-        to_ground: tuple[Shunt | Sink, ...] = (*self.shunts, *self.sinks)
+        to_ground: tuple[Shunt | CurrentSource, ...] = (*self.shunts, *self.sinks)
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
     def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
@@ -351,7 +351,7 @@ class Wiring:
 
     def _circuit(
         self, blocked: frozenset[int], faulted: bool, axis: int
-    ) -> tuple[list[Branch], list[Capacitor], list[Source], list[Shunt], list[Branch]]:
+    ) -> tuple[list[Branch], list[Capacitor], list[VoltageSource], list[Shunt], list[Branch]]:
         """The parts of a circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis."""
         filters, sources = [], []
@@ -369,18 +369,18 @@ class Wiring:
             if k not in blocked:
                 i_f = unit.states[0]
                 filters.append(Branch(i_f, unit.bridge, unit.terminal, unit.L_f, unit.R_f))
-                sources.append(Source(unit.bridge, unit.bridge))
+                sources.append(VoltageSource(unit.bridge, unit.bridge))
         branches = [
             *self._whole(self.units_lines),
             *filters,
             *self._whole((*self.branches, *self.fed_branches)),
             *through_fault,
         ]
-        sources += [Source(emf(name), emf(name)) for name, one in self.fed if one.is_voltage]
+        sources += [VoltageSource(emf(name), emf(name)) for name, one in self.fed if one.is_voltage]
         capacitors = [Capacitor(unit.states[1], unit.terminal, unit.C_f) for unit in self.units]
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
-            sources.append(Source(GRID_SOURCE, self.grid))
+            sources.append(VoltageSource(GRID_SOURCE, self.grid))
         whole, held = branches, {GROUND} | {source.node for source in sources}
         held |= {one.node for one in capacitors} | {one.node for one in shunts}
         if self.closed and not self.opened:  # no line may hang, but a converter on an open bus may

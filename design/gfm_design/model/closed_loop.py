@@ -38,9 +38,9 @@ from gfm_design.norms.hinf import balance
 from gfm_design.norms.performance import (
     D_Q,
     PAPER_WEIGHTS,
-    Channel,
     StateSpace,
     Weight,
+    WeightedChannel,
     channel_norms,
 )
 from gfm_plant import Plant, load_converter, make_plant
@@ -428,7 +428,7 @@ class ClosedLoop:
 
     def channels(
         self, weights: tuple[Weight, ...] = PAPER_WEIGHTS, D_q: float = D_Q
-    ) -> tuple[Channel, ...]:
+    ) -> tuple[WeightedChannel, ...]:
         """The norm of every weighted channel W_ij T_ij; a sampled loop has the weights by Tustin.
 
         Raises:

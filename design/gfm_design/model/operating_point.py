@@ -78,7 +78,7 @@ def operating_point(
         NoEquilibrium: the law has no rest state there (a frequency that its droop cannot reach
             within the line's capacity, or no steady state at all).
     """
-    side = _Side(par, law, np.asarray(ref))
+    side = _ConverterRest(par, law, np.asarray(ref))
     z = side.first(V_g, omega_g)
 
     def residual(z: Vector) -> Vector:
@@ -113,7 +113,7 @@ def operating_points(
     Raises:
         NoEquilibrium: there is none, or Newton's method does not find it.
     """
-    rest = _Rest(plant, laws, refs)
+    rest = _NetworkRest(plant, laws, refs)
     z = _newton(rest.residual, rest.first(refs))
     if z is None:
         each = zip(plant.wiring.units, laws, strict=True)
@@ -122,7 +122,7 @@ def operating_points(
     return rest.found(z)
 
 
-class _Rest:
+class _NetworkRest:
     """The unknowns z of a network at rest, and what must vanish.
 
     z has the unknowns of each converter, the two parts of each node's voltage, the unknowns of each
@@ -133,7 +133,7 @@ class _Rest:
         self.wiring = wiring = plant.wiring
         self.V_g, self.omega_g = complex(plant.now[0]["V_g"]), float(plant.now[0]["omega_g"])
         self.sides = [
-            _Side(plant.par[k : k + 1], law, np.asarray(ref))
+            _ConverterRest(plant.par[k : k + 1], law, np.asarray(ref))
             for k, (law, ref) in enumerate(zip(laws, refs, strict=True))
         ]
         self.fixed = wiring.grid if wiring.closed else None
@@ -223,7 +223,7 @@ def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
     return found
 
 
-class _Side:
+class _ConverterRest:
     """One converter under its law: unknowns, what must vanish, and what is found.
 
     The unknowns are the plant's state (8,), the DC current, E_u, and the law's states.

@@ -12,7 +12,7 @@ import numpy as np
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.model.least_stable import least_stable
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
+from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel
 from gfm_design.norms.weights import read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
@@ -45,7 +45,7 @@ class Gamma:
     """
 
     law: str
-    channels: tuple[Channel, ...]
+    channels: tuple[WeightedChannel, ...]
 
     @property
     def value(self) -> float:

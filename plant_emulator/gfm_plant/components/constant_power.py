@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gfm_plant.circuit import Sink
+from gfm_plant.circuit import CurrentSource
 from gfm_plant.components.part import Fed, LinearPart, Matrix
 from gfm_plant.layout import field
 from gfm_plant.parameters import Positive
@@ -126,8 +126,8 @@ class ConstantPowerLoad(Fed):
         """P + jQ, p.u."""
         return complex(self.P, self.Q)
 
-    def elements(self, name: str) -> tuple[Sink]:
-        return (Sink(name, self.node),)
+    def elements(self, name: str) -> tuple[CurrentSource]:
+        return (CurrentSource(name, self.node),)
 
     def label(self) -> str:
         return f"constant P {self.P:g}, Q {self.Q:g} p.u."

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from rich.table import Table
 
-from gfm_design.norms.performance import Channel
+from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -148,7 +148,7 @@ _W = {1: "P_ref", 2: "ω_g"}
 _Z = {1: "P_ref − p", 2: "p", 3: "ω_u", 4: "q + V/D_q"}
 
 
-def print_channels(name: str, channels: Sequence[Channel]) -> None:
+def print_channels(name: str, channels: Sequence[WeightedChannel]) -> None:
     """gamma and its channels as a table."""
     table = Table("channel", "‖W T‖∞", "at \\[rad/s]", box=None, pad_edge=False, title=None)
     for c in channels:
