@@ -212,8 +212,8 @@ def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:
     """Return the modes of a circuit that is not the same in all directions.
 
     In the frame that stands still a space vector is W = w e^(j omega_b t), and the parts of
-    W e^(-j angle) = W_alpha + j W_beta belong to one circuit each. Their modes are real-linear in W,
-    and so linear in w and its mirror image together: W_alpha = (W' + conj W') / 2 and
+    W e^(-j angle) = W_alpha + j W_beta belong to one circuit each. Their modes are real-linear in
+    W, and so linear in w and its mirror image together: W_alpha = (W' + conj W') / 2 and
     W_beta = (W' - conj W') / 2j with W' = W e^(-j angle).
 
     Args:

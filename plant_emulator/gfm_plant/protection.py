@@ -65,8 +65,9 @@ def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
     """Latch a trip of converter k, if none is latched: its bridge blocks, its DC source turns off.
 
     The current of L_f is taken as interrupted at once. From here on the plant ignores the
-    converter's commands; its frame turns with the grid. The circuits are at hand for one converter that trips; a second
-    one trips a tick later, when Python has made those for two (`gfm_plant.grid.take_out`).
+    converter's commands; its frame turns with the grid. The circuits are at hand for one converter
+    that trips; a second one trips a tick later, when Python has made those for two
+    (`gfm_plant.grid.take_out`).
     """
     s, n, now = plant.st[k], plant.net[0], plant.now[0]
     if s.trip == 0 and now.row == 0:
