@@ -26,11 +26,13 @@ LINE = {"start": "m", "end": "n", "L": 0.1, "R": 0.03}
 POWER = {"node": "n", "P": 0.5, "Q": 0.1}
 
 
-def make(T_s: float = 1e-4, **changes: Any) -> Network:
-    """A converter, a line, and at its end a load of constant power on a capacitor bank."""
+def make(T_s: float = 1e-4, count: int = 1, **changes: Any) -> Network:
+    """Two converters, a line, and at its end loads of constant power on a capacitor bank."""
+    power = {**POWER, "P": 0.5 / count, "Q": 0.1 / count, **changes}
     parts: dict[str, Any] = {
         "lines": {"l": LINE}, "capacitors": {"c": {"node": "n", "Q": 0.3}},
-        "loads": {"r": {"node": "n", "P": 0.3}}, "constant_power": {"p": {**POWER, **changes}},
+        "loads": {"r": {"node": "n", "P": 0.3}},
+        "constant_power": {"p" * k: power for k in range(1, count + 1)},
     }  # fmt: skip
     plant = Plant.model_validate({"protection": OFF})
     return make_network(
@@ -107,21 +109,20 @@ def start_at(plant: Network, E: Any, omega: float) -> np.ndarray:
     x = np.zeros((N, 8))
     x[:, 7] = 1.0
     for _ in range(2):
-        plant.start(x, u, [((), omega)])
+        plant.start(x, u, [((), omega)] * len(plant.wiring.fed))
         w = plant.now["w"][0]
         modes, sources = plant.wiring.modes(frozenset(), False)
-        ((_, load),) = plant.wiring.fed
         slip = W_B * (omega - 1)
-        v = complex(*w[plant.wiring.order.index("c")])
-        i = load.current(v, slip)[1]
-        volts = [u[k, 2] for k in range(N)] + [i]
-        assert sources[-1] == "p"
+        v = complex(w[plant.wiring.order.index("c")])
+        names, loads = zip(*plant.wiring.fed, strict=True)
+        volts = [u[k, 2] for k in range(N)] + [load.current(v, slip)[1] for load in loads]
+        assert tuple(sources[N:]) == names
         whole = modes.states @ (modes.drive @ volts / (1j * slip - modes.rates))
         for k in range(N):
             own = whole[3 * k : 3 * k + 3]
             x[k, 0:6:2], x[k, 1:6:2] = own.real, own.imag
             u[k, 0] = u[k, 2] * own[0].real
-    plant.start(x, u, [((), omega)])
+    plant.start(x, u, [((), omega)] * len(plant.wiring.fed))
     return u
 
 
@@ -159,6 +160,17 @@ def test_below_its_least_voltage_it_is_an_impedance() -> None:
     assert error(plant, u, 0.02, 1e-4) < 1e-4
     i, _ = drawn(0.5 + 0.1j, 4.0, 1.0 + 0j, 0j)
     assert i == pytest.approx(complex(0.5, -0.1) / 4)
+
+
+def test_six_of_a_sixth_are_one() -> None:
+    found = []
+    for count in (1, 6):
+        plant = make(count=count)
+        u = start_at(plant, [1.02, 1.02], 1.0)
+        u[0] += [0.0, 2e-3, 0.04, 0.0]
+        go(plant, u, 300)
+        found.append(plant.st["x"])
+    assert found[0] == pytest.approx(found[1], abs=1e-11)
 
 
 @pytest.mark.parametrize("V", [1.03, 0.6])

@@ -114,6 +114,19 @@ def test_a_machine_that_is_lost_runs_up_by_itself() -> None:
     assert now["omega_g"] == last and g["omega"] > last  # the last machine is gone
 
 
+def test_five_of_a_fifth_are_one() -> None:
+    found = []
+    for count in (1, 5):
+        plant = make(**{f"g{k}": {**MACHINE, "S": 2.0 / count} for k in range(count)})
+        u = rest(plant, [0.05] * count)
+        u[0, 2] += 0.05
+        for _ in range(300):
+            plant_command(plant.records, 0, u[0])
+            plant_step(plant.records)
+        found.append([*plant.st["x"][0], plant.of(Machine)["omega"][-1], plant.now["omega_g"][0]])
+    assert found[0] == pytest.approx(found[1], abs=1e-11)
+
+
 def test_a_machine_that_swings_too_fast() -> None:
     with pytest.raises(ValueError, match=r"network.machines.g: it swings at .* rad/s; allowed are"):
         make(g={**MACHINE, "H": 1e-4})
