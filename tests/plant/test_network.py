@@ -62,7 +62,7 @@ def start(plant: Network, E: Any, delta: Any, omega: float = 1.0) -> np.ndarray:
         own[[0, 2]] *= plant.par[k]["current"]
         x[k, 0:6:2], x[k, 1:6:2] = own.real, own.imag
         u[k, 0] = u[k, 2] * own[0].real
-    plant.start(x, u)
+    plant.start(x, u, [(np.zeros(0), omega)] * len(plant.wiring.fed))
     return u
 
 
