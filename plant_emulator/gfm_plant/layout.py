@@ -15,8 +15,10 @@ import numpy as np
 from llvmlite import ir
 from numba import from_dtype, types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic as _intrinsic
 from numpy.typing import NDArray
+
+intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's arguments
 
 Record = NDArray[np.void]
 _Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
@@ -148,22 +150,21 @@ def make_net_and_now(
     return _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
 
 
-def _allocate(
-    header: np.dtype[np.void], arrays: _Arrays, lengths: Mapping[str, int]
-) -> NDArray[np.void]:
-    names = header.names or ()
-    fields = [(header.fields or {})[name] for name in names]
-    formats, offsets = [field[0] for field in fields], [field[1] for field in fields]
-    places, end = {}, header.itemsize
+def _allocate(header: np.dtype[np.void], arrays: _Arrays, lengths: dict[str, int]) -> Record:
+    fields = dict(header.fields or {})
+    formats, offsets = [f[0] for f in fields.values()], [f[1] for f in fields.values()]
+    places, end = dict[str, int](), header.itemsize
     for name, (kind, shape) in arrays.items():
         places[f"{name}_at"] = end = -(-end // 16) * 16
         formats.append(np.dtype((kind, tuple(lengths.get(str(n), n) for n in shape))))
         offsets.append(end)
         end += formats[-1].itemsize
-    whole = {"names": [*names, *arrays], "formats": formats, "offsets": offsets, "itemsize": end}
-    record = np.zeros(1, np.dtype(whole))  # type: ignore[call-overload]
+    whole: Any = {
+        "names": [*fields, *arrays], "formats": formats, "offsets": offsets, "itemsize": end
+    }  # fmt: skip
+    record: Record = np.zeros(1, np.dtype(whole))
     for name, value in (lengths | places).items():
-        if name in names:
+        if name in fields:
             record[name] = value
     return record
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfm_plant.layout import Record
+from gfm_plant.layout import Record as Record
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
 N_OWN = 3  # states of the circuit that a converter brings: i_f, v, i_o

@@ -525,11 +525,11 @@ class _Writing:
             else:
                 self.B_d[angle, 0] = self.omega_b
         for name, part in self.fed.items():
-            own, seen = self.at[name], _rows(self.modes.states[self.at_w[name]])
+            at, seen = self.at[name], _rows(self.modes.states[self.at_w[name]])
             source = emf(name) if emf(name) in self.sources else name
             drive = self.modes.drive[:, [self.sources.index(source)]]
-            self.A[own, own], self.A[own, self.z] = part.A, part.by_seen @ seen
-            self.A[self.z, own] = _real(drive) @ part.source
+            self.A[at, at], self.A[at, self.z] = part.A, part.by_seen @ seen
+            self.A[self.z, at] = _real(drive) @ part.source
         return self._against_references()
 
     def _source(self, source: str, part: str, e: complex, unit: complex) -> Complex:
