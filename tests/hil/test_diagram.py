@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram
-from gfm_hil.scenario.model import Scenario, load_scenario, shipped_scenarios
+from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
 from gfm_plant import NetworkParts
 from gfm_plant.components.part import Component
 

@@ -81,7 +81,7 @@ class NetworkMode(Mode):
 
 
 @dataclass(frozen=True)
-class NetworkConverter:
+class LinearConverter:
     """A converter of the network.
 
     Attributes:
@@ -153,7 +153,7 @@ class NetworkLoop:
     def __init__(
         self,
         network: LinearNetwork,
-        members: Sequence[NetworkConverter],
+        members: Sequence[LinearConverter],
         T_s: float,
         u_delay: Matrix,
     ) -> None:
@@ -183,7 +183,7 @@ class NetworkLoop:
         x, u = (np.array([getattr(op, name) for op in points]) for name in ("x", "commands"))
         resting.start(x, u, rests)
         T_s = float(plant.net[0]["T_s"])
-        members, delays, at_u, at_y = list[NetworkConverter](), list[float](), 0, 0
+        members, delays, at_u, at_y = list[LinearConverter](), list[float](), 0, 0
         each = zip(plant.wiring.units, plant.par, laws, refs, points, strict=True)
         for unit, r, law, ref, op in each:
             inner = law.law.inner
@@ -192,7 +192,7 @@ class NetworkLoop:
             n_u, n_y = (NU, NY) if stage is None else (NU_INNER, NY_INNER)
             places = slice(at_u, at_u + n_u), slice(at_y, at_y + n_y)
             title = f"{unit.name} ({law.law.name})"
-            members.append(NetworkConverter(unit.name, title, linear, stage, op, ref, *places))
+            members.append(LinearConverter(unit.name, title, linear, stage, op, ref, *places))
             delays += [float(r["delay"] + r["fraction"]) * T_s] * n_u
             at_u, at_y = at_u + n_u, at_y + n_y
         return cls(linearise_network(resting, members), members, T_s, np.array(delays))
@@ -409,13 +409,13 @@ class _Others:
         return LinearPlant(p.A, p.B[:, one.u], p.B_d, p.C[one.y], p.C_true[own])
 
 
-def _states(n: int, members: Sequence[NetworkConverter]) -> list[slice]:
+def _states(n: int, members: Sequence[LinearConverter]) -> list[slice]:
     """Where the states of each controller are, behind n of the plant."""
     ends = n + np.cumsum([0, *(len(m.controller.A) for m in members)])
     return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
 
-def _closed(p: LinearPlant, members: Sequence[NetworkConverter]) -> Matrix:
+def _closed(p: LinearPlant, members: Sequence[LinearConverter]) -> Matrix:
     """The matrix of a sampled plant with the loops of some converters closed."""
     n, places = len(p.A), _states(len(p.A), members)
     A = np.zeros((places[-1].stop,) * 2) if places else np.zeros((n, n))
@@ -427,7 +427,7 @@ def _closed(p: LinearPlant, members: Sequence[NetworkConverter]) -> Matrix:
     return A
 
 
-def linearise_network(plant: Network, members: Sequence[NetworkConverter]) -> LinearNetwork:
+def linearise_network(plant: Network, members: Sequence[LinearConverter]) -> LinearNetwork:
     """A network at rest, as ``Network.start`` leaves it, around that rest."""
     return _Writing(plant, members).written()
 
@@ -442,7 +442,7 @@ class _Writing:
     from a frame that turns at its speed at rest.
     """
 
-    def __init__(self, plant: Network, members: Sequence[NetworkConverter]) -> None:
+    def __init__(self, plant: Network, members: Sequence[LinearConverter]) -> None:
         wiring, now, N = plant.wiring, plant.now[0], len(members)
         self.plant, self.members, self.omega_b = plant, members, wiring.omega_b
         self.modes, self.sources = wiring.modes(wiring.blocked, False)
@@ -539,7 +539,7 @@ class _Writing:
         self.A[self.z, self.at[part].start] = _parts(1j * e * by_e)
         return np.asarray(by_e)
 
-    def _converter(self, k: int, member: NetworkConverter) -> None:
+    def _converter(self, k: int, member: LinearConverter) -> None:
         alone, r, own = self._alone(k), self.plant.par[k], self.at[member.name]
         unit = complex(self.plant.now[0]["unit"][k])
         by_e = self._source(self.plant.wiring.units[k].bridge, member.name, member.op.e, unit)

@@ -110,9 +110,11 @@ class Table:
         free, left = console.options.update(max_width=_ANY), [*range(1, len(self.heads))]
         while left:
             count = len(left)
-            while count > 1 and console.measure(
-                self._of(left[:count]).terminal(), options=free
-            ).maximum > console.width:
+            while (
+                count > 1
+                and console.measure(self._of(left[:count]).terminal(), options=free).maximum
+                > console.width
+            ):
                 count -= 1
             yield self._of(left[:count]).terminal()
             left = left[count:]
