@@ -50,7 +50,8 @@ def start(plant: Network, E: Any, delta: Any, omega: float = 1.0) -> np.ndarray:
     u[:, 1], u[:, 2] = omega, E
     x = np.zeros((N, 8))
     x[:, DELTA], x[:, V_DC] = delta, 1.0
-    plant.start(x, u)
+    rests = [(np.zeros(0), omega)] * len(plant.wiring.fed)
+    plant.start(x, u, rests)
     # w as the phasors have it, which `start` takes from x for the converters' own states
     modes, sources = plant.wiring.modes(frozenset(), False)
     volts = [u[k, 2] * np.exp(1j * x[k, DELTA]) for k in range(N)]
@@ -62,7 +63,7 @@ def start(plant: Network, E: Any, delta: Any, omega: float = 1.0) -> np.ndarray:
         own[[0, 2]] *= plant.par[k]["current"]
         x[k, 0:6:2], x[k, 1:6:2] = own.real, own.imag
         u[k, 0] = u[k, 2] * own[0].real
-    plant.start(x, u, [(np.zeros(0), omega)] * len(plant.wiring.fed))
+    plant.start(x, u, rests)
     return u
 
 
