@@ -163,9 +163,9 @@ def _give_rows(bars: Mapping[str, _Bar], lines: _Lines) -> int:
     """
     row, done = 0, set[str]()
     for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
-        for line, (_, start, end, *shown) in lines.items():
+        for line, (_, start, end, symbol, text, closed) in lines.items():
             if {start, end} & done and name in (start, end):
-                lines[line] = row, start, end, *shown
+                lines[line] = row, start, end, symbol, text, closed
                 row += 1
         count = max(1, len(bar.converters), len(bar.right))
         bar.rows = [*range(row, row + count)]
