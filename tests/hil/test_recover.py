@@ -292,7 +292,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
             filled.append(fill(small_disk))
 
     with pytest.raises(Unfinished, match="No space left on device"):
-        run_scenario(make(duration=0.4, events=events), folder, progress)
+        run_scenario(make(duration=0.4, events=events), folder, progress, report=write_report)
     with pytest.raises(Unfinished, match="No space left on device"):
         recover(folder)
     filled[0].unlink()
