@@ -70,13 +70,14 @@ class Network:
 
     def copy(self) -> Network:
         """Return the same plant at the same instant, in memory of its own."""
-        par, st, net, now, *parts = (record.copy() for record in self.memory)
+        copies = (_bytes(record).copy().view(record.dtype) for record in self.memory)
+        par, st, net, now, *parts = copies
         return Network(par, st, net, now, tuple(parts), self.wiring)
 
     def restore(self, kept: Network) -> None:
         """Take the wiring, the parameters and the instant of a copy."""
         for record, old in zip(self.memory, kept.memory, strict=True):
-            record[:] = old
+            _bytes(record)[:] = _bytes(old)
         self.wiring = kept.wiring
 
     def start(
@@ -163,9 +164,13 @@ class Network:
         """
         changed = self.copy()
         _connect(changed, wiring)
-        for record, new in zip(self.memory, changed.memory, strict=True):
-            record[:] = new
-        self.wiring = wiring
+        changed.wiring = wiring
+        self.restore(changed)
+
+
+def _bytes(record: Record) -> NDArray[np.uint8]:
+    """Its memory, the gaps between its fields included."""
+    return record.view(np.uint8)
 
 
 def _connect(plant: Network, wiring: Wiring) -> None:
