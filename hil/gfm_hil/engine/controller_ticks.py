@@ -47,10 +47,7 @@ def controller_ticks(end, records, controller, event):
         if why != ReturnReason.GO_ON:
             return why
         changes = ctl[0].changes
-        tripped = end.reader[0].state == SAFE
-        if r.every > 1 and (r.tick != r.received or r.left != 0):
-            tripped = False  # not yet in the ticks before it
-        answer(ctl, laws, states, est, y, u, tripped)
+        answer(ctl, laws, states, est, y, u, plant_tripped(end, r))
         why = reply(end, records, r, controller, event, changes)
         if why != ReturnReason.GO_ON:
             return why
@@ -85,6 +82,13 @@ def receive(end, records, r, ctl, event, sent):
         break
     r.pending = 0
     return ReturnReason.GO_ON
+
+
+@inlined
+def plant_tripped(end, r):
+    """Whether the plant had tripped in the tick in hand: not yet in the ticks before the y that
+    says so."""
+    return end.reader[0].state == SAFE and (r.every == 1 or (r.tick == r.received and r.left == 0))
 
 
 @inlined

@@ -17,20 +17,21 @@ from numpy.typing import NDArray
 
 from gfm_hil.controllers import ControllerError, ExternalController
 from gfm_hil.core.errors import PeerLost
-from gfm_hil.engine.controller_ticks import receive, reply
+from gfm_hil.engine.controller_ticks import plant_tripped, receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.log import Status
 from gfm_hil.scenario.events.base import Event
-from gfm_hil.scenario.events.gains import GainChange, Retuned, ready_gains
+from gfm_hil.scenario.events.gains import GainChange, ready_gains
 from gfm_runtime.assembly import Controller
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import accept, bad_output, follow_plant, measured, next_law
 from gfm_runtime.signals import NY
-from gfm_runtime.states import READY, RUNNING, SAFE
+from gfm_runtime.states import READY, RUNNING
 
 if TYPE_CHECKING:
     from gfm_hil.controllers import PilController
+    from gfm_hil.scenario.events.gains import Retuned
 
 REFUSED, ACCEPTED, RESTARTED = range(3)
 _COUNT = kept_of("controller").index("instructions")
@@ -200,7 +201,7 @@ def receive_tick(end, records, controller, event, has_laws):
     if why != ReturnReason.GO_ON:
         return why, REFUSED, -1
     before = ctl[0].state
-    follow_plant(ctl, end.reader[0].state == SAFE)
+    follow_plant(ctl, plant_tripped(end, records.loop[0]))
     if ctl[0].state != RUNNING or not accept(ctl[0], records.y):
         return why, REFUSED, -1
     changed = next_law(ctl[0], controller.est[0], ctl[0].y) if has_laws else -1
