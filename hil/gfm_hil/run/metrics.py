@@ -126,7 +126,7 @@ def _oscillations(p: Rows, first: int, stop: int, T_s: float, f_n: float) -> dic
     """Damping and frequency of the swing and of the fast mode of p, of those that there are."""
     x = p[first : max(first, min(stop, first + round(LONGEST / T_s)))]
     slow, fast = swing(x, T_s, f_n), fast_mode(x, T_s, f_n)
-    found = {}
+    found: dict[str, float] = {}
     if slow is not None:
         found |= {"damping_ratio": slow.damping, "oscillation_hz": slow.hz}
     if fast is not None:

@@ -107,7 +107,7 @@ def _run(
     progress: Progress,
     notice: Notice,
     report: Report | None,
-    controller_command: Sequence[str] = (),
+    controller_command: tuple[str, ...] = (),
 ) -> dict[str, Run]:
     """Run both sides of each converter, and complete their run folders."""
     places = _places(scenario, folder)
