@@ -19,10 +19,10 @@ pytestmark = pytest.mark.processes
 HOLD = """
 import sys, time
 from pathlib import Path
-from gfm_hil.recording.parts import Part, keep_in_memory
+from gfm_hil.recording.parts import RolePart, keep_in_memory
 folder = Path(sys.argv[1])
 keep_in_memory(folder, 100)
-part = Part.create(folder, sys.argv[2], 100)
+part = RolePart.create(folder, sys.argv[2], 100)
 part.signals[:60] = 1.5
 print("ready", flush=True)
 time.sleep(600)
@@ -71,20 +71,20 @@ def test_a_folder_is_left_behind_once_nobody_holds_it(tmp_path):
     place, first = scratch.make("x-", tmp_path)
     second = scratch.hold(place)
     assert list(scratch.left_behind("x-", tmp_path)) == []
-    scratch.let_go(first)
+    scratch.release(first)
     assert list(scratch.left_behind("x-", tmp_path)) == []
-    scratch.let_go(second)
+    scratch.release(second)
     ((found, handle),) = scratch.left_behind("x-", tmp_path)
     assert found == place
     assert list(scratch.left_behind("x-", tmp_path)) == []  # only one process can remove them
-    scratch.let_go(handle)
+    scratch.release(handle)
 
 
 def test_a_temporary_folder_goes_with_its_context_and_left_ones_go_too(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     left, handle = scratch.make("x-", tmp_path)
     (left / "link").touch()
-    scratch.let_go(handle)
+    scratch.release(handle)
     (tmp_path / "x-a-file").touch()
     with scratch.temporary("x-") as place:
         (place / "link").touch()
@@ -145,7 +145,7 @@ def test_it_stays_and_is_named_where_the_run_folder_is_gone(record, memory, tmp_
 
 def test_a_place_in_which_nothing_was_recorded_goes(memory, tmp_path):
     _, handle = scratch.make("gfmhil-parts-", memory)
-    scratch.let_go(handle)
+    scratch.release(handle)
     assert another_run(tmp_path) == []
     assert list(memory.iterdir()) == []
 

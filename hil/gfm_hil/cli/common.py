@@ -8,7 +8,7 @@ import shlex
 import time
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from rich.progress import (
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import target_of
+from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.processes import Progress as TellProgress
 from gfm_hil.recording.run import Run, controlled_by
@@ -31,6 +32,7 @@ from gfm_hil.results.table import shown
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
 from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.studies.workers import Watch
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run
@@ -177,6 +179,29 @@ def above(bar: Progress) -> Notice:
 
 
 @contextmanager
+def watching(label: str, quiet: bool = False, stoppable: bool = False) -> Iterator[Watch]:
+    """A bar on stderr that watches a study; Ctrl-C then ends a ``stoppable`` one in good order."""
+    columns = BarColumn(), TaskProgressColumn(), "{task.fields[words]}", TimeRemainingColumn()
+    interrupt = Interrupt()
+    with ExitStack() as stack:
+        if stoppable:
+            stack.enter_context(interrupt)
+        bar = stack.enter_context(progress("{task.description}", *columns, quiet=quiet))
+        task = bar.add_task(escape(label), total=None, words="starting …")
+
+        def tell(done: int, of: int, words: str) -> None:
+            bar.update(task, completed=done, total=of, words=escape(words))
+
+        yield Watch(tell, above(bar), lambda: interrupt.came)
+
+
+def add_study_options(command: argparse.ArgumentParser, printed: str) -> None:
+    """--json and --quiet; ``printed`` is what --json prints."""
+    command.add_argument("--json", action="store_true", help=f"print {printed}, nothing else")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+@contextmanager
 def progress_bar(
     scenario: Scenario, label: str, quiet: bool
 ) -> Iterator[tuple[TellProgress, Notice]]:
@@ -200,7 +225,7 @@ def why_unstable(scenario: Scenario, named: str | Path) -> str:
         scenario: whose loop it is.
         named: what that command calls the scenario.
     """
-    from gfm_hil.studies.loop import unstable_mode  # a second of imports
+    from gfm_hil.studies.linear_loop import unstable_mode  # a second of imports
 
     found = unstable_mode(scenario)
     if found is None:

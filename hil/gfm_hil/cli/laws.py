@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
+from gfm_hil.api.law import cell_text
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
-from gfm_hil.studies.law import cell_text
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
 from gfm_runtime.inner_file import acting, inner_names, named_inner
 from gfm_runtime.law import HomeGrid

@@ -208,8 +208,9 @@ class Timeline:
         self.end(*(self._fault or ("completed", "")), tick)
 
     def end(self, status: Status, reason: str, tick: int) -> None:
-        """End the run; the first reason stays."""
+        """End the run, with tick -1 before its tick 0; the first reason stays."""
         if self.outcome is None:
+            tick = max(tick, 0)
             if self.failed and status == "interrupted":
                 status, reason = "safe", self.failed
             self.outcome = Outcome(status, reason, tick)

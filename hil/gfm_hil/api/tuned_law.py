@@ -112,6 +112,6 @@ def write_law(
     ]
     source = f"{file.source.strip()}; tuned by {by}, see the comments"
     about = {"name": path.stem, "title": f"{file.title}, tuned", "source": source}
-    found_by = f"{by}, seed {result['seed']}"
-    text = law_text(file, gains, found_by, comments, home_grid=_PAPERS_GRID, **about)
+    changed_by = f"{by}, seed {result['seed']}"
+    text = law_text(file, gains, changed_by, comments, home_grid=_PAPERS_GRID, **about)
     path.write_text(text, encoding="utf-8")
