@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
-from gfm_hil.results.report import cell
+from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.result import document, status, table
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_runtime.errors import printable
@@ -291,4 +291,4 @@ def _notes(old: Results, new: Results) -> Iterator[str]:
 
 
 def _value(of: ClauseResult | None) -> str:
-    return "–" if of is None or of.value is None else f"{cell(of.value)} {of.unit}".rstrip()
+    return "–" if of is None or of.value is None else f"{shown(of.value)} {of.unit}".rstrip()

@@ -17,7 +17,8 @@ from xml.etree import ElementTree
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import printed
-from gfm_hil.results.report import STYLE, cell, figure, finite
+from gfm_hil.results.report import STYLE, figure, finite
+from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.execute import PartResult, slug
 from gfm_hil.studies.conformity.model import KNOWN
 from gfm_hil.studies.conformity.sets import Case
@@ -278,7 +279,7 @@ _HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "wha
 
 
 def _row(v: Verdict) -> list[str]:
-    measured = "–" if v.value is None else f"{cell(v.value)} {v.unit}".rstrip()
+    measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
     plain = (v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text)
     return [status(v.verdict), *map(html.escape, plain)]
