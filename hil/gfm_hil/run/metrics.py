@@ -122,7 +122,7 @@ def _settling(
     return done, settled, low, high
 
 
-def _oscillations(p: Rows, first: int, stop: int, T_s: float, f_n: float) -> dict[str, float]:
+def _oscillations(p: ColumnLike, first: int, stop: int, T_s: float, f_n: float) -> dict[str, float]:
     """Damping and frequency of the swing and of the fast mode of p, of those that there are."""
     x = p[first : max(first, min(stop, first + round(LONGEST / T_s)))]
     slow, fast = swing(x, T_s, f_n), fast_mode(x, T_s, f_n)
