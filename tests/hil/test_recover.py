@@ -476,7 +476,7 @@ COLUMNS = {
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("npz") / "some.npz"
-    npz.write_npz(path, [npz.Table.of(**{name: x}) for name, x in COLUMNS.items()])
+    npz.write_npz(path, [npz.ColumnGroup.of(**{name: x}) for name, x in COLUMNS.items()])
     return path
 
 
@@ -503,13 +503,13 @@ def test_what_numpy_writes_is_read(save, tmp_path):
 
 def test_a_file_that_could_not_be_written_leaves_the_old_one(tmp_path):
     path = tmp_path / "x.npz"
-    npz.write_npz(path, [npz.Table.of(a=np.arange(3))])
+    npz.write_npz(path, [npz.ColumnGroup.of(a=np.arange(3))])
 
     def read(first, last):
         raise OSError(errno.EIO, "gone")
 
     with pytest.raises(OSError):
-        npz.write_npz(path, [npz.Table({"b": np.dtype(float)}, 9, read)])
+        npz.write_npz(path, [npz.ColumnGroup({"b": np.dtype(float)}, 9, read)])
     assert list(npz.open_npz(path)) == ["a"]
     assert names(tmp_path) == {"x.npz"}
 

@@ -101,7 +101,7 @@ def test_what_a_killed_run_recorded_in_memory_is_moved_to_its_folder(record, mem
     another_run(tmp_path)
     assert not (folder / "parts").is_symlink()
     assert list(memory.iterdir()) == []
-    part = recording.Part.open(folder, "plant")
+    part = recording.RolePart.open(folder, "plant")
     assert part is not None
     assert (part.signals[:60] == 1.5).all() and np.isnan(part.signals[60:]).all()
     assert {path.name for path in folder.iterdir()} == {"parts"}
@@ -116,7 +116,7 @@ def test_it_stays_while_one_role_lives(record, memory, tmp_path):
     kill(controller)
     another_run(tmp_path)
     assert not (folder / "parts").is_symlink()
-    assert all(recording.Part.open(folder, role) for role in ("plant", "controller"))
+    assert all(recording.RolePart.open(folder, role) for role in ("plant", "controller"))
     assert list(memory.iterdir()) == []
 
 
@@ -126,7 +126,7 @@ def test_it_is_found_in_a_folder_that_was_renamed(record, memory, tmp_path):
     folder = folder.rename(tmp_path / "a better name")
     assert another_run(tmp_path) == []
     assert not (folder / "parts").is_symlink()
-    assert recording.Part.open(folder, "plant") is not None
+    assert recording.RolePart.open(folder, "plant") is not None
     assert list(memory.iterdir()) == []
 
 
@@ -140,7 +140,7 @@ def test_it_stays_and_is_named_where_the_run_folder_is_gone(record, memory, tmp_
         (said,) = another_run(tmp_path)
         assert said.startswith(f"{place}: kept, ")
         assert str(folder) in said
-    assert recording.Part.open(elsewhere, "plant") is not None
+    assert recording.RolePart.open(elsewhere, "plant") is not None
 
 
 def test_a_place_in_which_nothing_was_recorded_goes(memory, tmp_path):
@@ -161,4 +161,4 @@ def test_it_stays_where_its_folder_has_no_room(record, memory, tmp_path, monkeyp
     another_run(tmp_path)
     assert (folder / "parts").is_symlink()
     assert {path.name for path in folder.iterdir()} == {"parts"}  # no incomplete copy
-    assert recording.Part.open(folder, "plant") is not None
+    assert recording.RolePart.open(folder, "plant") is not None
