@@ -89,7 +89,7 @@ class Loop:
         self.plant = RolePart.create(folder, "plant", ticks).signals
         self.controller = RolePart.create(folder, "controller", ticks).signals
         c = bench.controller
-        self._kept = [*bench.plant.records, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
+        self._kept = [*bench.plant.memory, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
         self._start = [a.copy() for a in self._kept]
         self.whole()
         self._rows = itertools.cycle(

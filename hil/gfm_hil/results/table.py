@@ -22,11 +22,13 @@ class Cell(NamedTuple):
         text: as ``shown`` writes values.
         style: a key of ``STYLES``, or "".
         link: address that a page links it to, or "".
+        classes: of HTML, further ones.
     """
 
     text: Any
     style: str = ""
     link: str = ""
+    classes: str = ""
 
 
 def shown(value: Any) -> str:
@@ -34,8 +36,6 @@ def shown(value: Any) -> str:
     match value:
         case Cell():
             return shown(value.text)
-        case str():
-            return value
         case None:
             return "–"
         case float():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gfm_design.norms.performance import Channel
+from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.api.tuned_law import channels_as_json as channels_as_json
 from gfm_hil.api.tuned_law import problem_name
 from gfm_hil.cli.common import OPTIONS
@@ -147,7 +147,7 @@ _W = {1: "P_ref", 2: "ω_g"}
 _Z = {1: "P_ref − p", 2: "p", 3: "ω_u", 4: "q + V/D_q"}
 
 
-def print_channels(name: str, channels: Sequence[Channel]) -> None:
+def print_channels(name: str, channels: Sequence[WeightedChannel]) -> None:
     """gamma and its channels as a table."""
     rows = [
         [f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", "∞" if np.isinf(c.omega) else c.omega]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_design.margins.all_margins import UnstableLoop
+from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
@@ -127,7 +127,7 @@ def _draw_at(draw: Callable[..., object]) -> Callable[[ClosedLoop, argparse.Name
 
 
 def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
-    found = loop.margins()
+    found = loop_margins(loop)
     channels = {c.name: c for c in (*found.u, *found.y)}
     wanted = _at(options) or [c.name for c in found.u]
     if unknown := [name for name in wanted if name not in channels]:

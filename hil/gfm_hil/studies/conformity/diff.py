@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from markupsafe import Markup
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
 from gfm_hil.results.page import render
-from gfm_hil.results.table import Table, shown
-from gfm_hil.studies.conformity.result import status
+from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_runtime.errors import printable
 
@@ -169,22 +167,8 @@ class ReportDiff:
 
     def page(self, old: str, new: str) -> str:
         """As an HTML page; the arguments are the reports' names."""
-        rows = [
-            [
-                row.change,
-                *(row.law, row.test, row.part, row.clause.clause),
-                Markup(" → ").join(status(x.verdict) if x else "–" for x in (row.old, row.new)),
-                *(row.value, row.clause.text),
-            ]
-            for row in self.rows
-        ]
-        heads = ("change", "law", "test", "part", "clause", "verdict", "measured", "what was found")
         return render(
-            "conformity.html",
-            title="Conformity: what changed",
-            head=f"{old} → {new}: {self.words}.",
-            notes=self.notes,
-            summary=Table(heads, rows, text=None),
+            "conformity_diff.html", title="Conformity: what changed", old=old, new=new, diff=self
         )
 
 

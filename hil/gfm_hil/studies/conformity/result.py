@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from markupsafe import Markup
-
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import printed
 from gfm_hil.results.page import render
 from gfm_hil.results.report import finite
-from gfm_hil.results.table import Cell, Table, shown
+from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.execute import PartResult, slug
 from gfm_hil.studies.conformity.model import KNOWN
 from gfm_hil.studies.conformity.sets import Case
@@ -150,14 +148,15 @@ class Conformity:
             write_text(folder / "results.json", json.dumps(self.plain(), indent=1) + "\n")
             write_text(folder / "junit.xml", self._junit())
             if len(self.laws) == 1:
-                write_text(folder / "report.html", self._page(self.laws[0]))
+                write_text(folder / "report.html", self._law_page(self.laws[0]))
                 return
             from gfm_hil.studies.conformity.figure import draw_matrix
 
             draw_matrix(folder / "matrix.png", self.laws, [c.id for c in self.cases], self.matrix)
             for law in self.laws:
-                write_text(folder / f"report-{slug(law)}.html", self._page(law))
-            write_text(folder / "report.html", self._overview())
+                write_text(folder / f"report-{slug(law)}.html", self._law_page(law))
+            page = self._page("conformity_matrix.html", "Conformity of laws")
+            write_text(folder / "report.html", page)
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
@@ -186,70 +185,15 @@ class Conformity:
         text = ElementTree.tostring(top, encoding="unicode", xml_declaration=True)
         return _NOT_XML.sub("\ufffd", text) + "\n"
 
-    def _page(self, law: str) -> str:
-        rows = [
-            [
-                status(self.matrix[law, c.id]),
-                Cell(f"{c.id}: {c.test.title}", link=f"#{slug(c.id)}"),
-                c.test.source.words(),
-            ]
-            for c in self.cases
-        ]
+    def _law_page(self, law: str) -> str:
+        return self._page("conformity.html", f"{law}: conformity", law=law)
+
+    def _page(self, template: str, title: str, **more: Any) -> str:
+        """A page about all of it, or of one law."""
         return render(
-            "conformity.html",
-            title=f"{law}: conformity",
-            head=self._head,
-            summary=Table(("verdict", "test", "source"), rows, text=None),
-            sections=[self._section(law, case) for case in self.cases],
-        )
-
-    def _section(self, law: str, case: Case) -> dict[str, Any]:
-        """What the page of a law says of a test."""
-        source = case.test.source
-        return {
-            "id": slug(case.id),
-            "verdict": status(self.matrix[law, case.id]),
-            "title": f"{case.id}: {case.test.title}",
-            "test": case.test,
-            "source": f"{source.words()}, {KNOWN[source.known]}",
-            "parts": [
-                (f, status(f.verdict), Table(_HEADS, [_row(v) for v in f.verdicts], text=None))
-                for f in self.of(law, case.id)
-            ],
-        }
-
-    def _overview(self) -> str:
-        pages = {law: f"report-{slug(law)}.html" for law in self.laws}
-        matrix = [
-            (
-                {"id": c.id, "title": c.test.title},
-                [
-                    (status(self.matrix[law, c.id], short=True), f"{page}#{slug(c.id)}")
-                    for law, page in pages.items()
-                ],
-            )
-            for c in self.cases
-        ]
-        sources = [(c.id, c.test.source.words(), KNOWN[c.test.source.known]) for c in self.cases]
-        return render(
-            "conformity_laws.html",
-            title="Conformity of laws",
-            head=self._head,
-            pages=pages,
-            matrix=matrix,
-            sources=Table(("test", "source", "known"), sources, text=None),
-        )
-
-    @property
-    def _head(self) -> str:
-        under = self.under
-        stage = "each law's own" if self.inner is None else self.inner
-        return (
-            f"Inner stage: {stage}. Converter: {under.plant.converter}, declared droop "
-            f"{100 * under.droop:g} %, power {under.P_min:g} to {under.P_max:g} p.u. gfmhil "
-            f"{version('gfmhil')}, {datetime.now(UTC).date()}. These verdicts are about this "
-            "model, not about a product; check each limit against the source before you rely on it."
-        )
+            template, title=title, found=self, slug=slug, known=KNOWN, signs=SIGNS, row=_row,
+            version=version("gfmhil"), date=datetime.now(UTC).date(), **more,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         count = list(self.matrix.values())
@@ -257,20 +201,11 @@ class Conformity:
         return "\n".join([f"<Conformity of {', '.join(self.laws)}: {told}", *self.failures, ">"])
 
 
-_HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "what was found")
-
-
-def _row(v: Verdict) -> list[Any]:
+def _row(v: Verdict) -> list[str]:
+    """What a page says of a clause, after its verdict."""
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
-    signal = printed(v.signal) or "–"
-    return [status(v.verdict), v.clause, signal, window, measured, v.limit, v.text]
-
-
-def status(verdict: str, short: bool = False) -> Markup:
-    """A verdict in its colour, as a word or its sign."""
-    badge = Markup('<span class="status {}">{}</span>')
-    return badge.format(verdict.split()[0], SIGNS[verdict] if short else verdict)
+    return [v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text]
 
 
 def _case(suite: Any, law: str, f: PartResult, name: str, verdict: str, text: str) -> None:
