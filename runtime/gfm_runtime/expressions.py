@@ -6,9 +6,15 @@ import ast
 import math
 import operator
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
 
 from gfm_runtime.errors import LawError, allowed
+from gfm_runtime.mistakes import lines
+from gfm_runtime.toml_file import Table
+
+T = TypeVar("T", bound=Table)
 
 _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -38,6 +44,25 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
     if isinstance(result, complex) or not math.isfinite(result):
         raise LawError(where, f"{value!r} gives {result}, not a finite number")
     return result
+
+
+def evaluated(where: str, table: T, parameters: Mapping[str, float]) -> T:
+    """The table with a number in place of each expression, checked again.
+
+    Raises:
+        LawError: naming ``where`` and the key: as ``evaluate``, and a number that is not allowed.
+    """
+    values = {name: getattr(table, name) for name in table.model_fields_set}
+    for name, value in values.items():
+        if isinstance(value, Table):
+            values[name] = evaluated(f"{where}.{name}", value, parameters)
+        elif type(table).model_fields[name].annotation == float | str:
+            values[name] = evaluate(f"{where}.{name}", value, parameters)
+    try:
+        return type(table)(**values)
+    except ValidationError as problem:
+        texts = lines(problem, type(table))
+        raise LawError(where, *texts, lines=[f"{where}.{text}" for text in texts]) from None
 
 
 def evaluate_each(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:

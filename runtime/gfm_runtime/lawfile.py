@@ -18,11 +18,11 @@ from gfm_runtime import elements
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
 from gfm_runtime.errors import LawError, Mistakes, allowed, meant
-from gfm_runtime.expressions import evaluate
-from gfm_runtime.inner_file import InnerSpec, build_inner, named_inner
+from gfm_runtime.expressions import evaluate, evaluated
+from gfm_runtime.inner import Inner
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
-from gfm_runtime.signals import U_NAMES
 from gfm_runtime.toml_file import Number, Table, parse_toml, read_text, read_toml
 
 
@@ -35,7 +35,6 @@ def _stage(value: Any) -> Any:
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class ElementSpec(Table):
@@ -57,30 +56,13 @@ Factors = Annotated[
 ]
 
 
-class ParameterSpec(Table):
-    """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
-
-    # of a file with a base, what the base says of the number may be missing here
-    model_config = ConfigDict(json_schema_extra=lambda schema: schema.pop("required"))
-
-    value: float = Field(allow_inf_nan=False, description="the number, in its unit")
-    unit: str = Field("", description="e.g. p.u. or 1/s")
-    source: str = Field("", description="where the number comes from")
-    free: Range | None = Field(None, description="[low, high] within which a synthesis may move it")
-    tied: str | None = Field(
-        None, description="expression that it follows while a synthesis moves others"
-    )
-
-
 def _valued(value: Any) -> Any:
     bare = isinstance(value, int | float) and not isinstance(value, bool)
     return {"value": value} if bare else value
 
 
 # a number alone may stand for the table
-Named = Annotated[
-    ParameterSpec, BeforeValidator(_valued, json_schema_input_type=ParameterSpec | float)
-]
+Named = Annotated[Parameter, BeforeValidator(_valued, json_schema_input_type=Parameter | float)]
 
 
 class ErrorMapSpec(Table):
@@ -99,28 +81,10 @@ class SetPoints(Table):
     E_u: Number = Field("V_ref", description="p.u., or the name of a reference")
 
 
-class LimitsSpec(Table):
-    """Clamps of u in p.u., times in s."""
+class SchedulePoint(Table):
+    """Gains of a schedule, in force up to the reactance X (p.u.)."""
 
-    i_u: Range = Field(default_factory=lambda: [-5.0, 5.0], description="[low, high], p.u.")
-    omega_u: Range = Field(default_factory=lambda: [0.9, 1.1], description="[low, high], p.u.")
-    E_u: Range = Field(default_factory=lambda: [0.0, 1.5], description="[low, high], p.u.")
-    T_t: float = Field(0.02, description="tracking time constant of the anti-windup, s")
-    T_off: float = Field(0.2, description="decay of the offset left by a change of law, s")
-
-
-class GridSpec(Table):
-    """The grid the defaults are meant for, as factors on the converter's."""
-
-    L_g: float = Field(1.0, gt=0, description="factor on the converter's line inductor")
-    R_g: float = Field(1.0, ge=0, description="factor on the converter's line resistor")
-    note: str = Field("the paper's grid", description="for people")
-
-
-class Stage(Table):
-    """One stage of a gain-scheduled law, in force up to the reactance X (p.u.)."""
-
-    X: float = Field(gt=0, description="upper end of the stage, p.u.; the last one has no end")
+    X: float = Field(gt=0, description="up to which reactance, p.u.; the last one has no end")
     parameters: dict[str, float] = Field(
         default_factory=dict, description="values that differ from [parameters]"
     )
@@ -129,7 +93,7 @@ class Stage(Table):
 class Schedule(Table):
     """Gains as a function of the estimated grid reactance."""
 
-    stages: Annotated[list[Stage], Field(min_length=2, max_length=8)] = Field(
+    stages: Annotated[list[SchedulePoint], Field(min_length=2, max_length=8)] = Field(
         description="two to eight"
     )
     hysteresis: float = Field(0.15, ge=0, lt=1, description="relative, on every boundary")
@@ -175,10 +139,10 @@ class LawFile(Table):
         default_factory=dict,
         description="the terms in braces of Table II, by cell: on the feedback only",
     )
-    limits: LimitsSpec = Field(LimitsSpec(), description="clamps of u, anti-windup")
-    home_grid: GridSpec = Field(GridSpec(), description="where the defaults are meant to be used")
+    limits: Limits = Field(Limits(), description="clamps of u, anti-windup")
+    home_grid: HomeGrid = Field(HomeGrid(), description="where the defaults are meant to be used")
     inner: Annotated[
-        InnerSpec | None, BeforeValidator(_stage, json_schema_input_type=InnerSpec | str | None)
+        Inner | None, BeforeValidator(_stage, json_schema_input_type=Inner | str | None)
     ] = Field(
         None,
         description="the inner stage between the law and the bridge: a table, or the name of a "
@@ -282,8 +246,8 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
             raise LawError(f"parameter {name}", f"unknown to {file.name}; {known}")
         numbers[name] = value
     parameters = {
-        name: Parameter(numbers[name], spec.unit, spec.source)
-        for name, spec in file.parameters.items()
+        name: one.model_copy(update={"value": numbers[name]})
+        for name, one in file.parameters.items()
     }
     mistakes = Mistakes()
     code, error_parameters = "linear", tuple[float, ...]()
@@ -293,13 +257,9 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
         _cells(name, cells, numbers, mistakes)
         for name, cells in (("phi", file.phi), ("psi", file.psi))
     )
-    limits = Limits()
-    with mistakes.noting():
-        low, high = zip(*(getattr(file.limits, name) for name in U_NAMES), strict=True)
-        limits = Limits(low, high, file.limits.T_t, file.limits.T_off)
     inner = None
     with mistakes.noting():
-        inner = None if file.inner is None else build_inner(file.inner, numbers)
+        inner = None if file.inner is None else evaluated("inner", file.inner, numbers)
     law = None
     with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
         law = Law(
@@ -311,9 +271,9 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
             u_0=(file.u_0.i_u, file.u_0.omega_u, file.u_0.E_u),
             error_map=code,
             error_parameters=error_parameters,
-            limits=limits,
+            limits=file.limits,
             parameters=parameters,
-            home_grid=HomeGrid(**file.home_grid.model_dump()),
+            home_grid=file.home_grid,
             inner=inner,
         )
     mistakes.check()

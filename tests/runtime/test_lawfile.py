@@ -95,7 +95,9 @@ def test_round_trip() -> None:
     assert law.psi == {(1, 1): D(0.1) * IF(1.0, 0.1)}
     assert law.u_0 == ("P_ref", 1.0, 1)
     assert (law.error_map, law.error_parameters) == ("hybrid-angle", (0.001, 0.1))
-    assert law.limits == Limits((-2.0, 0.95, 0.1), (2.0, 1.05, 1.2), 0.03, 0.4)
+    assert law.limits == Limits(
+        i_u=(-2.0, 2.0), omega_u=(0.95, 1.05), E_u=(0.1, 1.2), T_t=0.03, T_off=0.4
+    )
     assert (law.home_grid.L_g, law.home_grid.R_g, law.home_grid.note) == (5.0, 1.0, "weak")
     assert law.parameters["D_p"].source == "Table III"
 
@@ -220,9 +222,9 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "[1.05, 0.95]",
         ("limits.omega_u", "[1.05, 0.95]", "ascending"),
     ),
-    "one limit": ("[0.95, 1.05]", "[0.95]", ("limits.omega_u", "[0.95]", "at least 2")),
-    "T_t": ("T_t = 0.03", "T_t = 0.0", ("limits.T_t", "0 s", "> 0")),
-    "T_off": ("T_off = 0.4", "T_off = nan", ("limits.T_off", "nan", "> 0")),
+    "one limit": ("[0.95, 1.05]", "[0.95]", ("limits.omega_u", "missing")),
+    "T_t": ("T_t = 0.03", "T_t = 0.0", ("limits.T_t", "0.0", "greater than 0")),
+    "T_off": ("T_off = 0.4", "T_off = nan", ("limits.T_off", "nan", "greater than 0")),
     "home grid": ("L_g = 5.0", "L_g = 0.0", ("home_grid.L_g", "0.0", "greater than 0")),
     "not TOML": ("[psi]", "[psi", ("law file", "not TOML", "line")),
     "key twice": ("34 = {", "23 = {", ("law file", "not TOML")),
@@ -253,7 +255,7 @@ def test_all_mistakes_at_once() -> None:
 def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
     text = CUSTOM.replace('k = "D_p"', 'k = "D_q"').replace("34 = {", "46 = {")
     text = text.replace('type = "hybrid-angle"', 'type = "hybrid_angle"')
-    text = text.replace("[0.95, 1.05]", "[1.05, 0.95]").replace(", T_f = 0.001", "")
+    text = text.replace(", T_f = 0.001", "")
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(LawError) as caught:
@@ -265,7 +267,6 @@ def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
         "did you mean 'D_p'?",
         "phi.46: a cell is row",
         "did you mean 'hybrid-angle'?",
-        "limits.omega_u: [1.05, 0.95]",
         "phi_21: improper",
     ):
         assert sum(part in line for line in lines) == 1, part

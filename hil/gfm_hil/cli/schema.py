@@ -14,13 +14,13 @@ from gfm_hil.core.files import write_text
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
 from gfm_hil.studies.conformity.model import Test, UnderTest
-from gfm_runtime.inner_file import InnerSpec
+from gfm_runtime.inner import Inner
 from gfm_runtime.lawfile import LawFile
 
 MODELS: dict[str, TypeAdapter[Any]] = {
     "scenario": TypeAdapter(Scenario),
     "law": TypeAdapter(LawFile),
-    "inner": TypeAdapter(InnerSpec),
+    "inner": TypeAdapter(Inner),
     "campaign": TypeAdapter(CampaignFile),
     "conformity": TypeAdapter(Test),
     "converter": TypeAdapter(UnderTest),

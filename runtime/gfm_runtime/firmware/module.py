@@ -31,7 +31,7 @@ from gfm_runtime.firmware.c_text import (
 )
 from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
 from gfm_runtime.firmware.tick import SHARED, Tick
-from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, PRIORITIES
+from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
@@ -187,7 +187,7 @@ def check_modules(modules: Sequence[Module]) -> None:
         for field, allowed in possible.items() if module.stages else ():
             if module.record[field] not in allowed:
                 raise LawError(where, f"{field} = {module.record[field]} is not possible")
-        if module.stages and not module.record["k_c"] > 0:
+        if module.stages and module.record["inner"] != NONE and not module.record["k_c"] > 0:
             raise LawError(where, f"k_c = {module.record['k_c']} is not possible")
         for field in fields(module.stages)[1]:
             if not np.isfinite(module.record[field]).all():

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from gfm_runtime import inner
 from gfm_runtime.firmware.translate import (
     Algebra,
     Array,
@@ -26,7 +25,7 @@ from gfm_runtime.firmware.translate import (
     reached,
     without_unread,
 )
-from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE
+from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE, stage
 from gfm_runtime.kernel import (
     advance,
     advance_with_inner,
@@ -65,7 +64,7 @@ _OF_A_TICK = {
     "e_now": ("e", "the bridge's voltage"),
 }
 _PLACES = ("V_DC", "P", "OMEGA", "I_D", "I_Q", "V_D", "V_Q", "I_OD", "I_OQ")
-assert [getattr(inner, name) for name in _PLACES] == list(range(len(_PLACES)))
+assert [getattr(stage, name) for name in _PLACES] == list(range(len(_PLACES)))
 
 
 _IN_PLACE = """\
