@@ -55,7 +55,7 @@ TRIP = ("one protection, e.g. [plant.protection.over_current]", options.Trip)
 EVENTS = get_args(get_args(events.Event)[0])
 LAW_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("top level", lawfile.LawFile),
-    ("[error_map]", lawfile.ErrorMapSpec),
+    ("[error_map]", lawfile.ErrorMap),
     ("[u_0]", lawfile.SetPoints),
     ("[parameters.NAME]", law.Parameter),
     ("an element of [phi] or [psi]", lawfile.ElementSpec),

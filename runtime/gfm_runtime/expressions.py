@@ -8,6 +8,7 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 
 from gfm_runtime.errors import LawError, allowed
@@ -29,8 +30,10 @@ _UNARY: dict[type[ast.unaryop], Callable[[float], float]] = {
 }
 
 
-def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) -> float:
+def evaluate(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
     """A number, or an expression of + - * / ** ( ) over ``parameters``.
+
+    Of parameters that are arrays the result is one, and may hold values that are not finite.
 
     Raises:
         LawError: naming ``where``: syntax, an unknown name, a result that is no finite number.
@@ -41,7 +44,7 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
         raise LawError(where, "the expression is nested too deeply") from None
     except ArithmeticError as problem:
         raise LawError(where, f"{value!r}: {problem}") from None
-    if isinstance(result, complex) or not math.isfinite(result):
+    if np.ndim(result) == 0 and (isinstance(result, complex) or not math.isfinite(result)):
         raise LawError(where, f"{value!r} gives {result}, not a finite number")
     return result
 
@@ -65,11 +68,6 @@ def evaluated(where: str, table: T, parameters: Mapping[str, float]) -> T:
         raise LawError(where, *texts, lines=[f"{where}.{text}" for text in texts]) from None
 
 
-def evaluate_each(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
-    """As ``evaluate`` for parameters that are arrays; the result may hold values not finite."""
-    return _walk(where, _parse(where, value), parameters)
-
-
 def _parse(where: str, value: float | str) -> ast.expr:
     if not isinstance(value, str):
         return ast.Constant(value)
@@ -79,7 +77,7 @@ def _parse(where: str, value: float | str) -> ast.expr:
         raise LawError(where, f"{value!r} is no arithmetic expression") from None
 
 
-def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
+def _walk(where: str, node: ast.expr, parameters: Mapping[str, Any]) -> Any:
     match node:
         case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
             return float(number)

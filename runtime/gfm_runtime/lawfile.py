@@ -10,13 +10,13 @@ import re
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
-from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
+from gfm_runtime.error_maps import ERROR_MAPS, WITH_IMPEDANCE
 from gfm_runtime.errors import LawError, Mistakes, allowed, meant
 from gfm_runtime.expressions import evaluate, evaluated
 from gfm_runtime.inner import Inner
@@ -40,7 +40,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 class ElementSpec(Table):
     """One factor: its type and its numbers (T, T_f in s)."""
 
-    type: Literal["P", "I", "D", "PI", "PD", "IF", "O"] = Field(description="type of element")
+    type: elements.Kind = Field(description="type of element")
     k: Number | None = Field(None, description="gain")
     k_i: Number | None = Field(None, description="integral gain, 1/s")
     T: Number | None = Field(None, description="time constant, s")
@@ -65,12 +65,12 @@ def _valued(value: Any) -> Any:
 Named = Annotated[Parameter, BeforeValidator(_valued, json_schema_input_type=Parameter | float)]
 
 
-class ErrorMapSpec(Table):
-    """The errors on which Phi(s) acts; R and X (p.u.) only for hybrid-angle."""
+class ErrorMap(Table):
+    """The errors on which Phi(s) acts; R and X (p.u.) of the line where the map needs them."""
 
-    type: str = Field("linear", description="linear, dc-energy, dvoc or hybrid-angle")
-    R: Number | None = Field(None, description="resistance of the line, p.u.; hybrid-angle only")
-    X: Number | None = Field(None, description="reactance of the line, p.u.; hybrid-angle only")
+    type: str = Field("linear", description=", ".join(ERROR_MAPS))
+    R: Number | None = Field(None, description=f"line's, p.u.; {', '.join(WITH_IMPEDANCE)} only")
+    X: Number | None = Field(None, description=f"line's, p.u.; {', '.join(WITH_IMPEDANCE)} only")
 
 
 class SetPoints(Table):
@@ -127,7 +127,7 @@ class LawFile(Table):
     )
     title: str = Field(description="for people")
     source: str = Field(description="where the law and its numbers come from")
-    error_map: ErrorMapSpec = Field(ErrorMapSpec(), description="what Φ acts on")
+    error_map: ErrorMap = Field(ErrorMap(), description="what Φ acts on")
     u_0: SetPoints = Field(SetPoints(), description="set-points of u")
     parameters: dict[Name, Named] = Field(
         default_factory=dict, description="named numbers for the expressions"
@@ -153,45 +153,20 @@ class LawFile(Table):
     )
 
 
-_NUMBERS = {
-    "P": ({"k"}, {"k"}),
-    "I": ({"T"}, {"k_i"}),
-    "D": ({"T"}, {"T"}),
-    "PI": ({"k", "T"}, {"k", "k_i"}),
-    "PD": ({"k", "T"}, {"k", "T"}),
-    "IF": ({"k", "T"}, {"k", "T"}),
-    "O": ({"k", "T", "xi"}, {"k", "T", "xi"}),
-}
-
-
-def build_element(where: str, spec: ElementSpec, parameters: Mapping[str, float]) -> Element:
-    """One factor with its numbers evaluated.
+def build_element(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> Element:
+    """One factor with its numbers evaluated; the parameters may be arrays.
 
     Raises:
         LawError: naming the cell, the number and what is allowed.
     """
-    given = {k: v for k, v in spec.model_dump(exclude={"type", "T_f"}).items() if v is not None}
-    if set(given) not in _NUMBERS[spec.type]:
-        forms = " or ".join(sorted({str(sorted(form)) for form in _NUMBERS[spec.type]}))
-        raise LawError(where, f"{spec.type} takes {forms}, not {sorted(given)}")
-    numbers = {k: evaluate(f"{where}.{k}", v, parameters) for k, v in given.items()}
-    if "k_i" in numbers:  # k + k_i/s, the form the paper prints its gains in
-        integral = _made(f"{where}.k_i", "P", k=numbers["k_i"]) * elements.I(1.0)
-        element = _made(where, "P", k=numbers.get("k", 0.0)) + integral
-    else:
-        element = _made(where, spec.type, **numbers)
-    if spec.T_f is not None:
-        T_f = evaluate(f"{where}.T_f", spec.T_f, parameters)
-        element = element * _made(f"{where}.T_f", "IF", k=1.0, T=T_f)
-    return element
+    numbers = element_numbers(where, spec, parameters)
+    return elements.make(where, spec.type, numbers)
 
 
-def _made(where: str, kind: str, **numbers: float) -> Element:
-    try:
-        made: Element = getattr(elements, kind)(**numbers)
-    except LawError as problem:
-        raise LawError(f"{where}, {kind}", problem.why) from None
-    return made
+def element_numbers(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of a factor by name, its expressions evaluated."""
+    given = spec.model_dump(exclude={"type"}, exclude_none=True)
+    return {name: evaluate(f"{where}.{name}", value, parameters) for name, value in given.items()}
 
 
 def _cells(
@@ -220,9 +195,9 @@ def _error_map(file: LawFile, numbers: Mapping[str, float]) -> tuple[str, tuple[
         known = f"use one of {sorted(ERROR_MAPS)}{meant(code, ERROR_MAPS)}"
         raise LawError("error_map.type", f"{code!r} is unknown; {known}")
     impedance = (file.error_map.R, file.error_map.X)
-    needs = ERROR_MAPS[code] == HYBRID_ANGLE
+    needs = code in WITH_IMPEDANCE
     if needs != (None not in impedance) or (not needs and impedance != (None, None)):
-        raise LawError("error_map", "R and X belong to hybrid-angle, which needs both")
+        raise LawError("error_map", f"R and X belong to {WITH_IMPEDANCE}, which need both")
     values = tuple(
         evaluate(f"error_map.{n}", v, numbers)
         for n, v in zip("RX", impedance, strict=True)

@@ -330,7 +330,7 @@ def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> c
     if inner is None:
         return e
     if not limited:
-        inner = replace(inner, I_max=math.inf)
+        inner = inner.model_copy(update={"I_max": math.inf})
     i, v, i_o = (complex(x[k], x[k + 1]) for k in (0, 2, 4))
     try:
         return inner.internal_voltage(i, v, i_o, e, float(u[1]))

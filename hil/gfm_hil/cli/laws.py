@@ -54,7 +54,7 @@ def call(options: argparse.Namespace) -> int:
                     for k in sorted({*file.phi, *file.psi})
                 },
                 "stages": len(laws.laws),
-                "home_grid": asdict(first.home_grid),
+                "home_grid": first.home_grid.model_dump(),
                 "source": " ".join(first.source.split()),
             }
         )  # fmt: skip
@@ -148,7 +148,7 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
             for n, p in law.parameters.items()
         },
         "inner": None if law.inner is None else {"type": law.inner.kind, **acting(law.inner)},
-        "home_grid": asdict(law.home_grid),
+        "home_grid": law.home_grid.model_dump(),
         "order": discrete[0].order,
         "discrete": [
             {"T_s": d.T_s, **{n: getattr(d, n).tolist() for n in MATRICES}} for d in discrete
