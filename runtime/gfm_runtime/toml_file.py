@@ -52,7 +52,9 @@ def _not_negative(value: Any) -> float | str:
 # A number or an expression over the law's parameters: a float once the expressions are
 # ``evaluated``. One validator, because a union would give two errors a mistake.
 if TYPE_CHECKING:
-    Number = Positive = NotNegative = float
+    Number = float
+    Positive = float
+    NotNegative = float
 else:
     Number = Annotated[float | str, PlainValidator(_number, float | str)]
     Positive = Annotated[float | str, PlainValidator(_positive, float | str)]

@@ -39,13 +39,10 @@ def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
                 good &= usable(own)
                 product = product * make(f"{matrix}_{key}", spec.type, own)
             cells[matrix][key] = product
-    rows = [
-        row_of(
-            *([of.get(f"{i + 1}{j + 1}", ZERO) for j in range(NY)] for of in cells.values()),
-            smooth=True,
-        )
-        for i in range(NU)
-    ]
+    rows = []
+    for i in range(NU):
+        phi, psi = ([of.get(f"{i + 1}{j + 1}", ZERO) for j in range(NY)] for of in cells.values())
+        rows.append(row_of(phi, psi, smooth=True))
     out = assemble(rows, [getattr(file.u_0, name) for name in U_NAMES])
     A, D_y = (np.broadcast_to(m, (len(good), *m.shape[-2:])).copy() for m in (out.A, out.D_y))
     A[~good], D_y[~good] = np.nan, np.nan

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np

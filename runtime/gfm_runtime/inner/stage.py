@@ -63,7 +63,7 @@ class PowerLimiter(Table):
     @model_validator(mode="after")
     def _ascending(self) -> PowerLimiter:
         numbers = isinstance(self.P_max, float) and isinstance(self.P_min, float)
-        if numbers and not self.P_max > self.P_min:  # type: ignore[redundant-expr]
+        if numbers and not self.P_max > self.P_min:
             raise ValueError(f"P_max = {self.P_max!r} must be above P_min = {self.P_min!r}")
         return self
 
