@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.benchmark.attribution import CAUSES, attribute
-from gfm_hil.benchmark.contenders import memory_folder
-from gfm_hil.benchmark.jitter import HYBRID, lost, pace_both, pace_here
-from gfm_hil.benchmark.pair import pair
+from gfm_hil.bench.attribution import CAUSES, attribute
+from gfm_hil.bench.contenders import memory_folder
+from gfm_hil.bench.jitter import HYBRID, lost, pace_both, pace_here
+from gfm_hil.bench.pair import pair
 from gfm_hil.core.terminal import markdown
 from gfm_hil.realtime.environment import environment, may_sched_fifo
 from gfm_hil.recording.columns import TIMES_OF

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.benchmark.inproc_loop import Loop
-from gfm_hil.benchmark.rounds import Spread, ratio, seconds, take_turns
+from gfm_hil.bench.inproc_loop import Loop
+from gfm_hil.bench.rounds import Spread, ratio, seconds, take_turns
 from gfm_hil.realtime.environment import environment
 
 try:

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import zmq
 
-from gfm_hil.benchmark.contenders import FRAME, Contender, free_port, memory_folder
-from gfm_hil.benchmark.pair import Policy, pair
-from gfm_hil.benchmark.pingpong import LinkEnd
-from gfm_hil.benchmark.rounds import Spread, ratio
+from gfm_hil.bench.contenders import FRAME, Contender, free_port, memory_folder
+from gfm_hil.bench.pair import Policy, pair
+from gfm_hil.bench.pingpong import LinkEnd
+from gfm_hil.bench.rounds import Spread, ratio
 from gfm_hil.core.roles import Role
 from gfm_hil.core.terminal import markdown
 from gfm_hil.links.zeromq.curve import Curve, write_keys

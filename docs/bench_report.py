@@ -14,9 +14,9 @@ from typing import Any
 
 from _figures.common import FIGURES, TABLES
 
-from gfm_hil.benchmark import tables
-from gfm_hil.benchmark.plots import figures
-from gfm_hil.benchmark.result import read_result
+from gfm_hil.bench import tables
+from gfm_hil.bench.plots import figures
+from gfm_hil.bench.result import read_result
 
 _DRAWN = ("latency", "misses", "jitter", "lockstep")  # the kernel's says no more than its table
 _BADGE = {

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from gfm_hil.core.terminal import markdown
+from gfm_hil.ports.streams.metrics import METRICS
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.results.export import FORMATS
-from gfm_hil.telemetry.metrics import METRICS
 
 
 def export_formats() -> str:

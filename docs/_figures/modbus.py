@@ -16,7 +16,7 @@ from _figures.common import FIGURES, GREY, dress
 from matplotlib import pyplot as plt
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 
-import gfm_hil.modbus
+import gfm_hil.ports.modbus
 
 SCENARIO = """
 title = "A client's session"
@@ -60,7 +60,7 @@ def session() -> None:
 
 
 def _device(port: int) -> Any:
-    models = str(Path(gfm_hil.modbus.__file__).parent / "models")
+    models = str(Path(gfm_hil.ports.modbus.__file__).parent / "models")
     sunspec.set_model_defs_path([models, sunspec.models_dir])
     device = SunSpecModbusClientDeviceTCP(slave_id=1, ipport=port, timeout=10)
     device.scan()

@@ -18,16 +18,15 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
+from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.recording.parts import Part
-from gfm_hil.results.runner import run_scenario
-from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
-from gfm_hil.scenario.profiles import read_profile
-from gfm_hil.scenario.toml_out import scenario_toml
-from gfm_hil.scope.record import open_record
+from gfm_hil.run.runner import run_scenario
+from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario, scenario_toml
+from gfm_hil.scenario.events.grid_profile import read_profile
 from gfm_hil.studies.campaign import loading
 from gfm_hil.studies.conformity.diff import Results, compare_results, read_results
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test
-from gfm_hil.telemetry.follow import Follower
 from gfm_runtime import LawError, discretise, get_law, load_law
 from gfm_runtime.firmware import STYLES, elf_a2l, golden, make_modules
 from gfm_runtime.firmware.report import read_report, reports
@@ -289,7 +288,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
         "",
     )  # fmt: skip
     finished, going, held = place / "finished", place / "going", place / "held"
-    run_scenario(scenario, finished, figures=False)
+    run_scenario(scenario, finished)
     held.mkdir(0o700)
     going.mkdir()
     (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")

@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 
-from gfm_hil.benchmark.c_code import compile_twin
-from gfm_hil.benchmark.contenders import FRAME, Contender
-from gfm_hil.benchmark.kernel import compare
-from gfm_hil.benchmark.peers import has_iceoryx2
+from gfm_hil.bench.c_code import compile_twin
+from gfm_hil.bench.contenders import FRAME, Contender
+from gfm_hil.bench.kernel import compare
+from gfm_hil.bench.peers import has_iceoryx2
 from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
@@ -189,9 +189,7 @@ def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) 
 def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path: Path) -> None:
     """The load's processes are stopped when their parent is killed: SIGTERM would not end them."""
     mark = f"GFMHIL_TEST={uuid.uuid4()}"
-    program = (
-        "from gfm_hil.benchmark.cpu_load import cpu_load\nwith cpu_load():\n    input('ready')"
-    )
+    program = "from gfm_hil.bench.cpu_load import cpu_load\nwith cpu_load():\n    input('ready')"
     with subprocess.Popen(
         [sys.executable, "-c", program], env={**os.environ, **dict([mark.split("=")])},
         stdin=subprocess.PIPE, stdout=subprocess.PIPE,

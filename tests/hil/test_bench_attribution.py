@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil.benchmark.attribution import CAUSES, attribute, bursts, counts, missed_ticks
+from gfm_hil.bench.attribution import CAUSES, attribute, bursts, counts, missed_ticks
 
 T = 100_000  # ns
 TICKS = 500

@@ -14,8 +14,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
-from gfm_hil.benchmark.compare import compare, holm, rank_test
-from gfm_hil.benchmark.result import FORMAT
+from gfm_hil.bench.compare import compare, holm, rank_test
+from gfm_hil.bench.result import FORMAT
 from gfm_hil.cli import main
 
 VALUES = st.floats(0.1, 100.0)

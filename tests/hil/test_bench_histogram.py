@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gfm_hil.benchmark.histogram import (
+from gfm_hil.bench.histogram import (
     BUCKETS,
     RESOLUTION,
     dense,

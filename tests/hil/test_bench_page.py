@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_hil.benchmark.histogram import summary
-from gfm_hil.benchmark.page import write_page
-from gfm_hil.benchmark.plots import figures
-from gfm_hil.benchmark.rounds import Spread
-from gfm_hil.benchmark.tables import tables
+from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.page import write_page
+from gfm_hil.bench.plots import figures
+from gfm_hil.bench.rounds import Spread
+from gfm_hil.bench.tables import tables
 from gfm_hil.realtime.environment import caveats, environment
 
 

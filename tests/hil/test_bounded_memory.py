@@ -15,8 +15,8 @@ import pytest
 import zmq
 
 from gfm_hil.links.base import LONGEST
+from gfm_hil.ports.streams import blocks
 from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF
-from gfm_hil.telemetry import blocks
 
 pytestmark = pytest.mark.processes
 
@@ -137,7 +137,7 @@ def test_the_longest_message_gets_through_encrypted(tmp_path):
 
 PUBLISHER = """
 import sys, time
-from gfm_hil.telemetry.publish import Ports, Publisher
+from gfm_hil.ports.streams.publish import Ports, Publisher
 with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:
     print(publisher.samples, publisher.blocks, flush=True)
     while True:
@@ -169,7 +169,7 @@ def test_a_long_subscription_costs_the_stream_nothing(which, child, attack_now):
 
 READER = """
 import sys
-from gfm_hil.telemetry import BlockReader
+from gfm_hil.ports.streams import BlockReader
 with BlockReader({where!r}) as reader:
     print("ready", flush=True)
     sys.stdin.readline()
@@ -238,7 +238,7 @@ OPERATOR = """
 import sys
 from pathlib import Path
 from gfm_hil.core.errors import UserError
-from gfm_hil.operator import client
+from gfm_hil.ports import commands as client
 client._ANSWER_MS = 1000
 operator = client.Operator(Path({folder!r}))
 print("ready", flush=True)

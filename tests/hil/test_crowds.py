@@ -20,8 +20,8 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 from websockets.sync.client import ClientConnection, connect
 
-from gfm_hil.modbus.image import VENDOR
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.modbus.image import VENDOR
 
 from ..support.modbus import MODELS, SCENARIO, at
 from ..support.processes import GFMHIL, PATIENCE_S, takes_commands, wait_for

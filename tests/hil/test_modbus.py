@@ -18,8 +18,8 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP, SunSpecModbusClientException
 from sunspec2.modbus.modbus import ModbusClientException
 
-from gfm_hil.modbus.image import VENDOR
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.modbus.image import VENDOR
 
 from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
 from ..support.processes import GFMHIL, running, wait_for

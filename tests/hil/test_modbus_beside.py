@@ -12,7 +12,7 @@ import sunspec2.device as sunspec
 from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP
 
-from gfm_hil.modbus.image import VENDOR
+from gfm_hil.ports.modbus.image import VENDOR
 
 from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
 from ..support.processes import GFMHIL, PATIENCE_S, free_port, running

@@ -16,11 +16,11 @@ import pytest
 from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.listener import Listener
-from gfm_hil.modbus import connection, serve
-from gfm_hil.modbus.connection import CLIENTS, Server
-from gfm_hil.modbus.image import VENDOR
-from gfm_hil.modbus.serve import Address
+from gfm_hil.ports.listener import Listener
+from gfm_hil.ports.modbus import connection, serve
+from gfm_hil.ports.modbus.connection import CLIENTS, Server
+from gfm_hil.ports.modbus.image import VENDOR
+from gfm_hil.ports.modbus.serve import Address
 
 from ..support.modbus import SUNS
 from ..support.modbus_device import Bench

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymodbus.constants import ExcCodes
 
-from gfm_hil.modbus.device import TICK_S
-from gfm_hil.modbus.image import BASE, VENDOR, Image
-from gfm_hil.modbus.measures import Measures
+from gfm_hil.ports.modbus.device import TICK_S
+from gfm_hil.ports.modbus.image import BASE, VENDOR, Image
+from gfm_hil.ports.modbus.measures import Measures
 from gfm_runtime.states import SAFE
 
 from ..support.modbus_device import LAWS, S_N, Bench

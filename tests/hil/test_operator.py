@@ -13,7 +13,7 @@ import pytest
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.announcement import present
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
 
 from ..support.processes import PATIENCE_S, running, wait_for

@@ -14,11 +14,11 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from gfm_hil.scope import server, session
-from gfm_hil.scope.access import Access
-from gfm_hil.scope.record import open_record
-from gfm_hil.scope.server import Scope
-from gfm_hil.scope.view import View
+from gfm_hil.ports.scope import server, session
+from gfm_hil.ports.scope.access import Access
+from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.server import Scope
+from gfm_hil.ports.scope.view import View
 
 from ..support.processes import takes_commands, wait_for
 from ..support.scope import Rig, mute, rig, serving, words

@@ -20,10 +20,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from gfm_hil.cli import main
-from gfm_hil.scope.access import Access
-from gfm_hil.scope.record import open_record
-from gfm_hil.scope.server import Scope, static_files
-from gfm_hil.scope.view import HEAD
+from gfm_hil.ports.scope.access import Access
+from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.server import Scope, static_files
+from gfm_hil.ports.scope.view import HEAD
 
 from ..support.scope import addresses, serving, words
 

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 
 from gfm_hil.engine.announcement import present
-from gfm_hil.modbus.image import Image
-from gfm_hil.modbus.measures import Measures
-from gfm_hil.operator import Operator
-from gfm_hil.scenario.model import load_scenario
-from gfm_hil.scope.channels import make_channels
-from gfm_hil.scope.record import open_record
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.modbus.image import Image
+from gfm_hil.ports.modbus.measures import Measures
+from gfm_hil.ports.scope.channels import make_channels
+from gfm_hil.ports.scope.record import open_record
+from gfm_hil.scenario import load_scenario
 
 from ..support.modbus import GFMHIL
 from ..support.processes import PATIENCE_S, has_run, places, roles_of, signals, summary, wait_for

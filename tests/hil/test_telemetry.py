@@ -18,14 +18,14 @@ import zmq
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.streams import BlockReader
+from gfm_hil.ports.streams.blocks import block_dtype, messages
+from gfm_hil.ports.streams.follow import Follower, Rows
+from gfm_hil.ports.streams.publish import Ports, Publisher
+from gfm_hil.ports.streams.samples import Sampler
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
 from gfm_hil.recording.parts import Part
-from gfm_hil.telemetry import BlockReader
-from gfm_hil.telemetry.blocks import block_dtype, messages
-from gfm_hil.telemetry.follow import Follower, Rows
-from gfm_hil.telemetry.publish import Ports, Publisher
-from gfm_hil.telemetry.samples import Sampler
 
 from ..support.processes import PATIENCE_S, takes_commands, wait_for
 

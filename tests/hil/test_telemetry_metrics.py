@@ -14,11 +14,11 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from gfm_hil.cli import main
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.streams.follow import Follower
+from gfm_hil.ports.streams.metrics import METRICS
+from gfm_hil.ports.streams.prometheus import RunCollector, serve_metrics
 from gfm_hil.recording.parts import Part
-from gfm_hil.telemetry.follow import Follower
-from gfm_hil.telemetry.metrics import METRICS
-from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics
 
 from ..support.processes import PATIENCE_S, wait_for
 

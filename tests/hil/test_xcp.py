@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
+from gfm_hil.ports.xcp.lines import CanFd, packed
+from gfm_hil.ports.xcp.memory import Memory
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.recording.log import read_log
-from gfm_hil.xcp.lines import CanFd, packed
-from gfm_hil.xcp.memory import Memory
 from gfm_runtime import law_file
 
 from ..support.processes import GFMHIL, PATIENCE_S, free_port, running

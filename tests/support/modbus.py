@@ -6,7 +6,7 @@ import re
 import subprocess
 from pathlib import Path
 
-import gfm_hil.modbus
+import gfm_hil.ports.modbus
 
 from .processes import GFMHIL
 
@@ -32,7 +32,7 @@ over_current = { enabled = false }
 over_frequency = { enabled = false }
 under_frequency = { enabled = false }
 """
-MODELS = str(Path(gfm_hil.modbus.__file__).parent / "models")
+MODELS = str(Path(gfm_hil.ports.modbus.__file__).parent / "models")
 SUNS = 40000
 
 

@@ -22,9 +22,9 @@ import zmq
 from pymodbus.client import ModbusTcpClient
 from websockets.sync.client import connect
 
-from gfm_hil.modbus.image import BASE, VENDOR, Image
-from gfm_hil.operator import Operator
-from gfm_hil.telemetry import BlockReader
+from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.modbus.image import BASE, VENDOR, Image
+from gfm_hil.ports.streams import BlockReader
 
 MB = 1e6
 SETTLE_S = 15.0  # how long a process may take to free the resources of former clients

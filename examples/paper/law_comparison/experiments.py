@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_hil.studies.campaign.worker import kept, simulate
 
 START = "mimo-gfm"  # the law that the switchover comes from
@@ -32,7 +32,7 @@ def experiment(name: str, law: str) -> dict[str, Any]:
         law: catalogue name or law file.
 
     Returns:
-        status, reason, the metrics of the event (``results.metrics``), i_peak [p.u.], dp (largest
+        status, reason, the metrics of the event (``run.metrics``), i_peak [p.u.], dp (largest
         deviation of p from before the event), bump_pu of a switchover, and trace, p over time
         every ``TRACE_EVERY`` ticks.
     """

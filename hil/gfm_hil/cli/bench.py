@@ -15,7 +15,7 @@ from rich.progress import BarColumn, TaskProgressColumn
 from gfm_hil.cli.common import new_folder, progress
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.links import link_names
-from gfm_hil.results.run_folder import check_free
+from gfm_hil.run.run_folder import check_free
 
 _WIDTH = 100  # columns: a table cut short is no use in a file
 
@@ -111,10 +111,10 @@ def _add_compare(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry a measuring command out; returns the exit code."""
-    from gfm_hil.benchmark.page import write_page
-    from gfm_hil.benchmark.plans import steps_of
-    from gfm_hil.benchmark.result import Recorder, write_result
-    from gfm_hil.benchmark.tables import tables
+    from gfm_hil.bench.page import write_page
+    from gfm_hil.bench.plans import steps_of
+    from gfm_hil.bench.result import Recorder, write_result
+    from gfm_hil.bench.tables import tables
 
     steps = steps_of(options)
     folder = new_folder(options.out, f"bench-{options.kind}")
@@ -136,9 +136,9 @@ def call(options: argparse.Namespace) -> int:
 
 def compare_call(options: argparse.Namespace) -> int:
     """Carry the comparison out; returns the exit code."""
-    from gfm_hil.benchmark.compare import compare, comparison_table
-    from gfm_hil.benchmark.interleave import interleave
-    from gfm_hil.benchmark.result import read_result
+    from gfm_hil.bench.compare import compare, comparison_table
+    from gfm_hil.bench.interleave import interleave
+    from gfm_hil.bench.result import read_result
 
     remarks = []
     if options.interleave is None:

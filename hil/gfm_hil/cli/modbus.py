@@ -45,8 +45,8 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    from gfm_hil.modbus.image import vendor_model
-    from gfm_hil.modbus.serve import LOCAL, Address, begun, serve
+    from gfm_hil.ports.modbus.image import vendor_model
+    from gfm_hil.ports.modbus.serve import LOCAL, Address, begun, serve
 
     if options.vendor_model:
         print(vendor_model(), end="")

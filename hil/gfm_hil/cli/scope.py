@@ -46,9 +46,9 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     encryption, ports = check(options)
     need_websockets()
-    from gfm_hil.scope.access import Access
-    from gfm_hil.scope.record import begun, open_record
-    from gfm_hil.scope.server import Scope, run_scope
+    from gfm_hil.ports.scope.access import Access
+    from gfm_hil.ports.scope.record import begun, open_record
+    from gfm_hil.ports.scope.server import Scope, run_scope
 
     while options.wait and not begun(options.folder):
         time.sleep(_LOOK_S)

@@ -22,7 +22,7 @@ _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 def add(command: argparse.ArgumentParser) -> None:
     command.description = (
         "Samples for PlotJuggler's ZeroMQ subscriber (JSON) and, at the next port, "
-        "every tick in blocks for gfm_hil.telemetry.BlockReader. Ends with the run."
+        "every tick in blocks for gfm_hil.ports.streams.BlockReader. Ends with the run."
     )
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument("--wait", action="store_true", help="wait for the run to begin")
@@ -45,9 +45,9 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     _check(options)
+    from gfm_hil.ports.streams.follow import Follower
+    from gfm_hil.ports.streams.publish import Ports, Publisher
     from gfm_hil.recording.live import begun
-    from gfm_hil.telemetry.follow import Follower
-    from gfm_hil.telemetry.publish import Ports, Publisher
 
     follower = None if options.wait and not begun(options.folder) else Follower(options.folder)
     following = options.port + 1 if options.port else 0
@@ -58,7 +58,7 @@ def call(options: argparse.Namespace) -> int:
         print(f"blocks:  {publisher.blocks}")
         collector = None
         if options.prometheus is not None:
-            from gfm_hil.telemetry.prometheus import RunCollector, serve_metrics
+            from gfm_hil.ports.streams.prometheus import RunCollector, serve_metrics
 
             collector = RunCollector()
             port = stack.enter_context(serve_metrics(collector, options.host, options.prometheus))

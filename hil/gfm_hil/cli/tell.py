@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.operator import Operator
+from gfm_hil.ports.commands import Operator
 from gfm_runtime.errors import meant
 from gfm_runtime.signals import REF_NAMES
 

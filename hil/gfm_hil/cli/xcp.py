@@ -45,9 +45,9 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     from gfm_hil.engine.announcement import present
+    from gfm_hil.ports.xcp.lines import CanFd, Line, Udp
+    from gfm_hil.ports.xcp.serve import live_a2l, serve
     from gfm_hil.recording.live import begun
-    from gfm_hil.xcp.lines import CanFd, Line, Udp
-    from gfm_hil.xcp.serve import live_a2l, serve
 
     line: Line = Udp(options.host, options.port, options.plain)
     if options.can is not None:

@@ -1,0 +1,204 @@
+"""Time of the whole closed loop in one process, and of its parts.
+
+The loop is that of ``gfmhil run --link inproc``, on a scenario's own records, from a step of P_ref
+at tick 0. The parts are timed separately with the data of the whole run: the plant gets the
+recorded u of every tick, the controller the y. The processor can overlap the ticks of a part alone,
+but not of the closed loop, so the parts need not add up to the whole.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
+from numba.core.runtime.nrt import rtsys
+
+from gfm_hil.bench.rounds import RUNS, Spread, quickest, seconds, take_turns
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.inproc import run_ticks, stack
+from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.recording.parts import Part
+from gfm_hil.recording.recorder import record_command, record_controller, record_sample
+from gfm_hil.scenario import load_scenario
+from gfm_plant import plant_advance, plant_sample
+from gfm_runtime.compiled import compiled
+from gfm_runtime.controller import control
+from gfm_runtime.signals import NU, NY
+
+# Laws whose defaults are stable on the paper's stiff grid; the last row adds the rig's noise,
+# sensor filters, quantisation and delay.
+LAWS = (
+    "mimo-gfm", "mimo-gfm-scheduled", "vsg-2", "vsg-11", "droop-2", "droop-5", "psc-2",
+    "matching-1", "hybrid-angle",
+)  # fmt: skip
+RIG = "mimo-gfm, rig"
+
+
+@compiled
+def plant_alone(plant, y, u, us):
+    """The plant under the recorded commands ``us`` (ticks, 3)."""
+    for k in range(len(us)):
+        for i in range(NU):
+            u[i] = us[k, i]
+        plant_sample(plant, 0, y)
+        plant_advance(plant, u)
+
+
+@compiled
+def plants_half(plant, y, u, us, rows):
+    """The tick of the plant's process without the link: the plant and its recording."""
+    for k in range(len(us)):
+        for i in range(NU):
+            u[i] = us[k, i]
+        plant_sample(plant, 0, y)
+        record_sample(rows[k], y, plant, 0)
+        record_command(rows[k], u)
+        plant_advance(plant, u)
+
+
+@compiled
+def controller_alone(ctl, laws, states, est, y, u, ys):
+    """The controller on the recorded measurements ``ys`` (ticks, 5)."""
+    for k in range(len(ys)):
+        for j in range(NY):
+            y[j] = ys[k, j]
+        control(ctl, laws, states, est, y, u)
+
+
+@compiled
+def recording_alone(plant, ctl, states, est, y, u, plant_rows, controller_rows):
+    """Record the same tick into every row."""
+    for k in range(len(plant_rows)):
+        record_controller(controller_rows[k], ctl, states, est)
+        record_sample(plant_rows[k], y, plant, 0)
+        record_command(plant_rows[k], u)
+
+
+class Loop:
+    """A bench that can be reset to its start, and files for its recording."""
+
+    def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
+        bench = make_bench(load_scenario(scenario, law=law, in_process=True))
+        bench.controller.set("P_ref", 0.8)
+        self.bench, self.ticks = bench, ticks
+        self.T_s = bench.scenario.T_s
+        self.plant = Part.create(folder, "plant", ticks).signals
+        self.controller = Part.create(folder, "controller", ticks).signals
+        c = bench.controller
+        self._kept = [*bench.plant.records, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
+        self._start = [a.copy() for a in self._kept]
+        self.whole()
+        self._rows = itertools.cycle(
+            np.split(Part.create(folder / "long", "plant", RUNS * ticks).signals, RUNS)
+        )
+        self._y, self._u = np.split(self.plant[:, : NY + NU].copy(), [NY], axis=1)
+
+    def reset(self) -> Bench:
+        for array, start in zip(self._kept, self._start, strict=True):
+            array[:] = start
+        return self.bench
+
+    def whole(self, ticks: int | None = None) -> float:
+        """ns per tick of the closed loop.
+
+        Raises:
+            UserError: the run ended early, so that there is nothing to time.
+        """
+        b, n = self.reset(), ticks or self.ticks
+        done, controllers = 0, stack([b])
+
+        def run() -> None:
+            nonlocal done
+            done = run_ticks(
+                b.plant.records, controllers, self.plant[None], self.controller[None], 0, n
+            )
+
+        time = seconds(run) / n * 1e9
+        if done != n:
+            raise UserError(f"{b.controller.active}: tripped or safe at tick {done - 1} of {n}")
+        return time
+
+    def plant_part(self) -> float:
+        """ns per tick of the plant alone."""
+        b = self.reset()
+        return self._per_tick(lambda: plant_alone(b.plant.records, b.y, b.u, self._u))
+
+    def plants_half(self) -> float:
+        """ns per tick of the plant and its recording, into rows not written lately, as in a run."""
+        b, rows = self.reset(), next(self._rows)
+        return self._per_tick(lambda: plants_half(b.plant.records, b.y, b.u, self._u, rows))
+
+    def controller_part(self) -> float:
+        """ns per tick of the controller alone."""
+        b, c = self.reset(), self.bench.controller
+        return self._per_tick(
+            lambda: controller_alone(c.ctl, c.laws, c.states, c.est, b.y, b.u, self._y)
+        )
+
+    def recording_part(self) -> float:
+        """ns per tick of the recording alone."""
+        b, c = self.reset(), self.bench.controller
+        rows = (self.plant, self.controller)
+        return self._per_tick(
+            lambda: recording_alone(b.plant.records, c.ctl, c.states, c.est, b.y, b.u, *rows)
+        )
+
+    def allocations_per_tick(self) -> float:
+        """Allocations of numba's runtime per tick; those per call cancel."""
+        _nrt_python.memsys_enable_stats()
+        short, long = self._allocations(self.ticks // 2), self._allocations(self.ticks)
+        _nrt_python.memsys_disable_stats()
+        return (long - short) / (self.ticks - self.ticks // 2)
+
+    def _allocations(self, ticks: int) -> int:
+        before: int = rtsys.get_allocation_stats().alloc
+        self.whole(ticks)
+        return int(rtsys.get_allocation_stats().alloc) - before
+
+    def _per_tick(self, work: Callable[[], object]) -> float:
+        return seconds(work) / self.ticks * 1e9
+
+
+def measure(
+    laws: Sequence[str], ticks: int, turns: int, folder: Path, tell: Callable[[str, float], None]
+) -> list[dict[str, Any]]:
+    """ns per tick of laws and of the rig, one row each.
+
+    Args:
+        laws: names.
+        ticks: of a short run; a turn has ``RUNS`` of them.
+        turns: of each.
+        folder: for the recordings.
+        tell: called with the present work and the share done.
+
+    Raises:
+        UserError: a run ended early, so that there is nothing to time.
+    """
+    jobs = {name: ("pref_step", name) for name in laws}
+    jobs[RIG] = ("rig_pref_step", "mimo-gfm")
+    rows = []
+    for k, (name, (scenario, law)) in enumerate(jobs.items()):
+        tell(f"loop in process, {name}", k / len(jobs))
+        rows.append({"law": name, **_measure(Loop(scenario, law, ticks, folder / name), turns)})
+    return rows
+
+
+def _measure(loop: Loop, turns: int) -> dict[str, Any]:
+    found = take_turns(
+        {
+            "whole": lambda: quickest(loop.whole),
+            "plant": lambda: quickest(loop.plant_part),
+            "controller": lambda: quickest(loop.controller_part),
+            "recording": lambda: quickest(loop.recording_part),
+        },
+        turns,
+    )
+    rate = Spread.of([loop.T_s * 1e9 / ns for ns in found["whole"]])
+    return {f"{name}_ns": Spread.of(times).plain() for name, times in found.items()} | {
+        "times_real_time": rate.plain(),
+        "allocations_per_tick": loop.allocations_per_tick(),
+    }

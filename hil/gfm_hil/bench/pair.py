@@ -1,0 +1,151 @@
+"""Two processes for a whole benchmark: one sends, one answers, each on its processor.
+
+Both open every contender at the start, so that a round of one can follow a round of another at
+once. They are pinned and get the priority of the two sides of a run in real time.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.bench.contenders import CEnd, Contender
+from gfm_hil.bench.pingpong import LinkEnd
+from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
+from gfm_runtime.children import end_with_parent
+
+Policy = Literal["fifo", "other"]
+
+CAPACITY = 1 << 20  # most round trips in a round
+_START_S = 120.0
+WARM_NS = 20_000_000
+
+# state in each of the two processes
+_role: Role = "plant"
+_ends: dict[str, LinkEnd | CEnd] = {}
+_took = np.zeros(0, np.int64)
+_stop = np.zeros(1, np.int64)
+
+
+class Pair:
+    """Handle of the two processes."""
+
+    def __init__(self, pools: dict[Role, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
+        self._pools, self._stop = pools, stop
+
+    def call(self, role: Role, work: Any, *arguments: Any, timeout: float = 120.0) -> Any:
+        """Call a function in one of them and return its result."""
+        return self._wait(self._pools[role].submit(work, *arguments), timeout)
+
+    def both(self, work: Any, *arguments: Any, timeout: float = 120.0) -> dict[Role, Any]:
+        """Call a function in both at the same time."""
+        futures = {s: pool.submit(work, *arguments) for s, pool in self._pools.items()}
+        return {s: self._wait(future, timeout) for s, future in futures.items()}
+
+    def open(self, contender: Contender, payload: int) -> bool:
+        """Open a contender's ends; returns whether its loops are compiled.
+
+        Raises:
+            UserError: it cannot be opened.
+        """
+        for role in ROLES:
+            compiled = self.call(role, _open, contender, payload)
+        return bool(compiled)
+
+    def round(self, contender: Contender, period_ns: int, seconds: float) -> NDArray[np.int64]:
+        """Times of the round trips of one round in ns; none if the peer stopped answering."""
+        self._stop[0] = 0
+        answers = self._pools["controller"].submit(_pong, contender.name)
+        try:
+            return self.call("plant", _ping, contender.name, period_ns, int(seconds * 1e9))
+        finally:
+            self._stop[0] = 1
+            self._wait(answers, 30.0)
+
+    @staticmethod
+    def _wait(future: Future[Any], timeout: float) -> Any:
+        try:
+            return future.result(timeout)
+        except BrokenProcessPool:
+            raise RuntimeError("a process of the benchmark died") from None
+
+
+@contextmanager
+def pair(policy: Policy, place: Path) -> Iterator[Pair]:
+    """Start both; ``place`` is a folder in memory."""
+    path = place / "stop"
+    path.write_bytes(bytes(8))
+    context = multiprocessing.get_context("spawn")
+    pools = {
+        role: ProcessPoolExecutor(
+            1, mp_context=context, initializer=_set_up, initargs=(role, policy, str(path))
+        )
+        for role in ROLES
+    }
+    stop = np.memmap(path, np.int64, "r+")
+    two = Pair(pools, stop)
+    heard = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:  # both start now and inherit this: only the parent handles Ctrl-C
+        started = [pool.submit(_started) for pool in pools.values()]
+    finally:
+        signal.signal(signal.SIGINT, heard)
+    try:
+        for one in started:
+            one.result(_START_S)
+        yield two
+    finally:
+        stop[0] = 1
+        for pool in pools.values():
+            with suppress(BrokenProcessPool):
+                pool.submit(_close)
+        for pool in pools.values():
+            pool.shutdown(cancel_futures=True)
+
+
+def _set_up(role: Role, policy: Policy, stop: str) -> None:
+    global _role, _took, _stop
+    end_with_parent()
+    if policy == "fifo":
+        ask_for_real_time(role)
+    else:
+        own_processor(role)
+    _role, _took = role, np.zeros(CAPACITY, np.int64)
+    _took += 1  # touch all pages before a round
+    _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
+    no_collector_pauses()
+
+
+def _started() -> None:
+    """The first task: it is done once ``_set_up`` is done."""
+
+
+def _open(contender: Contender, payload: int) -> bool:
+    end = _ends[contender.name] = contender.open(_role, payload)
+    return end.compiled
+
+
+def _pong(name: str) -> None:
+    _ends[name].pong(_stop)
+
+
+def _ping(name: str, period_ns: int, duration_ns: int) -> NDArray[np.int64]:
+    end = _ends[name]
+    if end.ping(_stop, period_ns, WARM_NS, _took) < 0:
+        return _took[:0]
+    return _took[: max(end.ping(_stop, period_ns, duration_ns, _took), 0)]
+
+
+def _close() -> None:
+    for end in _ends.values():
+        end.close()
+    _ends.clear()

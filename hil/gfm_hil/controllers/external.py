@@ -1,0 +1,144 @@
+"""What an external controller is to its process, and what those that are not ours share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.controllers.ports import PortWiring
+from gfm_hil.core.errors import UserError
+from gfm_plant import Bases
+
+_LONGEST = 64  # of a name, see gfm_hil.engine.handshake
+
+
+@dataclass(frozen=True)
+class BenchContext:
+    """What a controller is connected to.
+
+    Attributes:
+        T_s: sampling time of the run, s.
+        inner: whether the run has an inner stage, so that y and u have its signals.
+        bases: of the converter.
+        delay: from the sampling of y to the moment when u acts, in ticks.
+    """
+
+    T_s: float = 1e-4
+    inner: bool = False
+    bases: Bases = field(default_factory=Bases)
+    delay: float = 0.0
+
+
+class ControllerError(Exception):
+    """A controller fails while it runs; the message names it and says what it said."""
+
+
+class ExternalController(Protocol):
+    """A controller that is not ours.
+
+    Attributes:
+        name: what the run calls it: 1 to 64 printable ASCII characters.
+        real: float64 or float32, for the laws that the controller's process has beside it.
+    """
+
+    name: str
+    real: str
+
+    def start(self, u: NDArray[np.float64]) -> None:
+        """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
+
+        Raises:
+            ControllerError: it refuses.
+        """
+
+    def tick(
+        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> None:
+        """One tick: u[k] from the references (5,) and the measurements, p.u.
+
+        Raises:
+            ControllerError: it fails, or blocks the bridge.
+        """
+
+    def close(self) -> None:
+        """End it, and remove what it left."""
+
+
+class MappedController:
+    """A controller whose ports a map wires to the signals, and which steps every so many ticks;
+    each kind sets the wiring, the outputs' names and how many ticks."""
+
+    real = "float64"
+    name: str
+    _wiring: PortWiring
+    _names: list[str]
+    _every: int
+    _ticks = 0
+
+    def tick(
+        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> None:
+        """See ``ExternalController``."""
+        if self._ticks % self._every == 0:
+            outputs, blocks = self._step(self._wiring.inputs(ref, y)), self._wiring.blocks
+            if blocks >= 0 and outputs[blocks] != 0:
+                what = f"{self._names[blocks]} = {outputs[blocks]:g}"
+                raise ControllerError(f"{self.name}: blocks the bridge: {what}")
+            self._wiring.take(outputs, u)
+        self._ticks += 1
+
+    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        raise NotImplementedError
+
+
+def refuse_source(text: str) -> None:
+    """Check that a controller is no source.
+
+    Raises:
+        UserError: it is; the message says how to compile it.
+    """
+    file = Path(text.partition(":")[2])
+    if text.startswith(("c:", "dll:")) and file.suffix in (".c", ".h", ".cc", ".cpp"):
+        raise UserError(
+            f"controller {text}: is a source, not a library; compile it by cc -O2 -shared -fPIC "
+            f'-I"$(gfmhil firmware include)" {file} -o {file.with_suffix(".so")} -lm, and name '
+            f"{file.with_suffix('.so')}"
+        )
+
+
+def check_currents(text: str, inner: bool) -> None:
+    """Check that a run, with an inner stage or without, carries what a library in C measures.
+
+    Raises:
+        UserError: ``text`` is ``c:FILE``, and the run has no inner stage.
+    """
+    refuse_source(text)
+    if text.startswith("c:") and not inner:
+        raise UserError(
+            f"controller {text}: measures currents, which only a run with an inner stage carries: "
+            "choose --inner virtual-stator"
+        )
+
+
+def run_name(kind: str, controller: str) -> str:
+    """What a run calls a controller, from what the controller calls itself."""
+    plain = "".join(c if " " <= c <= "~" else "?" for c in f"{kind} {controller}")
+    return plain[:_LONGEST].strip()
+
+
+def ticks_a_step(where: str, step_s: float, T_s: float) -> int:
+    """How many ticks of T_s [s] pass between two steps of a controller.
+
+    Raises:
+        UserError: its step is not a whole number of ticks.
+    """
+    ticks = round(step_s / T_s) if step_s > 0 else 0
+    if ticks < 1 or abs(step_s - ticks * T_s) > 1e-6 * T_s:
+        raise UserError(
+            f"{where}: its step of {step_s:g} s must be a multiple of the run's T_s = {T_s:g} s"
+        )
+    return ticks

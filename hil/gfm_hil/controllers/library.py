@@ -1,0 +1,207 @@
+"""A controller in a shared library with the interface of ``gfmhil_controller.h``.
+
+It measures and commands three-phase voltages and currents in V and A, as firmware does. The plant
+works in a dq frame whose speed omega_u the controller commands. This adapter commands the speed of
+the start for ever, so that the frame's angle is known, and turns everything into that frame and out
+of it. The bridge's voltage stays where it is in space until the next call, as that of a modulator
+does: each tick it is turned back in the frame by what the frame turns.
+"""
+
+from __future__ import annotations
+
+import cmath
+import ctypes as c
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.controllers.external import (
+    BenchContext,
+    ControllerError,
+    check_currents,
+    run_name,
+    ticks_a_step,
+)
+from gfm_hil.controllers.ports import PortMap
+from gfm_hil.core.errors import UserError
+from gfm_runtime.signals import carried, names
+
+VERSION = 1
+_NEEDED = ("version", "name", "new", "start", "step", "free")
+_Phases = c.c_double * 3
+_A = cmath.exp(2j * math.pi / 3)
+
+
+class _Setup(c.Structure):
+    _fields_ = tuple(
+        (name, c.c_double) for name in ("period", "delay", "S_n", "V_n", "omega_n", "V_dcref")
+    )
+
+
+class _Input(c.Structure):
+    _fields_ = (
+        ("t", c.c_double), ("v", _Phases), ("i", _Phases), ("i_o", _Phases),
+        *((name, c.c_double) for name in
+          ("v_dc", "P_ref", "Q_ref", "V_ref", "omega_ref", "V_dc_ref")),
+    )  # fmt: skip
+
+
+class _Output(c.Structure):
+    _fields_ = (("e", _Phases), ("i_dc", c.c_double))
+
+
+class LibraryController:
+    """A controller in a shared library.
+
+    Args:
+        path: of the library.
+        ports: of the map only ``step_s``, the time between two calls, s.
+        context: what it is connected to.
+
+    Raises:
+        UserError: it cannot be loaded, has not the interface or another version of it, refuses
+            this bench, or the run does not carry the currents.
+    """
+
+    real = "float64"
+
+    def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
+        if beyond := sorted(ports.model_fields_set - {"step_s"}):
+            raise UserError(
+                f"{path.name}: {', '.join(beyond)} in its map: of a map it takes step_s only; its"
+                " ports are fixed"
+            )
+        check_currents(f"c:{path.name}", context.inner)
+        self._of = _loaded(path)
+        said = self._of.gfmhil_name()
+        self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)
+        self._context = context
+        self._every = ticks_a_step(path.name, ports.step_s or context.T_s, context.T_s)
+        bases = context.bases
+        self._phase_V = bases.V_n * math.sqrt(2.0 / 3.0)
+        self._phase_A = bases.S_n / (1.5 * self._phase_V)
+        self._dc_A = bases.S_n / bases.V_dcref
+        # a voltage that is held for several ticks acts on average half of them later
+        self._delay_s = (context.delay + self._every / 2) * context.T_s
+        setup = _Setup(
+            self._every * context.T_s, self._delay_s,
+            bases.S_n, bases.V_n, bases.omega_b, bases.V_dcref,
+        )  # fmt: skip
+        self._self = self._of.gfmhil_new(c.byref(setup))
+        if not self._self:
+            offered = ", ".join(f"{key} {getattr(setup, key):.6g}" for key, *_ in _Setup._fields_)
+            raise UserError(
+                f"{path.name}: {self.name} refuses this bench: gfmhil_new gave NULL; offered were"
+                f" {offered} (SI units; step_s in the map file sets the period)"
+            )
+        self._in, self._out = _Input(), _Output()
+        self._ticks, self._speed = 0, 1.0
+        y = {name: k for k, name in enumerate(carried("y", True))}
+        self._pairs = {
+            "v": (y["v_d"], y["v_q"]), "i": (y["i_d"], y["i_q"]), "i_o": (y["i_od"], y["i_oq"]),
+        }  # fmt: skip
+        self._v_dc = y["v_dc"]
+        self._ref = {name: k for k, name in enumerate(names("ref"))}
+
+    def start(self, u: NDArray[np.float64]) -> None:
+        """See ``ExternalController``; the library starts at the first tick, with measurements."""
+        self._ticks, self._speed = 0, float(u[1])
+        self._now(complex(u[2], u[3]), float(u[0]))
+
+    def tick(
+        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> None:
+        """See ``ExternalController``."""
+        if self._ticks % self._every == 0:
+            self._measure(ref, y)
+            if self._ticks == 0:
+                self._call("gfmhil_start")
+            self._call("gfmhil_step")
+        held = sum(e * turn for e, turn in zip(self._out.e, (1.0, _A, _A**2), strict=True)) * 2 / 3
+        # middle of this tick's share of the time for which e acts
+        acts = self._angle(self._ticks + self._context.delay + 0.5)
+        e = held * cmath.exp(-1j * acts) / self._phase_V
+        u[:] = self._out.i_dc / self._dc_A, self._speed, e.real, e.imag
+        self._ticks += 1
+
+    def close(self) -> None:
+        """See ``ExternalController``."""
+        self._of.gfmhil_free(self._self)
+
+    def _angle(self, ticks: float) -> float:
+        """Angle of the plant's frame that many ticks after the start, rad."""
+        cycles = (
+            self._speed * self._context.bases.omega_b * self._context.T_s / (2 * math.pi) * ticks
+        )
+        return 2 * math.pi * math.fmod(cycles, 1.0)
+
+    def _now(self, e: complex, i_u: float) -> None:
+        """Let the output begin at what the plant rests under, p.u. in its frame."""
+        turned = e * self._phase_V * cmath.exp(1j * self._angle(self._delay_s / self._context.T_s))
+        self._out.e[:] = _phases(turned)
+        self._out.i_dc = i_u * self._dc_A
+
+    def _measure(self, ref: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+        bases, turn = self._context.bases, cmath.exp(1j * self._angle(self._ticks))
+        self._in.t = self._ticks * self._context.T_s
+        for name, (d, q) in self._pairs.items():
+            base = self._phase_V if name == "v" else self._phase_A
+            getattr(self._in, name)[:] = _phases(complex(y[d], y[q]) * turn * base)
+        self._in.v_dc = y[self._v_dc] * bases.V_dcref
+        for field, name, base in (
+            ("P_ref", "P_ref", bases.S_n),
+            ("Q_ref", "Q_ref", bases.S_n),
+            ("V_ref", "V_ref", bases.V_n),
+            ("omega_ref", "omega_g", bases.omega_b),
+            ("V_dc_ref", "V_dcref", bases.V_dcref),
+        ):
+            setattr(self._in, field, ref[self._ref[name]] * base)
+
+    def _call(self, name: str) -> None:
+        number = getattr(self._of, name)(self._self, c.byref(self._in), c.byref(self._out))
+        if number:
+            said = None
+            if hasattr(self._of, "gfmhil_fault"):
+                self._of.gfmhil_fault.restype = c.c_char_p
+                said = self._of.gfmhil_fault(c.c_void_p(self._self), c.c_int(number))
+            words = (said or b"").decode("utf-8", "replace").strip() or "it does not say what it is"
+            raise ControllerError(f"{self.name}: blocks the bridge: fault {number}, {words}")
+        given = {**{f"e[{k}]": e for k, e in enumerate(self._out.e)}, "i_dc": self._out.i_dc}
+        for field, value in given.items():
+            if not math.isfinite(value):
+                raise ControllerError(
+                    f"{self.name}: out->{field} = {value} at t = {self._in.t:g} s"
+                )
+
+
+def _phases(space: complex) -> tuple[float, float, float]:
+    """The three phases of a space vector."""
+    return space.real, (space * _A**2).real, (space * _A).real
+
+
+def _loaded(path: Path) -> c.CDLL:
+    try:
+        of = c.CDLL(str(path))
+    except OSError as problem:
+        raise UserError(f"{path}: cannot be loaded: {problem}") from None
+    for name in _NEEDED:
+        if not hasattr(of, f"gfmhil_{name}"):
+            other = "; it has Model_GetInfo: use dll:" if hasattr(of, "Model_GetInfo") else ""
+            raise UserError(
+                f"{path}: has no function gfmhil_{name}; see gfmhil_controller.h{other}"
+            )
+    version = of.gfmhil_version()
+    if version != VERSION:
+        raise UserError(
+            f"{path}: was compiled for version {version} of gfmhil_controller.h; this bench has "
+            f"version {VERSION}"
+        )
+    of.gfmhil_name.restype = c.c_char_p
+    of.gfmhil_new.restype = c.c_void_p
+    given = (c.c_void_p, c.POINTER(_Input), c.POINTER(_Output))
+    of.gfmhil_start.argtypes = of.gfmhil_step.argtypes = given
+    of.gfmhil_free.argtypes = (c.c_void_p,)
+    of.gfmhil_free.restype = None
+    return of

@@ -1,0 +1,135 @@
+"""An operator: finds a run by its folder, sends commands to it and reads its growing recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.identity import Identity, local
+from gfm_hil.core.roles import Role
+from gfm_hil.engine.announcement import LARGEST, announced, not_running, present
+from gfm_hil.recording.live import LiveRun
+from gfm_hil.scenario.events import EVENTS
+from gfm_plant import TRIP_REASONS
+from gfm_runtime.states import REASONS, STATES
+
+_ANSWER_MS = 6000
+
+
+def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
+    """The meaning of a recorded code.
+
+    Raises:
+        UserError: it has none, so that the recording is damaged.
+    """
+    if code not in words:
+        raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
+    return words[int(code)]
+
+
+class Operator:
+    """Sends commands to one run in progress and reads its state.
+
+    Args:
+        folder: the run folder.
+        through: what passes the commands on, for the log of the run.
+
+    Raises:
+        UserError: no run is in progress there.
+    """
+
+    def __init__(self, folder: Path, through: str = "python") -> None:
+        self._folder, self._local = folder, local(through)
+        self._context = zmq.Context()
+        if not present(folder):
+            raise not_running(folder)
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._context.destroy(linger=0)
+
+    def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
+        """Have the run carry out a scenario event, given without its time, at once.
+
+        Args:
+            event: plain data, ``type`` and its fields.
+            by: who gives the command; this process if None.
+
+        Returns:
+            ``tick`` at which it was carried out, and its ``label``.
+
+        Raises:
+            UserError: the run refused it, with the reason; or the side is gone.
+        """
+        kind = event.get("type", "")
+        if not isinstance(kind, str):
+            raise UserError(f"type = {str(kind)[:60]}: must be the name of an event")
+        return self._ask(EVENTS[kind].side if kind in EVENTS else "plant", event, by)
+
+    def stop(self, by: Identity | None = None) -> None:
+        """Stop the run as Ctrl-C does; with a converter of a network, all of it.
+
+        Raises:
+            UserError: the run does not answer.
+        """
+        running = present(self._folder)
+        if running:
+            self._ask("plant" if "plant" in running else running[0], {"type": "stop"}, by)
+
+    def snapshot(self) -> dict[str, Any]:
+        """The newest recorded tick: every column of the recording by name, codes also as words.
+
+        Of the plant: ``tick``, ``misses``, ``trip`` ("" without one). Of the controller:
+        ``state``, ``reason`` (why SAFE), ``active`` (what the law in force is asked for by),
+        ``law_title`` (its name in results), ``gains`` (those that differ from its file), ``laws``
+        (what those that are ready are asked for by), ``T_s`` (s). A side that has not recorded
+        anything is left out.
+
+        The loop only appends rows, so that reading them does not disturb it.
+
+        Raises:
+            UserError: the recording is damaged.
+        """
+        found: dict[str, Any] = {}
+        run, folder = LiveRun(self._folder), self._folder
+        if done := run.done("plant"):
+            found |= {**run.row("plant", done - 1), "tick": done - 1, "misses": run.misses}
+            found["trip"] = _word(folder, "trip", {**TRIP_REASONS, 0: ""}, found["true_trip"])
+        if done := run.done("controller"):
+            found |= run.row("controller", done - 1)
+            found["state"] = _word(folder, "state", dict(enumerate(STATES)), found["state"])
+            found["reason"] = _word(folder, "reason", dict(enumerate(REASONS)), run.safe_reason)
+            if (server := announced(folder, "controller")) is not None:
+                law = _word(folder, "law", dict(enumerate(server["laws"])), found["law"])
+                found["active"], found["gains"] = law["name"], law["gains"]
+                found["law_title"] = law["title"]
+                found["laws"], found["T_s"] = server["names"], server["T_s"]
+        return found
+
+    def _ask(self, role: Role, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
+        server = announced(self._folder, role)
+        if server is None:
+            raise UserError(f"{self._folder}: the {role} is not running")
+        content = {**event, "by": (by or self._local).plain()}
+        try:
+            answer = self._exchange(role, server["endpoint"], content)
+        except zmq.ZMQError as problem:  # for example no descriptor for a socket
+            raise UserError(f"{self._folder}: the {role} cannot be asked: {problem}") from None
+        if not answer["ok"]:
+            raise UserError(str(answer["error"]))
+        return {key: value for key, value in answer.items() if key != "ok"}
+
+    def _exchange(self, role: Role, endpoint: str, content: dict[str, Any]) -> dict[str, Any]:
+        with self._context.socket(zmq.REQ) as socket:
+            socket.set(zmq.LINGER, 0)
+            socket.set(zmq.MAXMSGSIZE, LARGEST)
+            socket.connect(endpoint)
+            socket.send_json(content)
+            if not socket.poll(_ANSWER_MS):
+                raise UserError(f"{self._folder}: the {role} does not answer")
+            answer: Any = socket.recv_json()
+        return dict(answer)

@@ -1,0 +1,234 @@
+"""The device: one register image, the commands that writes cause, and a clock for timers.
+
+A request is carried out as a whole or not at all: the device checks every value, sends the
+resulting commands to the run, which checks them again, and only then stores anything. It carries
+out one request at a time; clients can read meanwhile.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from pymodbus.constants import ExcCodes
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.ports.modbus.connection import CLIENT
+from gfm_hil.ports.modbus.curves import Droop, VoltVar
+from gfm_hil.ports.modbus.droops import Gains
+from gfm_hil.ports.modbus.image import VENDOR, Image, Point, Value
+from gfm_hil.ports.modbus.measures import Measures
+from gfm_hil.ports.modbus.operation import Direct, Heartbeat, Operation
+from gfm_hil.ports.modbus.plan import Function, Plan, Refused
+from gfm_hil.ports.modbus.setpoints import SetPoint
+from gfm_hil.ports.modbus.view import Slack, View
+from gfm_hil.scenario import Scenario
+from gfm_plant import load_converter
+
+#: carries out a command, or raises UserError
+Tell = Callable[[dict[str, Any]], object]
+
+_READ, _WRITE_ONE, _WRITE_MANY = 3, 6, 16
+
+TICK_S = 0.01
+"""Of the device's clock: timers and heartbeats expire on its ticks."""
+
+
+class Device:
+    """A SunSpec device for one run.
+
+    Args:
+        scenario: of the run.
+        laws: names of the laws that are ready.
+        look: returns the newest tick.
+        tell: sends a command to the run; called in a separate thread.
+        heartbeat_ms: timeout of a client's heartbeat, 0: none.
+        elapsed_s: time since the device was started, s.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        laws: Sequence[str],
+        look: Callable[[], View | None],
+        tell: Tell,
+        heartbeat_ms: int,
+        elapsed_s: Callable[[], float],
+    ) -> None:
+        self._look, self._tell, self._elapsed_s = look, tell, elapsed_s
+        self._gains = Gains(laws)
+        self._measures = Measures(scenario)
+        rating = load_converter(scenario.plant.converter).bases.S_n
+        self._set_points = (
+            SetPoint("WSet", "P_ref", rating, absolute=1, percent=(0,)),
+            SetPoint("VarSet", "Q_ref", rating, absolute=4, percent=(0, 1, 3)),
+        )
+        self._heart = Heartbeat(heartbeat_ms)
+        self._functions: tuple[Function, ...] = (
+            *self._set_points,
+            VoltVar(self._gains),
+            Droop(self._gains),
+            self._heart,
+            Operation(),
+            Direct(laws, self._gains),
+        )  # fmt: skip
+        self._owner = {path: f for f in self._functions for path in f.writable}
+        self.image = Image(self._measures.models(laws))
+        for path, value in self._measures.plate(laws).items():
+            self.image.set(path, value)
+        self._lock = asyncio.Lock()
+        self._view: View | None = None
+        self._was_safe = False
+        self._beats, self._seen, self._second = 0, -1, 0
+        self._fresh = -1  # the device's tick at the last refresh
+        self.slack = Slack()
+        self.local = False
+        self.refresh()
+
+    def writable(self, point: Point) -> bool:
+        """Whether clients may write a point."""
+        return point.path in self._owner
+
+    def refresh(self) -> None:
+        """Update every register to the newest tick."""
+        view = self._look()
+        now = self._elapsed_s()
+        self._fresh = int(now / TICK_S)
+        if view is None:
+            return
+        if self._was_safe and not view.safe:  # the run was reset
+            self._forget()
+        self._view, self._was_safe = view, view.safe
+        values = self._measures.now(view, self.slack, self._beats, self._heart.missing, self.local)
+        for function in self._functions:
+            values.update(function.show(view, now))
+        for path, value in values.items():
+            self.image.set(path, value)
+
+    def take(self, local: bool) -> None:
+        """Set who commands: the bench (``local``; clients are then refused) or the clients.
+
+        The clients' commands stay in force, and no timer reverts them any more.
+        """
+        if local and not self.local:
+            self._forget()
+        self.local = local
+
+    async def clock(self) -> None:
+        """One tick of the device's clock: carry out the timers that have expired."""
+        now = self._elapsed_s()
+        if int(now) != self._second:
+            self._second = int(now)
+            self._count_beat()
+        if self._heart.expire(now):
+            for set_point in self._set_points:
+                set_point.end(now)
+        for set_point in [s for s in self._set_points if s.expire(now)]:
+            async with self._lock:
+                view = self._look()
+                if view is None or not set_point.expire(now):  # a client has just written it
+                    continue
+                try:
+                    await self._carry_out([set_point.revert(view, now)], view)
+                except UserError as problem:  # retried at the next tick
+                    self.image.set(f"{VENDOR}.Refd", str(problem))
+                else:
+                    self.refresh()
+
+    async def access(
+        self, code: int, address: int, written: Sequence[Any] | None
+    ) -> ExcCodes | None:
+        """Process a request from pymodbus; None: pymodbus answers it from the image.
+
+        Raises nothing: a refused request changes nothing; the vendor model shows the reason.
+        """
+        if code not in (_READ, _WRITE_ONE, _WRITE_MANY):
+            return ExcCodes.ILLEGAL_FUNCTION
+        if written is None:
+            if int(self._elapsed_s() / TICK_S) != self._fresh:
+                self.refresh()
+            return None
+        try:
+            await self._write(address, [int(r) for r in written])
+        except Refused as problem:
+            self.image.set(f"{VENDOR}.Refd", str(problem))
+            return problem.code
+        return None
+
+    async def _write(self, address: int, registers: list[int]) -> None:
+        cut = self.image.cut(address, registers)
+        if cut is None:
+            raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{address}: no whole points")
+        for point, _ in cut:
+            if not self.writable(point):
+                raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{point.path}: is not for writing")
+        if self.local and any(point.path != "715.ControllerHb" for point, _ in cut):
+            raise Refused(ExcCodes.ILLEGAL_FUNCTION, "local control: the bench is commanded there")
+        async with self._lock:
+            view = self._look()
+            if view is None:
+                raise Refused(ExcCodes.DEVICE_FAILURE, "the run has not begun")
+            plans = self._plans(cut, view)
+            _count(plans)
+            try:
+                await self._carry_out(plans, view)
+            except UserError as problem:
+                raise Refused(ExcCodes.DEVICE_FAILURE, str(problem)) from None
+        self.refresh()
+
+    def _plans(self, cut: Sequence[tuple[Point, Sequence[int]]], view: View) -> list[Plan]:
+        by_function: dict[int, tuple[Function, dict[str, Value]]] = {}
+        try:
+            for point, part in cut:
+                value = point.decode(part)
+                if value is None:
+                    raise ValueError(f"{point.path}: no value")
+                point.check(value)
+                function = self._owner[point.path]
+                by_function.setdefault(id(function), (function, {}))[1][point.path] = value
+            now = self._elapsed_s()
+            return [f.plan(values, view, now) for f, values in by_function.values()]
+        except ValueError as problem:
+            raise Refused(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
+
+    async def _carry_out(self, plans: Sequence[Plan], view: View) -> None:
+        """Send the run every command, then store the new state.
+
+        Raises:
+            UserError: the run refused one.
+        """
+        try:
+            for plan in plans:
+                for event in plan.events:
+                    await asyncio.to_thread(self._tell, event)
+                    if event["type"] == "reset":
+                        self._forget()
+        except UserError:
+            for plan in plans:
+                plan.fail()
+            raise
+        for plan in plans:
+            plan.keep()
+
+    def _forget(self) -> None:
+        for function in self._functions:
+            function.forget()
+
+    def _count_beat(self) -> None:
+        """Count DERHb only while the run advances: a device of a stalled run must look dead."""
+        view = self._look()
+        if view is not None and view.tick != self._seen:
+            self._beats, self._seen = self._beats + 1, view.tick
+
+
+def _count(plans: Sequence[Plan]) -> None:
+    """Apply the client's rate limit to a request that causes commands; a stop always passes."""
+    client = CLIENT.get()
+    kinds = [event["type"] for plan in plans for event in plan.events]
+    if client is None or not kinds or "stop" in kinds:
+        return
+    try:
+        client.rate.take()
+    except UserError as problem:
+        raise Refused(ExcCodes.DEVICE_BUSY, str(problem)) from None

@@ -1,0 +1,176 @@
+"""The device's read-only points: its name plate, measurements, and the run's state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.ports.modbus.image import VENDOR, Value
+from gfm_hil.ports.modbus.view import Slack, View
+from gfm_hil.scenario import Scenario
+from gfm_plant import Bases, load_converter
+from gfm_plant.names import TRIPS
+from gfm_runtime.signals import SIGNALS
+from gfm_runtime.states import INIT, READY, RUNNING, SAFE, STOPPED
+
+_GRID_FORMING = 1 << 1  # bits of 701.DERMode, 702.CtrlModes, 702.IntIslandCat
+_CONTROLS = 1 << 1 | 1 << 2 | 1 << 4 | 1 << 5  # fixed W, fixed var, volt-var, frequency droop
+_ISLAND = 1 << 1
+_MANUFACTURER = 1 << 16  # 701.Alrm
+_ALARMS = {
+    "over_voltage": 1 << 10,
+    "under_voltage": 1 << 11,
+    "dc_over_voltage": 1 << 1,
+    "over_frequency": 1 << 8,
+    "under_frequency": 1 << 9,
+}
+_STATES = {INIT: 2, READY: 2, RUNNING: 3, SAFE: 6, STOPPED: 0}  # 701.InvSt
+_DC_BOTH_WAYS, _THREE_PHASE, _VARS_MAX = 5, 2, 1
+
+
+class Measures:
+    """The read-only points of one run's converter."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._bases: Bases = load_converter(scenario.plant.converter).bases
+
+    def models(self, laws: Sequence[str]) -> dict[int, Mapping[str, Any]]:
+        """Every model of the device with the points that determine its layout, for ``Image``."""
+        b = self._bases
+        power = _exponent(b.S_n * _top("p"), 16, signed=True)
+        volt, amp = _exponent(b.V_n * _top("V"), 16), _exponent(b.I_b * _top("p"), 16, signed=True)
+        set_point = _exponent(b.S_n * _top("P_ref"), 32, signed=True)
+        points: list[dict[str, Any]] = [{}, {}]
+        return {
+            1: {"ID": 1},
+            701: {
+                "ID": 701, "A_SF": amp, "V_SF": volt, "Hz_SF": -4, "W_SF": power, "PF_SF": -3,
+                "VA_SF": power, "Var_SF": power,
+            },
+            702: {
+                "ID": 702, "W_SF": power, "VA_SF": power, "Var_SF": power, "V_SF": volt,
+                "A_SF": amp,
+            },
+            704: {
+                "ID": 704, "WSet_SF": set_point, "VarSet_SF": set_point, "WSetPct_SF": -2,
+                "VarSetPct_SF": -2,
+            },
+            705: {
+                "ID": 705, "NPt": 2, "NCrv": 2, "V_SF": -2, "DeptRef_SF": -2, "RspTms_SF": 0,
+                "Crv": [{"Pt": points}, {"Pt": points}],
+            },
+            711: {
+                "ID": 711, "NCtl": 2, "Db_SF": -3, "K_SF": -5, "RspTms_SF": -3, "Ctl": [{}, {}],
+            },
+            714: {
+                "ID": 714, "NPrt": 1, "DCV_SF": _exponent(b.V_dcref * _top("v_dc"), 16),
+                "DCA_SF": _exponent(b.I_dcb * _top("i_u"), 16, signed=True),
+                "DCW_SF": _exponent(b.S_n * _top("i_u") * _top("v_dc"), 16, signed=True),
+                "Prt": [{}],
+            },
+            715: {"ID": 715},
+            VENDOR: {"ID": VENDOR, "NLaw": len(laws), "Laws": [{} for _ in laws]},
+        }  # fmt: skip
+
+    def plate(self, laws: Sequence[str]) -> dict[str, Value]:
+        """The points that never change."""
+        b = self._bases
+        names = {f"{VENDOR}.Laws{k}.Nm": Path(name).name for k, name in enumerate(laws, 1)}
+        island = self._scenario.plant.grid.load_R is not None
+        found: dict[str, Value] = {
+            "1.Mn": "gfmhil",
+            "1.Md": "grid-forming converter, emulated",
+            "1.Vr": version("gfmhil"),
+            "1.SN": self._scenario.digest(),
+            "1.DA": 1.0,
+            "701.ACType": float(_THREE_PHASE),
+            "701.DERMode": float(_GRID_FORMING),
+            "702.VNomRtg": b.V_n,
+            "702.VNom": b.V_n,
+            "702.CtrlModes": float(_CONTROLS),
+            "702.IntIslandCatRtg": float(_ISLAND if island else 0),
+            "714.Prt1.PrtTyp": float(_DC_BOTH_WAYS),
+            "714.Prt1.ID": 1.0,
+            "714.Prt1.IDStr": "DC link",
+            "705.Crv1.DeptRef": float(_VARS_MAX),
+            "705.Crv2.DeptRef": float(_VARS_MAX),
+            "705.Crv1.ReadOnly": 1.0,
+            "705.Crv2.ReadOnly": 0.0,
+            "711.Ctl1.ReadOnly": 1.0,
+            "711.Ctl2.ReadOnly": 0.0,
+            **names,
+        }
+        for name in ("W", "VA", "WChaRte", "WDisChaRte"):
+            found[f"702.{name}MaxRtg"] = found[f"702.{name}Max"] = b.S_n
+        for name in ("Inj", "Abs"):
+            found[f"702.VarMax{name}Rtg"] = found[f"702.VarMax{name}"] = b.S_n
+        return found
+
+    def now(
+        self, view: View, slack: Slack, beats: int, heart_lost: bool, local: bool
+    ) -> dict[str, Value]:
+        """The points that change with the run.
+
+        Args:
+            beats: number of seconds in which the run advanced.
+            heart_lost: the client's heartbeat is missing.
+            local: remote control is refused.
+        """
+        b, y = self._bases, view.row
+        p, q, V = y["y_p"], y["y_q"], y["y_V"]
+        s = math.hypot(p, q)
+        i_dc = y["u_i_u"] if self._scenario.plant.dc_source.mode == "controlled" else math.nan
+        info = view.reason or ("heartbeat of the client lost" if heart_lost else "")
+        return {
+            "701.St": float(not view.safe),
+            "701.InvSt": float(6 if view.safe else _STATES[view.state]),
+            "701.ConnSt": float(not view.safe),
+            "701.Alrm": float(_alarms(int(y["true_trip"]), bool(info))),
+            "701.MnAlrmInfo": info,
+            "701.W": p * b.S_n,
+            "701.VA": s * b.S_n,
+            "701.Var": q * b.S_n,
+            "701.PF": p / s if s > 0 else None,
+            "701.A": s / V * b.I_b if V > 0 else None,
+            "701.LLV": V * b.V_n,
+            "701.LNV": V * b.V_n / math.sqrt(3),
+            "701.Hz": y["y_omega_u"] * b.omega_n / (2 * math.pi),
+            "714.DCA": i_dc * b.I_dcb,
+            "714.Prt1.DCA": i_dc * b.I_dcb,
+            "714.DCW": i_dc * y["y_v_dc"] * b.S_n,
+            "714.Prt1.DCW": i_dc * y["y_v_dc"] * b.S_n,
+            "714.Prt1.DCV": y["y_v_dc"] * b.V_dcref,
+            "714.Prt1.DCSta": 3.0 if view.safe else 1.0,
+            "715.LocRemCtl": float(local),
+            "715.DERHb": float(beats),
+            f"{VENDOR}.St": float(view.state),
+            f"{VENDOR}.PRef": view.references["P_ref"],
+            f"{VENDOR}.QRef": view.references["Q_ref"],
+            f"{VENDOR}.Tick": float(view.tick),
+            f"{VENDOR}.Miss": float(view.misses),
+            f"{VENDOR}.SlkP50": slack.p50,
+            f"{VENDOR}.SlkP1": slack.p1,
+            f"{VENDOR}.SlkP01": slack.p01,
+            f"{VENDOR}.SlkMin": slack.least,
+            f"{VENDOR}.Why": view.reason,
+        }
+
+
+def _top(name: str) -> float:
+    """The largest magnitude that the signal table allows, p.u."""
+    return max(max(abs(s.low), abs(s.high)) for s in SIGNALS if s.name == name)
+
+
+def _exponent(top: float, bits: int, signed: bool = False) -> int:
+    """The finest scale factor with which ``top`` still fits."""
+    whole = 2 ** (bits - signed) - 2
+    return math.ceil(math.log10(top / whole))
+
+
+def _alarms(trip: int, any_reason: bool) -> int:
+    name = TRIPS[trip - 1][0] if 1 <= trip <= len(TRIPS) else ""
+    return _ALARMS.get(name, _MANUFACTURER if any_reason else 0)

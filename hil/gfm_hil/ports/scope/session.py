@@ -1,0 +1,209 @@
+"""One page's connection: its requests, its messages, and its rights."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.identity import Identity, address
+from gfm_hil.core.rate import Rate
+from gfm_hil.ports.scope.access import Access
+from gfm_hil.ports.scope.pyramid import Pyramid
+from gfm_hil.ports.scope.view import Look, View
+
+#: carries out an event and returns its tick; raises UserError with the reason of a refusal
+Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
+
+SEND_S = 5.0  # timeout of a page that does not read a message
+ANSWER_S = 1.0  # timeout of a page's answer to a ping where another page wants its place
+PER_S, BURST = 20.0, 40  # rate limit of a page's commands
+
+_LOG = logging.getLogger("gfmhil.scope")
+
+
+def in_words(kind: str, **content: Any) -> str:
+    """A text message (JSON), as it is sent."""
+    return json.dumps({"kind": kind, **content})
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Hello(_Message):
+    """The first message; with a valid token the page may control."""
+
+    kind: Literal["hello"]
+    token: str = Field(max_length=200)
+
+
+class Play(_Message):
+    """Replay a finished run from ``start`` [s] at ``speed`` times real time; without a speed show
+    all of it again."""
+
+    kind: Literal["play"]
+    start: float = Field(0.0, ge=0, le=1e6)
+    speed: float = Field(0.0, ge=0, le=100)
+
+
+class Tell(_Message):
+    """An event that the run shall carry out."""
+
+    kind: Literal["tell"]
+    id: int = Field(ge=-(2**53), le=2**53)  # integers that JavaScript represents
+    event: dict[str, Any]
+
+
+_MESSAGE: TypeAdapter[Hello | Look | Play | Tell] = TypeAdapter(
+    Annotated[Hello | Look | Play | Tell, Field(discriminator="kind")]
+)
+
+
+class Session:
+    """State of one connection.
+
+    A page gets three kinds of messages, each sent so that a slow page, or one that does not read
+    at all, does not delay other pages: an answer waits for the page, and only that page waits; of
+    news and of pictures only the newest is kept, and ``run`` sends it when there is room. A page
+    that does not read a message within ``SEND_S`` is dropped.
+
+    Attributes:
+        operator: the operator with the page's token; empty: the page may only look.
+    """
+
+    def __init__(
+        self, socket: ServerConnection, pyramid: Pyramid, access: Access, tell: Teller
+    ) -> None:
+        self._socket, self._pyramid, self._access, self._tell = socket, pyramid, access, tell
+        self.operator = ""
+        self._rate = Rate("this page", PER_S, BURST)
+        self._view: View | None = None
+        self._played: tuple[float, float, float] | None = None  # start [ticks], speed, begin
+        self._news: str | None = None
+        self._picture: bytes | None = None
+        self._wake = asyncio.Event()
+
+    @property
+    def peer(self) -> str:
+        """Address and port of the page."""
+        return address(self._socket.remote_address)
+
+    def head(self) -> int:
+        """Number of ticks that this page shows as done."""
+        if self._played is None:
+            return self._pyramid.done
+        start, speed, since = self._played
+        gone = (time.monotonic() - since) * speed / self._pyramid.record.T_s
+        return min(self._pyramid.done, int(start + gone))
+
+    async def reads(self) -> bool:
+        """Whether the page answers a ping, as every browser does by itself; else it is dropped."""
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                await (await self._socket.ping())
+        except (TimeoutError, ConnectionClosed):
+            self._socket.transport.abort()
+            return False
+        return True
+
+    def picture(self) -> None:
+        """Queue the next frame, unless there is none or the page has not read the last one yet: a
+        slow page sees fewer pictures, never old ones. A page whose picture cannot be made is
+        dropped."""
+        if self._view is None or self._picture is not None:
+            return
+        try:
+            self._picture = self._view.frame(self.head())
+        except Exception:
+            _LOG.exception("%s: its picture cannot be made: the page is dropped", self.peer)
+            self._view = None
+            self._socket.transport.abort()
+        if self._picture is not None:
+            self._wake.set()
+
+    def post(self, news: str) -> None:
+        """Queue a message; a newer one replaces one that has not been sent yet."""
+        self._news = news
+        self._wake.set()
+
+    async def say(self, kind: str, **content: Any) -> None:
+        """Send a text message at once."""
+        await self._send(in_words(kind, **content))
+
+    async def _send(self, message: str | bytes) -> None:
+        try:
+            async with asyncio.timeout(SEND_S):
+                await self._socket.send(message)
+        except TimeoutError:
+            _LOG.warning(
+                "%s: has not taken a message in %g s: the page is dropped", self.peer, SEND_S
+            )
+            self._socket.transport.abort()
+
+    async def run(self) -> None:
+        """Process messages and send queued ones until the page disconnects."""
+        sending = asyncio.create_task(self._keep_sending())
+        try:
+            async for text in self._socket:
+                await self.hear(text)
+        finally:
+            sending.cancel()
+
+    async def _keep_sending(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while await self._wake.wait():
+                self._wake.clear()
+                news, self._news = self._news, None
+                if news is not None:
+                    await self._send(news)
+                if self._picture is not None:
+                    await self._send(self._picture)
+                    self._picture = None
+
+    async def hear(self, text: str | bytes) -> None:
+        """Process one message."""
+        try:
+            message = _MESSAGE.validate_json(text)
+            match message:
+                case Hello():
+                    self.operator = self._access.operator(message.token)
+                    await self.say("control", granted=bool(self.operator))
+                case Look():
+                    self._view = View(self._pyramid, message, self.head())
+                case Play():
+                    self._play(message)
+                case Tell():
+                    await self._command(message)
+        except ValidationError as problem:
+            await self.say("error", text="; ".join(lines(problem)).removeprefix(": "))
+        except ValueError as problem:
+            await self.say("error", text=str(problem))
+
+    def _play(self, message: Play) -> None:
+        if self._pyramid.record.live:
+            raise ValueError("play: the run is still going on")
+        start = message.start / self._pyramid.record.T_s
+        self._played = (start, message.speed, time.monotonic()) if message.speed else None
+
+    async def _command(self, message: Tell) -> None:
+        try:
+            if not self.operator:
+                raise UserError("this page may look, not touch: open the address with the token")
+            if message.event.get("type") != "stop":  # a stop always passes
+                self._rate.take()
+            by = Identity(through="scope", name=self.operator, peer=self.peer)
+            done = await self._tell(message.event, by)
+        except UserError as problem:
+            await self.say("answer", id=message.id, ok=False, text=str(problem))
+        else:
+            await self.say("answer", id=message.id, ok=True, **done)

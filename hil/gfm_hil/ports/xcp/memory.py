@@ -1,0 +1,249 @@
+"""What a calibration tool sees as the memory of a live controller: cells of float64.
+
+| from | what | writable |
+|---|---|---|
+| 0x1000 | every recorded column of both sides at the newest tick, and its number | no |
+| 0x8000 | the references in force | yes |
+| 0x9000 | the law in force, index of the laws that are ready | yes |
+| 0x10000 | parameters of the first law, every 0x1000 those of the next | if it is in force |
+
+A write becomes a command to the run's command server, whose checks and limits hold therefore.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Protocol
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.recording.columns import describe, signals_of
+from gfm_hil.scenario.events.reference import check_reference
+from gfm_runtime import LawError, law_file
+from gfm_runtime.firmware import Entry, a2l_text, unit_of
+from gfm_runtime.firmware.c_text import identifier
+from gfm_runtime.lawfile import LawFile, build_law, tied
+from gfm_runtime.signals import SIGNALS, group
+
+CELL = 8  # bytes
+_MEASURED, _REFERENCES, _LAW, _GAINS, _LAW_BYTES = 0x1000, 0x8000, 0x9000, 0x10000, 0x1000
+_A_REFERENCE, _THE_LAW = "a reference", "the law"  # no law has such a name
+_RECORDED_S = 1.0  # how long a write waits until the recording has it
+#: the columns that are a signal of the table, with its range
+_SIGNALS = {
+    f"{prefix}_{s.name}": s
+    for prefix, groups in (
+        ("y", ("y", "y_inner")), ("u", ("u", "u_inner")), ("ref", ("ref",)), ("true", ("y", "d")),
+    )
+    for s in SIGNALS
+    if s.group in groups
+}  # fmt: skip
+
+
+class Refused(Exception):
+    """The memory cannot be read or written so; ``code`` is one of XCP's error codes."""
+
+    def __init__(self, code: int, why: str) -> None:
+        super().__init__(why)
+        self.code = code
+
+
+OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
+
+
+class Controlled(Protocol):
+    """What the memory needs of an operator (``gfm_hil.ports.commands.Operator``)."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """The newest recorded tick."""
+
+    def tell(self, event: dict[str, Any], by: Any = None) -> dict[str, Any]:
+        """Carry out an event at once; its tick."""
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """One number: its description, its value in a snapshot, and the command that writes it.
+
+    Attributes:
+        group: of what one command can write: ``_A_REFERENCE``, ``_THE_LAW``, or the law of a gain;
+            empty for what is only measured.
+        key: its name in the command.
+    """
+
+    entry: Entry
+    value: Callable[[dict[str, Any]], float]
+    group: str = ""
+    key: str = ""
+
+
+def _recorded(name: str, now: dict[str, Any]) -> float:
+    return float(now[name])
+
+
+class Memory:
+    """The memory of a run.
+
+    Args:
+        operator: of the run.
+        laws: names of the laws that are ready.
+        inner: whether the run has an inner stage, so that it records its columns.
+        recorded: how many ticks the controller has recorded.
+    """
+
+    def __init__(
+        self,
+        operator: Controlled,
+        laws: Iterable[str],
+        inner: bool,
+        recorded: Callable[[], int],
+    ) -> None:
+        self._operator, self._recorded = operator, recorded
+        self._laws = list(laws)
+        self._files = {name: law_file(name) for name in self._laws}
+        self._cells: dict[int, _Cell] = {}
+        names = ["tick", *signals_of("plant", inner), *signals_of("controller", inner)]
+        for k, name in enumerate(names):
+            self._add(self._measured(name, _MEASURED + k * CELL))
+        for k, s in enumerate(group("ref")):
+            entry = Entry(
+                s.name, f"reference: {s.description}", "FLOAT64_IEEE", _REFERENCES + k * CELL,
+                unit_of(s), s.low, s.high, calibrated=True,
+            )  # fmt: skip
+            self._add(_Cell(entry, partial(_recorded, f"ref_{s.name}"), _A_REFERENCE, s.name))
+        words = tuple(enumerate(self._laws))
+        entry = Entry(
+            "active_law", "the law in force", "FLOAT64_IEEE", _LAW, low=0.0, words=words,
+            high=len(words) - 1.0, calibrated=True,
+        )  # fmt: skip
+        self._add(_Cell(entry, lambda now: self._laws.index(now["active"]), _THE_LAW))
+        for k, (law, file) in enumerate(self._files.items()):
+            if len(file.parameters) * CELL > _LAW_BYTES:
+                raise UserError(f"law {law}: has more than {_LAW_BYTES // CELL} parameters")
+            for j, (name, spec) in enumerate(file.parameters.items()):
+                entry = Entry(
+                    f"{identifier(law)}.{name}",
+                    ": ".join(filter(None, (f"gain of {law}", spec.source))), "FLOAT64_IEEE",
+                    _GAINS + k * _LAW_BYTES + j * CELL, spec.unit, calibrated=True,
+                    fixed=file.schedule is not None,
+                )  # fmt: skip
+                self._add(_Cell(entry, partial(self._gain, law, name), law, name))
+
+    def _add(self, cell: _Cell) -> None:
+        self._cells[cell.entry.address] = cell
+
+    def _measured(self, name: str, address: int) -> _Cell:
+        row = describe(name, self._laws)
+        signal = _SIGNALS.get(name)
+        low, high = (signal.low, signal.high) if signal else (None, None)
+        entry = Entry(
+            name, row.comment, "FLOAT64_IEEE", address, row.unit, low, high, words=row.words
+        )
+        if name == "law":  # of the recording: one more for each change of gains
+            entry = replace(entry, text="number of the law with its gains, as recorded", words=())
+        if name == "state":  # a snapshot has its word
+            numbers = {word: number for number, word in row.words}
+            return _Cell(entry, lambda now: numbers[now[name]])
+        return _Cell(entry, partial(_recorded, name))
+
+    def _gain(self, law: str, name: str, now: dict[str, Any]) -> float:
+        file = self._files[law]
+        changed = tied(file, now["gains"]) if law == now["active"] else {}
+        return float(changed.get(name, file.parameters[name].value))
+
+    def a2l(self, name: str, more: Iterable[str] = ()) -> str:
+        """The A2L text of this memory; ``more``: lines of its module."""
+        entries = [cell.entry for cell in self._cells.values()]
+        return a2l_text(name, "a controller on the bench of gfmhil", entries, more=more)
+
+    def read(self, address: int, size: int) -> bytes:
+        """Bytes of the memory, all of the same tick.
+
+        Raises:
+            Refused: there is no such memory, or the run has not begun.
+        """
+        first = address - address % CELL
+        cells = [self._at(at) for at in range(first, address + size, CELL)]
+        now = self._now()
+        try:
+            whole = b"".join(struct.pack("<d", cell.value(now)) for cell in cells)
+        except (KeyError, ValueError):
+            raise Refused(NOT_NOW, "the run has not recorded it yet") from None
+        return whole[address - first : address - first + size]
+
+    def write(self, address: int, data: bytes, by: Any) -> None:
+        """Write whole cells by one command to the run; it holds from one tick on.
+
+        Args:
+            address: of the first cell.
+            data: of whole cells of one kind.
+            by: who writes, see ``Operator.tell``.
+
+        Raises:
+            Refused: no whole cells, what cannot be written, a wrong value, or the run refuses it.
+        """
+        if not data or address % CELL or len(data) % CELL:
+            raise Refused(OUT_OF_RANGE, f"{address:#x}: numbers of {CELL} bytes are written whole")
+        cells = [self._at(address + k) for k in range(0, len(data), CELL)]
+        kind = cells[0].group
+        if any(not cell.group or cell.entry.fixed for cell in cells):
+            raise Refused(WRITE_PROTECTED, f"{address:#x}: can only be read")
+        if any(cell.group != kind for cell in cells):
+            raise Refused(OUT_OF_RANGE, f"{address:#x}: the numbers are of two commands")
+        numbers = struct.unpack(f"<{len(cells)}d", data)
+        given = {cell.key: value for cell, value in zip(cells, numbers, strict=True)}
+        event = self._event(kind, given)
+        if event is None:
+            return
+        try:
+            tick = self._operator.tell(event, by)["tick"]
+        except UserError as problem:
+            raise Refused(ACCESS_DENIED, str(problem)) from None
+        until = time.monotonic() + _RECORDED_S
+        while self._recorded() <= tick and time.monotonic() < until:
+            time.sleep(1e-3)  # tools read back what they have written
+
+    def _event(self, kind: str, given: dict[str, float]) -> dict[str, Any] | None:
+        """The command of a write, or None if it changes nothing."""
+        try:
+            if not all(map(math.isfinite, given.values())):
+                raise ValueError(f"{given}: must be finite")
+            if kind == _A_REFERENCE:
+                for name, value in given.items():
+                    check_reference(name, value)
+                return {"type": "reference", **given}
+            if kind == _THE_LAW:
+                (number,) = given.values()
+                if number not in range(len(self._laws)):
+                    raise ValueError(f"law {number:g}: must be one of 0 to {len(self._laws) - 1}")
+                return {"type": "law", "law": self._laws[int(number)]}
+        except ValueError as problem:
+            raise Refused(OUT_OF_RANGE, str(problem)) from None
+        now = self._now()
+        if now.get("active") != kind:
+            raise Refused(ACCESS_DENIED, f"{kind}: is not the law in force")
+        values = {n: v for n, v in given.items() if v != self._gain(kind, n, now)}
+        self._check_gains(self._files[kind], {**now["gains"], **values})
+        return {"type": "gains", "values": values} if values else None
+
+    def _check_gains(self, file: LawFile, changed: dict[str, float]) -> None:
+        try:
+            build_law(file, tied(file, changed))
+        except LawError as problem:
+            raise Refused(OUT_OF_RANGE, str(problem)) from None
+
+    def _at(self, address: int) -> _Cell:
+        cell = self._cells.get(address)
+        if cell is None:
+            raise Refused(OUT_OF_RANGE, f"{address:#x}: there is no such memory")
+        return cell
+
+    def _now(self) -> dict[str, Any]:
+        try:
+            return self._operator.snapshot()
+        except UserError as problem:
+            raise Refused(NOT_NOW, str(problem)) from None

@@ -1,0 +1,198 @@
+"""A course of the grid's frequency and voltage over time, from a CSV file.
+
+A file has the columns t [s] and f_hz [Hz] or omega_g [p.u.], V_g [p.u.], or both; lines that begin
+with # are for people. Between its lines a course is straight.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pydantic import Field
+
+import gfm_plant
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.events.base import EventTarget, PlantEvent, nominal_hz
+from gfm_runtime.errors import printable
+from gfm_runtime.regular import open_regular
+from gfm_runtime.signals import SIGNALS
+
+if TYPE_CHECKING:
+    from gfm_plant import Network
+
+_COLUMNS = ("t", "f_hz", "omega_g", "V_g")
+_RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
+_MOST = 100_000  # lines
+LARGEST_FILE = 64 << 20
+
+
+class GridProfile(PlantEvent):
+    """The grid's frequency and voltage follow a CSV file: t [s after the event], and f_hz [Hz] or
+    omega_g [p.u.], V_g [p.u.], or both; straight between its lines, and at the end they stay."""
+
+    type: Literal["grid-profile"] = Field(description="kind of event")
+    file: str = Field(
+        min_length=1, description="path, from the scenario's folder or where you run the command"
+    )
+
+    def lasts(self) -> float:
+        try:
+            return read_profile(self.file, None).t[-1]
+        except UserError:  # its file is gone
+            return 0.0
+
+    def label(self) -> str:
+        return f"grid profile {PurePath(self.file).stem}"
+
+    def course(self, plant: Network) -> Iterator[tuple[int, Point]]:
+        return read_profile(self.file, nominal_hz(plant)).points(float(plant.net[0]["T_s"]))
+
+    def try_on(self, plant: Network) -> None:
+        next(self.course(plant))[1].apply(plant)
+
+    def apply(self, plant: Network) -> None:
+        """Its points follow."""
+
+    def check_now(self, target: EventTarget) -> None:
+        raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
+
+
+EVENT = GridProfile
+
+
+class Point(NamedTuple):
+    """What the plant does from a tick of a course on: go to these values, in a line.
+
+    Attributes:
+        omega_g, V_g: p.u.; None: it stays as it is.
+        ticks: how long that takes; 0: a step.
+    """
+
+    omega_g: float | None
+    V_g: float | None
+    ticks: int
+
+    def apply(self, plant: Network) -> None:
+        """Carry it out on the plant's records, between two ticks.
+
+        Raises:
+            ValueError: the grid is finite and has its own frequency.
+        """
+        if self.omega_g is not None:
+            gfm_plant.grid_frequency(
+                plant, self.omega_g, self._rate(self.omega_g, plant, "omega_g")
+            )
+        if self.V_g is not None:
+            gfm_plant.grid_voltage(plant, self.V_g, self._rate(self.V_g, plant, "V_g"))
+
+    def _rate(self, value: float, plant: Network, name: str) -> float | None:
+        """p.u./s from where the grid is now; None for a step."""
+        way = abs(value - float(plant.now[0][name]))
+        return way / (self.ticks * float(plant.net[0]["T_s"])) if self.ticks and way else None
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A course.
+
+    Attributes:
+        t: s after its event, each larger than the one before.
+        omega_g, V_g: p.u., as many as of t; None without such a column.
+    """
+
+    t: list[float]
+    omega_g: list[float] | None
+    V_g: list[float] | None
+
+    def points(self, T_s: float) -> Iterator[tuple[int, Point]]:
+        """What the plant does, each with its tick after the event. Lines that fall on the same
+        tick count as the last of them."""
+        last = {round(t / T_s): k for k, t in enumerate(self.t)}
+
+        def to(k: int, ticks: int) -> Point:
+            omega_g, V_g = (x[k] if x is not None else None for x in (self.omega_g, self.V_g))
+            return Point(omega_g, V_g, ticks)
+
+        first = next(iter(last))
+        yield first, to(last[first], 0)
+        for now, then in pairwise(last):
+            yield now, to(last[then], then - now)
+
+
+def read_profile(file: str, f_n: float | None) -> Profile:
+    """Read and check a course.
+
+    Args:
+        file: path.
+        f_n: nominal frequency, Hz; None leaves f_hz aside.
+
+    Raises:
+        UserError: one line that names the file, and the line, column, value and what is allowed.
+    """
+    t, columns = [], dict[str, list[float]]()
+    try:
+        with io.TextIOWrapper(open_regular(file, LARGEST_FILE), "utf-8", newline="") as text:
+            for number, cells in _lines(text, file):
+                if not columns:
+                    columns = {name: [] for name in _head([c.strip() for c in cells], file)}
+                    continue
+                if len(cells) != len(columns):
+                    raise UserError(f"{file}, line {number}: has {len(cells)} fields, but the first"
+                                    f" line has {len(columns)}")  # fmt: skip
+                for (name, values), cell in zip(columns.items(), cells, strict=True):
+                    values.append(_value(name, cell, f_n, f"{file}, line {number}"))
+                t = columns["t"]
+                if len(t) > 1 and not t[-1] > t[-2]:
+                    raise UserError(f"{file}, line {number}: t = {t[-1]:g}: must be larger than in"
+                                    f" the line before, {t[-2]:g}")  # fmt: skip
+    except (OSError, ValueError) as problem:  # a name with a zero byte, bytes that are no text
+        reason = getattr(problem, "strerror", None) or str(problem)
+        raise UserError(printable(f"{file}: {reason}")) from None
+    except csv.Error as problem:
+        raise UserError(printable(f"{file}: {problem}")) from None
+    if not t:
+        raise UserError(f"{file}: has no line with numbers; it needs one with t and values")
+    omega_g = columns.get("omega_g")
+    if "f_hz" in columns and f_n is not None:
+        omega_g = [f / f_n for f in columns["f_hz"]]
+    return Profile(t, omega_g, columns.get("V_g"))
+
+
+def _lines(text: Any, file: str) -> Iterator[tuple[int, list[str]]]:
+    """The lines that are not for people, with their numbers."""
+    reader = csv.reader(text)
+    for found, cells in enumerate(c for c in reader if c and not c[0].lstrip().startswith("#")):
+        if found > _MOST:
+            raise UserError(f"{file}: more than {_MOST} lines; thin it out")
+        yield reader.line_num, cells
+
+
+def _head(names: list[str], file: str) -> list[str]:
+    """The names of the columns, checked."""
+    ok = names[0] == "t" and len(names) > 1 and len({*names}) == len(names)
+    if not ok or {*names} - {*_COLUMNS} or {"f_hz", "omega_g"} <= {*names}:
+        raise UserError(
+            printable(f"{file}: columns {','.join(names)}: must be t, then f_hz (Hz) or omega_g "
+                      "(p.u.), V_g (p.u.), or both")
+        )  # fmt: skip
+    return names
+
+
+def _value(name: str, cell: str, f_n: float | None, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        raise UserError(printable(f"{where}: {name} = {cell!r:.80}: must be a number")) from None
+    low, high = _RANGE.get(name, (0.0, 86400.0))
+    if name == "f_hz":
+        low, high = (limit * f_n for limit in _RANGE["omega_g"]) if f_n else (0.0, math.inf)
+    if not (math.isfinite(value) and low <= value <= high):
+        raise UserError(f"{where}: {name} = {value:g}: must lie in [{low:g}, {high:g}]")
+    return value

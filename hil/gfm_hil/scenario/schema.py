@@ -1,0 +1,411 @@
+"""The keys of a scenario, with all checks that need no plant."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cached_property
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from gfm_hil.core.schema import StrictSchema
+from gfm_hil.links import link_kind, link_names
+from gfm_hil.links.impaired import Impairment
+from gfm_hil.scenario.events import AnyEvent
+from gfm_hil.scenario.events.base import Event
+from gfm_hil.scenario.events.grid_profile import LARGEST_FILE
+from gfm_hil.scenario.events.reference import check_reference, reference_field
+from gfm_hil.scenario.expectation import check_expectation
+from gfm_plant import NetworkParts, Plant, load_converter
+from gfm_plant.records import SIZES
+from gfm_runtime import LawError, law_file
+from gfm_runtime.errors import meant
+from gfm_runtime.inner_file import named_inner
+from gfm_runtime.regular import read_regular
+from gfm_runtime.signals import REF_NAMES, table_hash
+
+#: ``link.peer_timeout_s`` by mode where none is given: real time cannot wait; in lockstep no time
+#: passes meanwhile, and a busy machine may keep a side for seconds
+PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
+INPROC = "inproc"  # no link: both sides in one compiled loop
+
+
+class LinkSettings(StrictSchema):
+    """How the two sides exchange frames."""
+
+    type: str = Field("zmq", description="name of a link; inproc: one compiled loop, lockstep only")
+    endpoint: str | None = Field(
+        None,
+        description="where the sides meet, in the form of the link; a fresh one if none",
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="the link's own options")
+    peer_timeout_s: float | None = Field(
+        None,
+        gt=0,
+        le=60,
+        description="silence after which the other side counts as gone, s; by default "
+        + " and ".join(f"{wait:g} in {mode}" for mode, wait in PEER_TIMEOUT_S.items()),
+    )
+    repeat_s: float = Field(
+        0.002, gt=0, le=60, description="lockstep: silence after which the plant sends y[k] again"
+    )
+    impairment: Impairment | None = Field(None, description="faults on purpose")
+    start_timeout_s: float = Field(
+        60.0, gt=0, le=604800, description="how long to wait for it at the start"
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> LinkSettings:
+        if self.type == INPROC:  # ignore endpoint and options: another link may need them
+            return self
+        if self.type not in link_names():
+            known = sorted([INPROC, *link_names()])
+            raise ValueError(
+                f"type = {self.type!r}: must be one of {known}{meant(self.type, known)}"
+            )
+        link_kind(self.type).checked(self.endpoint, self.options)
+        return self
+
+
+def file_hash(file: str) -> str:
+    """Hash of the content of a file, wherever it lies."""
+    return hashlib.sha256(read_regular(file, LARGEST_FILE)).hexdigest()[:16]
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class References(StrictSchema):
+    """Y_ref at the start, p.u."""
+
+    V_dcref: float = reference_field("V_dcref", 1.0)
+    P_ref: float = reference_field("P_ref", 0.5)
+    omega_g: float = reference_field("omega_g", 1.0)
+    Q_ref: float = reference_field("Q_ref", 0.0)
+    V_ref: float = reference_field("V_ref", 1.0)
+
+    @model_validator(mode="after")
+    def _in_range(self) -> References:
+        for name in REF_NAMES:
+            check_reference(name, getattr(self, name))
+        return self
+
+    def vector(self) -> list[float]:
+        """The references in the order of the signal table."""
+        return [getattr(self, name) for name in REF_NAMES]
+
+
+class LatePolicy(StrictSchema):
+    """Real time: what to do if a frame misses its deadline."""
+
+    hold: int = Field(
+        200, ge=0, le=10**9, description="ticks in a row to hold the last value, then SAFE"
+    )
+    extrapolate: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="the first of them, over which the plant goes on along u's trend",
+    )
+
+    @model_validator(mode="after")
+    def _within_hold(self) -> LatePolicy:
+        if self.extrapolate > self.hold:
+            raise ValueError(
+                f"extrapolate = {self.extrapolate}: must be at most hold = {self.hold}"
+            )
+        return self
+
+
+class NetworkConverter(StrictSchema):
+    """One converter of a network; what it does not give is that of the scenario."""
+
+    node: str = Field(min_length=1, description="where its line ends")
+    law: str | None = Field(None, description="catalogue name or path of a law file")
+    inner: str | None = Field(None, description="inner stage of its laws")
+    references: References | None = Field(None, description="references Y_ref at the start")
+    link: LinkSettings | None = Field(None, description="between the plant and its controller")
+    late_policy: LatePolicy | None = Field(
+        None, description="real time: what happens to late frames"
+    )
+    plant: Plant | None = Field(None, description="converter and instruments, without a grid")
+    expect: Literal["completed", "oscillating", "tripped", "safe"] | None = Field(
+        None, description="status with which its part of the run counts as passed"
+    )
+
+    @model_validator(mode="after")
+    def _has_no_grid(self) -> NetworkConverter:
+        if self.plant is not None and self.plant.grid != Plant().grid:
+            raise ValueError("plant.grid: is the scenario's own; its node is network.grid")
+        return self
+
+
+class NetworkSettings(NetworkParts):
+    """Several converters and what connects them."""
+
+    converters: dict[str, NetworkConverter] = Field(
+        min_length=1, max_length=max(SIZES), description="by name"
+    )
+
+
+class Scenario(StrictSchema):
+    """One experiment."""
+
+    title: str = Field(description="of figures and reports")
+    description: str = Field("", description="for people")
+    duration: float = Field(gt=0, le=86400, description="s")
+    T_s: float = Field(1e-4, ge=1e-6, le=0.1, description="sampling time, s")
+    mode: Literal["lockstep", "realtime"] = Field(
+        "lockstep", description="lockstep: simulated time; realtime: the clock"
+    )
+    law: str = Field("mimo-gfm", description="catalogue name or path of a law file")
+    inner: str | None = Field(
+        None,
+        description="inner stage of every law, in place of its own: a shipped name (gfmhil laws), "
+        "the path of a file, or none",
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
+    expect: Literal["completed", "oscillating", "tripped", "safe"] = Field(
+        "completed", description="status with which the run counts as passed (exit code 0)"
+    )
+    expect_ripple: float = Field(
+        0.02,
+        gt=0,
+        le=1000,
+        description="p.u.; a run that lasts to its end but whose p, V, omega_u or abs(i) then "
+        "still oscillates by more, peak to peak, ends as oscillating",
+    )
+    expect_reason: str | None = Field(
+        None,
+        description="name of the trip or safe reason, which must be the cause of the end; any if "
+        "none",
+    )
+    expect_after: float | None = Field(
+        None, gt=0, description="s; the trip or safe state must not come before; any time if none"
+    )
+    after_trip: Literal["end", "wait"] = Field(
+        "end",
+        description="wait: a trip or a safe state does not end the run; the plant stays blocked "
+        "until an event, or an operator, resets both sides to the scenario's start; of a network "
+        "the converter that tripped waits for its reset",
+    )
+    prevent_idle: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="real time: a thread of idle priority keeps each side's processor busy; auto: "
+        "on a virtual machine, whose host may return an idle processor late",
+    )
+    waveforms: tuple[float, float] | None = Field(
+        None,
+        strict=False,
+        description="[from, to], s: the window of the figure of the three phases; from 3 cycles "
+        "before the first event to 7 after it if none",
+    )
+    ready_laws: list[str] = Field(
+        default_factory=list,
+        description="further laws to make ready for an operator, besides those of the events",
+    )
+    compare: list[str] = Field(default_factory=list, description="laws for `gfmhil compare`")
+    references: References = Field(References(), description="references Y_ref at the start")
+    link: LinkSettings = Field(LinkSettings(), description="how the two sides exchange frames")
+    late_policy: LatePolicy = Field(
+        LatePolicy(), description="real time: what happens to late frames"
+    )
+    plant: Plant = Field(Plant(), description="converter, grid and instruments")
+    network: NetworkSettings | None = Field(
+        None, description="several converters in one network; one on its line to the grid if none"
+    )
+    converter: str | None = Field(
+        None, description="in the folder of a converter of a network: which one it is"
+    )
+    events: list[AnyEvent] = Field(
+        default_factory=list,
+        max_length=10_000,
+        description="what happens in the run, each at its time",
+    )
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks of the run."""
+        return round(self.duration / self.T_s)
+
+    @property
+    def converters(self) -> list[str]:
+        """Names of the converters of the network; none without one."""
+        return [] if self.network is None else list(self.network.converters)
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the converters that have a run folder of their own within the run's."""
+        return self.converters if self.converter is None else []
+
+    def of(self, name: str) -> Scenario:
+        """The scenario as one converter of the network sees it: with its law, references and plant,
+        and the events of the network and of itself."""
+        assert self.network is not None
+        given = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
+
+        def whole(member: NetworkConverter) -> NetworkConverter:
+            if self.converter is not None:  # it was made whole before
+                return member
+            own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
+            if "plant" in own:
+                own["plant"] = self.plant.model_copy(update={"grid": Plant().grid})
+            return member.model_copy(update=own)
+
+        members = {key: whole(member) for key, member in self.network.converters.items()}
+        own = {key: getattr(members[name], key) for key in given}
+        own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
+        own["network"] = self.network.model_copy(update={"converters": members})
+        events = [e for e in self.events if getattr(e, "converter", None) in (None, name)]
+        copy = self.model_copy(update={**own, "events": events, "converter": name})
+        copy.__dict__.pop("has_inner", None)
+        return copy
+
+    @property
+    def survives_trips(self) -> bool:
+        """Whether plant and controllers go on after a trip; they wait for a reset, or there may be
+        other converters."""
+        return self.after_trip == "wait" or self.network is not None
+
+    @property
+    def peer_timeout_s(self) -> float:
+        """Silence after which the other side counts as gone, s."""
+        return self.link.peer_timeout_s or PEER_TIMEOUT_S[self.mode]
+
+    @property
+    def answer_timeout_s(self) -> float:
+        """How long a model may take for an answer, s. It is half of the peer's time, so that its
+        controller can still say what has failed."""
+        return self.peer_timeout_s / 2
+
+    @property
+    def in_process(self) -> bool:
+        """Whether plant and controllers run in one compiled loop, without a link."""
+        return all(link.type == INPROC for link in self.links)
+
+    @property
+    def links(self) -> list[LinkSettings]:
+        """The link of each converter that runs here."""
+        return [self.of(name).link for name in self.parts] or [self.link]
+
+    def laws(self) -> list[str]:
+        """Names of all laws that the run uses, each once, the initial law first."""
+        changes = [e.law for e in self.sorted_events() if hasattr(e, "law")]
+        return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
+
+    def sorted_events(self) -> list[Event]:
+        """Events in order of their tick; within a tick in the order of the file."""
+        return sorted(self.events, key=lambda e: e.at(self.T_s))
+
+    def digest(self) -> str:
+        """Hash of all that both sides must agree on: scenario, signal table, and the content of
+        the law and converter files, wherever each machine keeps them."""
+        about = {"link", "title", "description", "compare", "waveforms"}
+        about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
+        content = self.model_dump(exclude={*about, "law", "inner", "events", "ready_laws"})
+        if self.network is not None:
+            members = content["network"]["converters"]
+            for name, member in members.items():
+                own = self.of(name)
+                for key in ("link", "expect", "law", "inner"):
+                    del member[key]
+                if member["plant"] is not None:
+                    converter = load_converter(own.plant.converter)
+                    member["plant"]["converter"] = converter.model_dump()
+                member["laws"] = own.laws_digest()
+        content["plant"]["converter"] = load_converter(self.plant.converter).model_dump()
+        names = self.laws()
+        events = []
+        for e in self.sorted_events():
+            known: dict[str, Any] = {}
+            if hasattr(e, "law"):
+                known["law"] = names.index(e.law)
+            if hasattr(e, "file"):
+                known["file"] = file_hash(e.file)
+            events.append({**e.model_dump(), **known})
+        return _hash([content, events, self.laws_digest(), table_hash()])
+
+    def laws_digest(self) -> str:
+        """Hash of the content of every law that the run uses."""
+        spec = None if self.inner is None else named_inner(self.inner)
+        inner = [self.inner is not None, spec and spec.model_dump()]
+        return _hash([inner, *(law_file(name).model_dump() for name in self.laws())])
+
+    @cached_property
+    def has_inner(self) -> bool:
+        """Whether a law of the run has an inner stage; frames and recording then carry its
+        signals."""
+        each = [self.of(name) for name in self.converters] or [self]
+        return any(
+            (law_file(name).inner if one.inner is None else named_inner(one.inner)) is not None
+            for one in each
+            for name in one.laws()
+        )
+
+    def _wrong_links(self) -> list[str]:
+        problems = []
+        own = dict(zip(self.parts or [""], self.links, strict=True))
+        kinds = {link.type for link in own.values()}
+        if INPROC in kinds and len(kinds) > 1:
+            problems.append(
+                f"network.converters: link.type is {INPROC!r} of some and not of others; choose"
+                " links for all, or for none"
+            )
+        if kinds == {INPROC} and self.mode == "realtime":
+            problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
+        places = [link.endpoint for link in own.values() if link.endpoint is not None]
+        for place in {place for place in places if places.count(place) > 1}:
+            problems.append(
+                f"network.converters: {places.count(place)} have the link.endpoint {place!r}; each"
+                " needs one of its own"
+            )
+        for name, link in own.items():
+            if link.type == INPROC:
+                continue
+            kind = link_kind(link.type)
+            options = kind.options.model_validate(link.options)
+            where = f"network.converters.{name}.link" if name else "link"
+            try:
+                kind.check(options.of_run(self.has_inner), self.T_s)
+            except LawError:
+                pass  # ``check_scenario`` says what is wrong with the laws
+            except ValueError as problem:
+                problems.append(f"{where}.options: {problem}")
+        return problems
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Scenario:
+        problems = check_expectation(self)
+        if self.ticks < 1:
+            problems.append(f"duration = {self.duration:g} s: not one tick of T_s = {self.T_s:g} s")
+        if self.waveforms and not 0 <= self.waveforms[0] < min(self.waveforms[1], self.duration):
+            problems.append(
+                f"waveforms = {list(self.waveforms)}: must be [from, to] with 0 <= from < to, and "
+                f"from before the end of the run at {self.duration:g} s"
+            )
+        for k, event in enumerate(self.events):
+            if event.at(self.T_s) >= self.ticks:
+                problems.append(
+                    f"events.{k}: at {event.at(self.T_s) * self.T_s:g} s, but the run ends at "
+                    f"{self.duration:g} s"
+                )
+            problems += [f"events.{k}: {line}" for line in event.misfits(self)]
+            asked = getattr(event, "converter", None)
+            if asked is not None and asked not in self.converters:
+                problems.append(
+                    f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
+                    f"{meant(asked, self.converters)}"
+                )
+        if self.network is not None and self.plant.grid.load_R is not None:
+            problems.append("plant.grid.load_R: a load of a network is one of network.loads")
+        if self.network is not None and self.plant.grid.scr is not None:
+            problems.append(
+                f"plant.grid.scr = {self.plant.grid.scr:g}: is for one converter alone;"
+                " network.lines say how strong the grid of a network is"
+            )
+        problems += self._wrong_links()
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self

@@ -1,8 +1,0 @@
-"""Streams a run's recording while it grows: to PlotJuggler, to our own tools, to Prometheus.
-
-A separate process reads the files to which the loop appends, and does not disturb the loop.
-"""
-
-from gfm_hil.telemetry.blocks import Block, BlockReader
-
-__all__ = ["Block", "BlockReader"]
