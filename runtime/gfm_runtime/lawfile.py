@@ -23,7 +23,7 @@ from gfm_runtime.inner import Inner
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
-from gfm_runtime.toml_file import Number, Table, parse_toml, read_text, read_toml
+from gfm_runtime.toml_file import Number, NumberOrName, Table, parse_toml, read_text, read_toml
 
 
 def _listed(value: Any) -> Any:
@@ -76,9 +76,9 @@ class ErrorMap(Table):
 class SetPoints(Table):
     """u_0: numbers (p.u.) or names of references."""
 
-    i_u: Number = Field(0.0, description="p.u., or the name of a reference")
-    omega_u: Number = Field(1.0, description="p.u., or the name of a reference")
-    E_u: Number = Field("V_ref", description="p.u., or the name of a reference")
+    i_u: NumberOrName = Field(0.0, description="p.u., or the name of a reference")
+    omega_u: NumberOrName = Field(1.0, description="p.u., or the name of a reference")
+    E_u: NumberOrName = Field("V_ref", description="p.u., or the name of a reference")
 
 
 class SchedulePoint(Table):

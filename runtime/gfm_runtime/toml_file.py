@@ -53,10 +53,11 @@ def _not_negative(value: Any) -> float | str:
 # ``evaluated``. One validator, because a union would give two errors a mistake.
 if TYPE_CHECKING:
     Number = float
+    NumberOrName = float | str
     Positive = float
     NotNegative = float
 else:
-    Number = Annotated[float | str, PlainValidator(_number, float | str)]
+    Number = NumberOrName = Annotated[float | str, PlainValidator(_number, float | str)]
     Positive = Annotated[float | str, PlainValidator(_positive, float | str)]
     NotNegative = Annotated[float | str, PlainValidator(_not_negative, float | str)]
 

@@ -370,7 +370,7 @@ class Across(NamedTuple):
     X: int
 
 
-def across(parameters: Sequence[float], p: Number, V: Number) -> Across:
+def across(parameters: Matrix, p: Number, V: Number) -> Across:
     """For the numbers p (and q) and V."""
     return Across(*(round(math.ldexp(float(one), 2 * V.q - p.q)) for one in parameters))
 

@@ -470,8 +470,8 @@ class _Body:
                 self.loop(name.id, iterable, body, out)
             case ast.For(ast.Tuple(targets), iterable, body):
                 for values in self.value(iterable, out):
-                    for target, one in zip(targets, values, strict=True):
-                        self.put(self.target(target, out), _constant(one), out)
+                    for name_of, one in zip(targets, values, strict=True):
+                        self.put(self.target(name_of, out), _constant(one), out)
                     self.block(body, out)
             case ast.While(test, body):
                 self.share(body, out)

@@ -19,8 +19,6 @@ from pydantic import Field
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.inner.stage import (
     I_D,
-    I_OD,
-    I_OQ,
     I_Q,
     LEAST_V,
     P_HIGH,
@@ -36,7 +34,12 @@ from gfm_runtime.inner.stage import (
     take_measurements,
 )
 from gfm_runtime.inner.virtual_stator import VirtualStator, stator
-from gfm_runtime.inner.voltage_loop import Cascaded, ThresholdImpedance, drop, voltage_loop
+from gfm_runtime.inner.voltage_loop import (
+    Cascaded,
+    ThresholdImpedance,
+    settle_voltage_loop,
+    voltage_loop,
+)
 from gfm_runtime.signals import NU
 
 Inner = Annotated[
@@ -146,11 +149,7 @@ def settle_inner(law, state, e_d, e_q):
         state.x_v[0], state.x_v[1] = through_d, through_q
         state.drop[0] = state.drop[1] = 0
         if law.inner != STATOR:
-            drop(law, state)
-            B = state.omega * law.C_f
-            state.x_v[0] = through_d - law.k_ff * m[I_OD] + B * m[V_Q]
-            state.x_v[1] = through_q - law.k_ff * m[I_OQ] - B * m[V_D]
-            through_d, through_q = m[I_OD], m[I_OQ]
+            through_d, through_q = settle_voltage_loop(law, state)
         X = state.omega * law.X_v
         need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]
         need_q = m[V_Q] + law.R_v * through_q + X * through_d + state.drop[1]

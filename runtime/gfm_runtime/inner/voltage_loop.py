@@ -98,3 +98,15 @@ def voltage_loop(law, state, E_d, E_q):
         state.x_v[0] += law.T_k_vi * error_d
         state.x_v[1] += law.T_k_vi * error_q
     state.limited = state.limited != 0 or state.drop[0] != 0 or state.drop[1] != 0
+
+
+@inlined
+def settle_voltage_loop(law, state):
+    """The integral with which i* is what ``state.i_ref`` holds; returns the current through the
+    virtual impedance, i_o."""
+    m = state.m
+    drop(law, state)
+    B = state.omega * law.C_f
+    state.x_v[0] = state.i_ref[0] - law.k_ff * m[I_OD] + B * m[V_Q]
+    state.x_v[1] = state.i_ref[1] - law.k_ff * m[I_OQ] - B * m[V_D]
+    return m[I_OD], m[I_OQ]
