@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.links import Port
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.realtime.clock import between_looks, now_ns, wait_until
+from gfm_hil.realtime.clock import now_ns, spin_or_yield, wait_until
 from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Vector, names
 
@@ -64,7 +64,7 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
         looks = 0
         while receive(handle, answer) == 0:
             looks += 1
-            between_looks(looks, spins)
+            spin_or_yield(looks, spins)
             if looks % _LOOKS == 0 and now_ns() - begin > SILENCE_NS:
                 return -1
         now = now_ns()
@@ -83,7 +83,7 @@ def pong_port(handle, send, receive, spins, messages, stop):
     while stop[0] == 0:
         if receive(handle, heard) == 0:
             looks += 1
-            between_looks(looks, spins)
+            spin_or_yield(looks, spins)
             continue
         for i in range(len(message)):
             message[i] = messages[n % len(messages), i]
