@@ -143,12 +143,16 @@ unsigned golden_row(const golden_word row[])
 
 int golden_refusals(const golden_word row[], unsigned long elapsed[2])
 {
-    const golden_word refused = ~(golden_word)0 >> 1; /* no number, or the largest integer */
-    const int law = (int)row[1], k = 2;               /* no row runs this instance */
+/* @if fixed@ */
+    const golden_word too_large = ~(golden_word)0 >> 1;
+/* @else@ */
+    const golden_word too_large = ~(golden_word)0 >> 2; /* whatever the type */
+/* @end@ */
+    const int law = (int)row[1], k = 2; /* no row runs this instance */
     golden_real ref[5], y[GOLDEN_NY], u[GOLDEN_NU];
     int i, result = 0;
     memcpy(ref, &row[3], sizeof ref);
-    memcpy(&ref[4], &refused, sizeof ref[4]);
+    memcpy(&ref[4], &too_large, sizeof ref[4]);
     memcpy(y, &row[8], sizeof y);
     laws[law].init(k);
     for (i = 0; i < 2; i++) {
