@@ -26,13 +26,8 @@ MODES: tuple[Mode, ...] = ("lockstep", "realtime")
 #: each is a module with ``measure(options, content, show)``, which adds to the result's content
 KINDS = ("latency", "jitter", "kernel", "loop")
 
+_SECONDS = {"loop": (0.1, 3600)}  # of a round, where others than the usual ones are allowed
 _FEW_LAWS = "mimo-gfm,vsg-2,droop-2"  # of the loop in `all`
-#: of options that a kind of benchmark does not have
-_DEFAULTS = {
-    "links": None, "mode": ",".join(MODES), "load": ",".join(LOADS), "policy": "auto",
-    "payload": FRAME, "laws": None, "cflags": FLAGS, "seconds": 0.1, "until": math.inf,
-}  # fmt: skip
-
 Measurement = Callable[[dict[str, Any], ShowProgress], None]
 
 
@@ -90,19 +85,18 @@ def measurements(options: Namespace) -> list[Measurement]:
 
 
 def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
-    o = Namespace(**(_DEFAULTS | options))
-    allowed = (0.1, 3600) if kind == "loop" else (0.01, 60)
+    of = options.get
     return BenchOptions(
-        links=_links(o.links),
-        modes=_split("--mode", o.mode, MODES),
-        loads=_split("--load", o.load, LOADS),
-        policies=_policies(o.policy),
-        payload=_within("--payload", o.payload, 1, 504),
-        laws=[get_law(name).name for name in _split("--laws", o.laws)],
-        cflags=o.cflags,
-        seconds=_within("--seconds", o.seconds, *allowed),
-        rounds=_within("--rounds", o.rounds, 1, 1000),
-        until=o.until,
+        links=_links(of("links")),
+        modes=_split("--mode", of("mode"), MODES) or MODES,
+        loads=_split("--load", of("load"), LOADS) or LOADS,
+        policies=_policies(of("policy", "auto")),
+        payload=_within("--payload", of("payload", FRAME), 1, 504),
+        laws=[get_law(name).name for name in _split("--laws", of("laws"))],
+        cflags=of("cflags", FLAGS),
+        seconds=_within("--seconds", of("seconds", 0.1), *_SECONDS.get(kind, (0.01, 60))),
+        rounds=_within("--rounds", of("rounds"), 1, 1000),
+        until=of("until", math.inf),
     )
 
 
