@@ -16,8 +16,8 @@ from gfm_hil.controllers import BenchContext, open_controller, read_map
 from gfm_hil.controllers.ports import PortMap, wire
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.results import runner
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import plant_sample
 from gfm_runtime.inner import settle

@@ -18,7 +18,7 @@ from gfm_hil.controllers import BenchContext, PortMap, library, open_controller
 from gfm_hil.controllers.external import ControllerError
 from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.priority import processors
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
 

@@ -21,8 +21,8 @@ from gfm_hil.cli import main
 from gfm_hil.controllers import BenchContext, PortMap, open_controller, pil
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.results import runner
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
 from gfm_hil.scenario.model import find_scenario, load_scenario
 from gfm_runtime.firmware import TARGETS
 

@@ -35,7 +35,7 @@ from gfm_hil.bench.rounds import RUNS, ShowProgress, in_turn, quickest, spread
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links import link_kind, open_link
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
 
 LAW = "mimo-gfm"
@@ -242,7 +242,7 @@ def _run(scenario: Scenario, place: Path, beside: Beside = nullcontext) -> _Run:
                 during.enter_context(beside())
                 begin = ticks + _SETTLE
 
-        run = run_scenario(scenario, folder, progress, figures=False)
+        run = run_scenario(scenario, folder, progress)
     if run.status == "interrupted":  # the run has caught Ctrl-C
         raise KeyboardInterrupt
     timing = {name: np.array(column[begin:]) for name, column in run.timing.items()}

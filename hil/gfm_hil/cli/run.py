@@ -5,29 +5,30 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import subprocess
 import sys
 from pathlib import Path
 
+from gfm_hil.api.runs import run as run_one
+from gfm_hil.api.runs import run_network
 from gfm_hil.cli.common import (
     add_map,
     add_scenario_options,
     exit_code,
     new_folder,
-    print_network,
-    print_summary,
+    print_run,
     progress_bar,
     resolve,
-    why_it_ended,
     window,
 )
 from gfm_hil.cli.companion import companion
 from gfm_hil.cli.modbus import PORT as MODBUS_PORT
 from gfm_hil.cli.scope import need_websockets
 from gfm_hil.cli.stream import PORT
-from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
+from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_external
-from gfm_hil.results.runner import Notice, external_command, run_network, run_scenario
+from gfm_hil.recording.run import Run
+from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
 
@@ -75,59 +76,54 @@ def call(options: argparse.Namespace) -> int:
         options.mode = "lockstep"  # QEMU keeps no time
     scenario = resolve(options, law=options.law, waveforms=options.waveforms)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
-    if scenario.network is not None:
-        return _run_network(scenario, folder, options)
+    figures = not options.no_figures
     with contextlib.ExitStack() as stack:
-        scope = None
-        if options.scope is not None:
-            need_websockets()
-            port = None if options.scope < 0 else options.scope
-            scope = stack.enter_context(companion("scope", folder, port, ends_itself=False))
-        if options.stream is not None:
-            stack.enter_context(companion("stream", folder, options.stream, ready=2))
-        if options.modbus is not None:
-            if scenario.link.type == INPROC:
-                raise UserError("--modbus: a run in process takes no commands; choose --link")
-            stack.enter_context(companion("modbus", folder, options.modbus))
-        with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-            command = _model_command(scenario, options, notice)
-            figures = not options.no_figures
-            run = run_scenario(scenario, folder, progress, notice, figures, command)
+        run: Run | NetworkRun
+        if scenario.network is not None:
+            _check_network(options)
+            with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+                run = run_network(
+                    scenario, folder, figures=figures, progress=progress, notice=notice
+                )
+            scope = None
+        else:
+            scope = _companions(stack, scenario, folder, options)
+            with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+                run = run_one(
+                    scenario, folder=folder, controller=options.controller, ports=options.map,
+                    figures=figures, progress=progress, notice=notice,
+                )  # fmt: skip
         if options.json:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
-            print_summary(run.summary, folder, why_it_ended(run))
-        if scope is not None and scope.poll() is None and run.summary["status"] != "interrupted":
+            print_run(run, folder, why=True)
+        if scope is not None and scope.poll() is None and run.status != "interrupted":
             print("the scope stays open until Ctrl-C", file=sys.stderr, flush=True)
             with contextlib.suppress(KeyboardInterrupt):
                 scope.wait()
-    return exit_code(run.summary)
+    return exit_code(run)
 
 
-def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Notice) -> list[str]:
-    """The program that steps the model of --controller; empty without one.
-
-    Raises:
-        UserError: there is no such model or map, the run is in process, has no operating point, or
-            does not carry what the model measures.
-    """
-    if options.controller is None:
-        if options.map is not None:
-            raise UserError("--map: is of a model; name it by --controller")
-        return []
-    if scenario.link.type == INPROC:
-        raise UserError("--controller: is a process, and a run in process has none; choose --link")
-    real = precision(options.controller)
-    if not options.controller.startswith(PIL):
-        controller_file(options.controller, FORMS)
-    read_map(options.map)
-    check_currents(options.controller, scenario.has_inner)
-    compile_external(scenario, notice, real)
-    return external_command(options.controller, options.map)
+def _companions(
+    stack: contextlib.ExitStack, scenario: Scenario, folder: Path, options: argparse.Namespace
+) -> subprocess.Popen[str] | None:
+    """Start what serves the run while it goes on; returns the scope, if it is asked for."""
+    scope = None
+    if options.scope is not None:
+        need_websockets()
+        port = None if options.scope < 0 else options.scope
+        scope = stack.enter_context(companion("scope", folder, port, ends_itself=False))
+    if options.stream is not None:
+        stack.enter_context(companion("stream", folder, options.stream, ready=2))
+    if options.modbus is not None:
+        if scenario.link.type == INPROC:
+            raise UserError("--modbus: a run in process takes no commands; choose --link")
+        stack.enter_context(companion("modbus", folder, options.modbus))
+    return scope
 
 
-def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:
-    """Run several converters, each of which gets a run folder of its own."""
+def _check_network(options: argparse.Namespace) -> None:
+    """Refuse what is of one converter."""
     if options.controller is not None:
         raise UserError("--controller: controls one converter; a network runs without it")
     for name in ("scope", "stream", "modbus"):
@@ -136,11 +132,3 @@ def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) 
                 f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
                 " folder of a converter"
             )
-    with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-        figures = not options.no_figures
-        runs = run_network(scenario, folder, progress, notice, figures=figures)
-    if options.json:
-        print(json.dumps(runs.summary, indent=2), flush=True)
-    else:
-        print_network(runs, folder)
-    return max(exit_code(run.summary) for run in runs.values())

@@ -15,8 +15,8 @@ from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, pre
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_external, compiled_bench, compiled_benches
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import (
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import (
     external_command,
     run_in_memory,
     run_network_in_memory,
@@ -396,7 +396,7 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     if job.foreign is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
         command = external_command(job.foreign.model, job.foreign.ports)
-        run = run_scenario(scenario, folder, figures=False, controller_command=command)
+        run = run_scenario(scenario, folder, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt
         return run, {}
