@@ -21,7 +21,7 @@ import zmq
 from gfm_hil.bench.contenders import FRAME, free_port, memory_folder, messages
 from gfm_hil.bench.pair import Policy, pair
 from gfm_hil.bench.pingpong import PingPong, over_link
-from gfm_hil.bench.rounds import ratios, spread, spread_text
+from gfm_hil.bench.rounds import in_turn, ratios, spread, spread_text
 from gfm_hil.core.roles import Role
 from gfm_hil.core.terminal import markdown
 from gfm_hil.links.zeromq.curve import Curve, write_keys
@@ -161,13 +161,12 @@ def measure(
             two.round(setting, 0, seconds)  # to compile and to warm up
         medians: dict[str, list[float]] = {setting.name: [] for setting in found}
         silent = set()
-        for round_ in range(rounds):
-            for setting in found[:: -1 if round_ % 2 else 1]:
-                times = two.round(setting, 0, seconds)
-                if len(times):
-                    medians[setting.name].append(float(np.median(times)) * 1e-3)
-                else:
-                    silent.add(setting.name)
+        for _, _, setting in in_turn(found, rounds):
+            times = two.round(setting, 0, seconds)
+            if len(times):
+                medians[setting.name].append(float(np.median(times)) * 1e-3)
+            else:
+                silent.add(setting.name)
     return {n: m for n, m in medians.items() if n not in silent}, sorted(silent)
 
 
