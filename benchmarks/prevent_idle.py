@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gfm_hil.bench.rounds import in_turn
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 WAYS = ("never", "always")
 

@@ -8,7 +8,7 @@ from gfm_hil.ports.modbus.droops import Gains
 from gfm_hil.ports.modbus.image import Point, definition
 from gfm_hil.ports.modbus.view import Slack, View
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_runtime import law_names
 from gfm_runtime.states import RUNNING
 

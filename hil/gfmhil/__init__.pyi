@@ -8,8 +8,8 @@ from gfm_hil.api.runs import recover as recover
 from gfm_hil.api.runs import run as run
 from gfm_hil.api.runs import run_network as run_network
 from gfm_hil.core.errors import UserError as UserError
-from gfm_hil.scenario.model import Scenario as Scenario
-from gfm_hil.scenario.model import load_scenario as load_scenario
+from gfm_hil.scenario import Scenario as Scenario
+from gfm_hil.scenario import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
 from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.studies.identification import Identification as Identification

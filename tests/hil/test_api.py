@@ -13,7 +13,7 @@ import pytest
 import gfmhil
 from gfm_design.model.closed_loop import REFERENCES
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 
 
 def test_a_run_in_memory_has_the_bits_of_one_in_a_folder(tmp_path, capsys):

@@ -21,8 +21,7 @@ from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, toml_text
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.judge import (
     CANNOT,

@@ -18,7 +18,7 @@ from gfm_hil.engine.handshake import Start, shake_hands
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import NY
 
 from ..support.links import PATIENT

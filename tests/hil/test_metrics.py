@@ -13,7 +13,7 @@ import gfmhil
 from gfm_hil.run.cycles import cycle_means
 from gfm_hil.run.metrics import METRICS, event_metrics
 from gfm_hil.run.modes import Acting, acting, fast_mode, free_from, swing
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_hil.studies.law import as_law
 
 T_s, F_N = 1e-3, 50.0

@@ -15,7 +15,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import write_scenario
 from gfm_runtime.inner_file import named_inner
 
 pytestmark = pytest.mark.full  # compiles the start of several converters

@@ -21,7 +21,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.scope.record import open_record
 from gfm_hil.recording.log import read_log
-from gfm_hil.scenario.events import Reference
+from gfm_hil.scenario.events.reference import Reference
 
 pytestmark = pytest.mark.processes
 

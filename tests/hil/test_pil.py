@@ -23,7 +23,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
 from gfm_hil.recording.run import Run
 from gfm_hil.run import runner
-from gfm_hil.scenario.model import find_scenario, load_scenario
+from gfm_hil.scenario import find_scenario, load_scenario
 from gfm_runtime.firmware import TARGETS
 
 from ..support.processes import write

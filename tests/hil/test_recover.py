@@ -35,7 +35,7 @@ from gfm_hil.results.export import export_run
 from gfm_hil.results.report import write_report
 from gfm_hil.run.run_folder import finish
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import scenario_toml
 
 from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
 

@@ -17,7 +17,7 @@ from gfm_hil.results.report import write_report
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.network_run import NetworkRun, save_network
 from gfm_hil.run.runner import Notice
-from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
+from gfm_hil.scenario import INPROC, Scenario, load_scenario
 from gfm_hil.studies.law import Law, law_files
 
 __all__ = [

@@ -30,7 +30,7 @@ from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages, staged
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run

@@ -28,7 +28,7 @@ from gfm_hil.recording.run import Run
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import cell, event_rows
 from gfm_hil.run.run_folder import check_free
-from gfm_hil.scenario.model import find_scenario
+from gfm_hil.scenario import find_scenario
 from gfm_runtime import law_titles
 
 

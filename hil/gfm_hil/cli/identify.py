@@ -14,7 +14,7 @@ from gfm_hil.cli.common import new_folder, progress
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import find_scenario, shipped_scenarios
+from gfm_hil.scenario import find_scenario, shipped_scenarios
 from gfm_hil.studies.identification import (
     AMPLITUDE,
     POINTS,

@@ -14,7 +14,7 @@ from rich.table import Column, Table
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.law import cell_text
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
 from gfm_runtime.inner_file import acting, inner_names, named_inner

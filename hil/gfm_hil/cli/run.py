@@ -29,7 +29,7 @@ from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
-from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
+from gfm_hil.scenario import INPROC, Scenario, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:

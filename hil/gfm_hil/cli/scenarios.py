@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Column, Table
 
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import load_scenario, shipped_scenarios
+from gfm_hil.scenario import load_scenario, shipped_scenarios
 
 
 def add(command: argparse.ArgumentParser) -> None:

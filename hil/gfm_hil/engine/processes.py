@@ -19,7 +19,7 @@ from gfm_hil.links import link_kind
 from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.children import END_NOW, guarded
 
 #: told (ticks done, misses so far); may be called a few times a second

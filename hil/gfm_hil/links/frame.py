@@ -211,7 +211,7 @@ def judge(reader, overdue, latched):
 
 if TYPE_CHECKING:
     from gfm_hil.core.roles import Role
-    from gfm_hil.scenario.model import Scenario
+    from gfm_hil.scenario import Scenario
 
 LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
 

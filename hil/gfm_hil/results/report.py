@@ -14,7 +14,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.summary import END_METRICS
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture

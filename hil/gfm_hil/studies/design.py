@@ -20,7 +20,7 @@ from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.law import Law, as_law
 from gfm_hil.studies.loop import Loop
 from gfm_hil.studies.network_loop import loop_under

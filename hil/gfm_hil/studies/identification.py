@@ -43,7 +43,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.run.runner import run_in_memory, run_scenario
-from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
+from gfm_hil.scenario import INPROC, Scenario, load_scenario
 from gfm_hil.studies.law import Law
 from gfm_hil.studies.loop import scenario_loop
 from gfm_plant import NoEquilibrium, make_plant

@@ -14,8 +14,7 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import (
     DiscreteLaw,

@@ -13,7 +13,7 @@ from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.closed_loop import frequencies_near as _near
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime import DiscreteLaw, law_titles, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import U_NAMES, Y_NAMES

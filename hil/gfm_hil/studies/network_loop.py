@@ -12,7 +12,7 @@ import numpy as np
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop as _NetworkLoop
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.model import Scenario, load_scenario, plant_of
+from gfm_hil.scenario import Scenario, load_scenario, plant_of
 from gfm_hil.studies.loop import Loop, draw_step, initial_law
 from gfm_plant import NoEquilibrium
 from gfm_runtime import Law as BuiltLaw

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from gfm_design.norms.performance import Channel
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import Scenario, toml_text
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import GridSpec, LawFile, shipped_law
 

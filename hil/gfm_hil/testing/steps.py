@@ -17,12 +17,12 @@ from pydantic import TypeAdapter, ValidationError
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.recording.run import Run, Signals
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.events import Event
-from gfm_hil.scenario.model import Scenario, check_scenario
+from gfm_hil.scenario import Scenario, check_scenario
+from gfm_hil.scenario.events import AnyEvent
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
 from gfm_runtime.signals import REF_NAMES
 
-_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+_EVENT: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
 
 
@@ -45,7 +45,7 @@ class Plan:
             event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
         except ValidationError as problem:
             raise UserError(
-                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, Event))
+                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, AnyEvent))
             ) from None
         self._steps.append(event)
         try:

@@ -14,7 +14,7 @@ from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
 from gfm_hil.studies.tuned_law import problem_name
 from gfm_runtime import law_file

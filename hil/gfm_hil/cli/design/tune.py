@@ -24,7 +24,7 @@ from gfm_hil.cli.design.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.design import NotTuned, Tuning, tune
 from gfm_hil.studies.law import Law
 from gfm_hil.studies.tuned_law import problem_name, write_law

@@ -23,7 +23,7 @@ from gfm_hil.ports.modbus.operation import Direct, Heartbeat, Operation
 from gfm_hil.ports.modbus.plan import Function, Plan, Refused
 from gfm_hil.ports.modbus.setpoints import SetPoint
 from gfm_hil.ports.modbus.view import Slack, View
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
 
 #: carries out a command, or raises UserError

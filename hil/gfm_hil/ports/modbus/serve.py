@@ -28,7 +28,7 @@ from gfm_hil.ports.modbus.connection import CLIENT, UNIT, Server
 from gfm_hil.ports.modbus.device import TICK_S, Device
 from gfm_hil.ports.modbus.image import BASE
 from gfm_hil.ports.modbus.view import Watcher
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
 

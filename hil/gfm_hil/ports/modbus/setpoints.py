@@ -15,7 +15,7 @@ from typing import Any
 from gfm_hil.ports.modbus.image import Value
 from gfm_hil.ports.modbus.plan import Plan
 from gfm_hil.ports.modbus.view import View
-from gfm_hil.scenario.events import check_reference
+from gfm_hil.scenario.events.reference import check_reference
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
-from gfm_hil.scenario.model import check_scenario, find_file, load_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import check_scenario, find_file, load_scenario, toml_text
 from gfm_hil.studies.campaign.draw import Distribution
 from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
 from gfm_plant import make_plant

@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import Field
 
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.draw import Distribution, Model, draw
 
 

@@ -15,7 +15,7 @@ from gfm_hil.recording.parts import Kept
 from gfm_hil.results.report import finite
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.run.summary import READ
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
 
 Job = tuple[int, str]  # run number, law

@@ -22,8 +22,7 @@ from gfm_hil.run.runner import (
     run_network_in_memory,
     run_scenario,
 )
-from gfm_hil.scenario.model import Link, Scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.campaign.execute import WorkerLost, processes
 from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, judge_nfp, worst
 from gfm_hil.studies.conformity.model import Criterion, Declared, InEnvelope, Nfp, Part, UnderTest
@@ -285,7 +284,7 @@ def _scenario(job: Job) -> Scenario:
         return found
     if found.network is not None:
         raise UserError(f"{job.law} is one controller, and the test's network has several")
-    return found.model_copy(update={"link": Link(type="shm")})
+    return found.model_copy(update={"link": LinkSettings(type="shm")})
 
 
 def run_part(job: Job) -> Found:

@@ -21,7 +21,9 @@ from gfm_hil.run import checks
 from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
 from gfm_hil.run.modes import acting, free_from, swing
 from gfm_hil.run.ripple import remaining_ripple
-from gfm_hil.scenario.events import GridFrequency, GridImpedance, PhaseJump
+from gfm_hil.scenario.events.grid_frequency import GridFrequency
+from gfm_hil.scenario.events.grid_impedance import GridImpedance
+from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.conformity.model import (
     Criterion,

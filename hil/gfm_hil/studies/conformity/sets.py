@@ -12,8 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import write_text
-from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario, check_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, check_scenario, toml_text
 from gfm_hil.studies.conformity.model import Part, Test, UnderTest
 from gfm_plant import ConverterParameters, load_converter
 from gfm_runtime.errors import allowed, printable
