@@ -15,16 +15,16 @@ from _figures.common import FIGURES, TABLES
 
 from gfm_hil.bench.page import all_tables, badge, figures
 from gfm_hil.bench.result import read_result
-from gfm_hil.bench.tables import BenchTable
+from gfm_hil.results.table import Table
 
 _DRAWN = ("latency", "misses", "jitter", "lockstep")  # the kernel's says no more than its table
 
 
-def markdown(table: BenchTable) -> str:
+def markdown(table: Table) -> str:
     """A table with its heading."""
-    rule = ["---", *["--:"] * (len(table.columns) - 1)]
-    lines = [table.columns, rule, *table.rows]
-    return f"**{table.heading}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    rule = ["---", *["--:"] * (len(table.heads) - 1)]
+    lines = [table.heads, rule, *table.rows]
+    return f"**{table.title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main(folder: Path) -> None:

@@ -109,7 +109,7 @@ def test_page_holds_every_table_and_figure(content: dict[str, Any], tmp_path: Pa
     drawn = [table for _, table in all_tables(content)]
     assert page.tables == len(drawn) == 10
     for table in drawn:
-        assert table.heading in page.text
+        assert table.title in page.text
         assert all(cell in page.text for row in table.rows for cell in row)
     assert len(page.links) == len(figures(content)) == 5
     assert content["remarks"][0] in page.text

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import ROLES
-from gfm_hil.recording.parts import Part
+from gfm_hil.core.temporary import private_folder
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import toml_text
 
 
@@ -24,7 +25,7 @@ def places(folder: Path) -> set[Path]:
     """What a run in progress has outside its folder: memory, the folder of a socket."""
     words = Path(f"/proc/{roles_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
     kind, _, name = words[words.index("--endpoint") + 1].partition("://")
-    found = {Path("/dev/shm") / f"gfmhil-link-{name}" if kind == "shm" else Path(name).parent}
+    found = {private_folder() / f"link-{name}" if kind == "shm" else Path(name).parent}
     if (folder / "parts").is_symlink():
         found.add((folder / "parts").resolve())
     return found
@@ -80,7 +81,7 @@ def takes_commands(folder: Path) -> bool:
 
 def has_run(folder: Path, ticks: int) -> bool:
     """Whether the plant has recorded that many ticks."""
-    part = Part.open(folder, "plant")
+    part = RolePart.open(folder, "plant")
     return part is not None and int(part.progress[0]) >= ticks
 
 

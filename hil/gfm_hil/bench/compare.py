@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import mannwhitneyu, rankdata
 
-from gfm_hil.bench.tables import BenchTable, lockstep_name, times
+from gfm_hil.bench.tables import lockstep_name, times
 from gfm_hil.core.errors import UserError
+from gfm_hil.results.table import Table
 
 BELIEVED = 0.05  # limit of a corrected p value
 _EXACT = 200_000  # most orders counted one by one; beyond, use the normal approximation
@@ -88,10 +89,9 @@ def _row(
     }
 
 
-def comparison_table(rows: list[dict[str, Any]]) -> BenchTable:
+def comparison_table(rows: list[dict[str, Any]]) -> Table:
     """The rows as a table for display."""
-    return BenchTable(
-        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
+    return Table(
         ("", "A", "B", "unit", "B : A", "p", "verdict"),
         [
             (
@@ -100,6 +100,7 @@ def comparison_table(rows: list[dict[str, Any]]) -> BenchTable:
             )
             for r in rows
         ],
+        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
     )  # fmt: skip
 
 

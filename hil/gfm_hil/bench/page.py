@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,7 +12,8 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from gfm_hil.bench import plots, tables
-from gfm_hil.results.report import STYLE, html_table
+from gfm_hil.results import page
+from gfm_hil.results.table import Table
 
 _STYLE = """
 .dim{opacity:.7;font-size:.9rem}
@@ -23,10 +22,9 @@ _STYLE = """
 .badge{font-size:.82rem} .badge b{font-weight:500;opacity:.7;margin-right:.35rem}
 .badge .warn{border-color:var(--wrong);color:var(--wrong)}
 .card{padding:.6rem 1rem;min-width:11rem} .card .v{font-size:1.45rem} .card .t{font-size:.82rem}
-caption{text-align:left;font-weight:600} img{max-width:100%}
+img{max-width:100%}
 """
 
-_WARN = ' class="warn"'
 _BADGE = (
     ("cpu", "CPU"), ("cpus", "CPUs"), ("kernel", "kernel"), ("preemption", "preemption"),
     ("virtual_machine", "virtual machine"), ("container", "container"),
@@ -51,7 +49,7 @@ class Section:
     name: str
     heading: str
     text: str
-    tables: Callable[[dict[str, Any]], Iterator[tables.BenchTable]]
+    tables: Callable[[dict[str, Any]], Iterator[Table]]
     figure: Callable[[dict[str, Any]], Figure | None]
 
 
@@ -104,7 +102,7 @@ SECTIONS = (
 )
 
 
-def all_tables(content: dict[str, Any]) -> Iterator[tuple[str, tables.BenchTable]]:
+def all_tables(content: dict[str, Any]) -> Iterator[tuple[str, Table]]:
     """All tables of a result, each with the name of its section."""
     return ((section.name, table) for section in SECTIONS for table in section.tables(content))
 
@@ -127,33 +125,19 @@ def write_page(content: dict[str, Any], path: Path) -> None:
     images = figures(content)
     for name, svg in images.items():
         path.with_name(f"{name}.svg").write_bytes(svg)
-    parts = []
-    for section in SECTIONS:
-        drawn = list(section.tables(content))
-        if drawn:
-            parts.append(f"<h2>{section.heading}</h2><p>{html.escape(section.text)}</p>")
-        if section.name in images:
-            uri = base64.b64encode(images[section.name]).decode()
-            parts.append(f'<img alt="{section.heading}" src="data:image/svg+xml;base64,{uri}">')
-        parts += [html_table(table.columns, table.rows, table.heading) for table in drawn]
-    points = "".join(
-        f"<li>{html.escape(x)}</li>" for x in (*content["caveats"], *content["remarks"])
-    )
-    path.write_text(
-        f"""<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>gfmhil bench</title><style>{STYLE}{_STYLE}</style>
-<h1>gfmhil bench {html.escape(content["bench"])}</h1>
-<p class="dim">measured in {content["seconds"]:g} s, in interleaved rounds: p50, p90 and p99 are
-medians over them, what is beyond p99 is of all rounds together; a ratio is taken round by round</p>
-<div class="badge">{_chips(content["environment"])}</div>
-{"".join(_cards(content))}
-{"".join(parts)}
-<h2>What to keep in mind</h2><ul>{points}
-<li>Absolute times are this machine's at this moment; ratios within the run are what carries over.
-</li></ul></html>
-""",
-        encoding="utf-8",
+    page.write_page(
+        path,
+        "bench.html",
+        title=f"gfmhil bench {content['bench']}",
+        style=_STYLE,
+        seconds=content["seconds"],
+        badge=badge(content["environment"]),
+        cards=_cards(content),
+        sections=[
+            (s, s.name in images and page.inline(images[s.name], "svg+xml"), [*s.tables(content)])
+            for s in SECTIONS
+        ],
+        points=[*content["caveats"], *content["remarks"]],
     )
 
 
@@ -176,15 +160,8 @@ def badge(environment: dict[str, Any]) -> Iterator[tuple[str, str, bool]]:
         yield label, text, key in caution and caution[key](value)
 
 
-def _chips(environment: dict[str, Any]) -> str:
-    return "".join(
-        f"<span{_WARN if warn else ''}><b>{label}</b>{html.escape(text)}</span>"
-        for label, text, warn in badge(environment)
-    )
-
-
-def _cards(content: dict[str, Any]) -> Iterator[str]:
-    """The most important figures, one line per kind."""
+def _cards(content: dict[str, Any]) -> list[list[tuple[str, str]]]:
+    """The most important figures as (value, text), one line per kind."""
     loop = content.get("loop", {})
     trips = [
         (f"{tables.micro(r['p50_us'])} µs", f"{r['name']}: round trip{_compared(r)}")
@@ -205,12 +182,7 @@ def _cards(content: dict[str, Any]) -> Iterator[str]:
         )
         for r in loop.get("lockstep", ())
     ]
-    for cards in filter(None, (trips, misses, rates)):
-        yield '<div class="cards">'
-        for value, text in cards:
-            yield f'<div class="card"><div class="v">{html.escape(value)}</div>'
-            yield f'<div class="t">{html.escape(text)}</div></div>'
-        yield "</div>"
+    return [trips, misses, rates]
 
 
 def _compared(row: dict[str, Any]) -> str:

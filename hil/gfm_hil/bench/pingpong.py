@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.realtime.clock import between_looks, now_ns, wait_until
+from gfm_hil.realtime.clock import now_ns, spin_or_yield, wait_until
 from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Vector, names
 
@@ -87,7 +87,7 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
         polls = 0
         while receive(handle, answer) == 0:
             polls += 1
-            between_looks(polls, spins)
+            spin_or_yield(polls, spins)
             if polls % _POLLS == 0 and now_ns() - begin > SILENCE_NS:
                 return -1
         now = now_ns()
@@ -106,7 +106,7 @@ def pong_port(handle, send, receive, spins, messages, stop):
     while stop[0] == 0:
         if receive(handle, request) == 0:
             polls += 1
-            between_looks(polls, spins)
+            spin_or_yield(polls, spins)
             continue
         for i in range(len(message)):
             message[i] = messages[n % len(messages), i]

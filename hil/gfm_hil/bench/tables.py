@@ -3,31 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from gfm_hil.bench.histogram import SHARES
+from gfm_hil.results.table import Table
 
 Row = dict[str, Any]
 #: a column of a table: the key of what it shows as it is, or a function that makes a cell of a row
 Column = str | Callable[[Row], str]
 
 
-@dataclass(frozen=True)
-class BenchTable:
-    """One table; the first column is text, the others are numbers."""
-
-    heading: str
-    columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-
-
-def _table(heading: str, rows: list[Row], columns: Mapping[str, Column]) -> BenchTable:
+def _table(heading: str, rows: list[Row], columns: Mapping[str, Column]) -> Table:
     def cell(row: Row, column: Column) -> str:
         return str(row[column]) if isinstance(column, str) else column(row)
 
-    cells = [tuple(cell(row, column) for column in columns.values()) for row in rows]
-    return BenchTable(heading, tuple(columns), cells)
+    cells = [[cell(row, column) for column in columns.values()] for row in rows]
+    return Table([*columns], cells, heading)
 
 
 def micro(value: float | None) -> str:
@@ -69,7 +60,7 @@ def _median(key: str, form: str, unit: str = "") -> Column:
 _PERCENTILES = {name.replace("_", "."): _micro(f"{name}_us") for name in SHARES}
 
 
-def latency_tables(content: Row) -> Iterator[BenchTable]:
+def latency_tables(content: Row) -> Iterator[Table]:
     """Round trips, one table per mode and load."""
     rows = content["results"]
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
@@ -85,7 +76,7 @@ def _limit(row: Row) -> str:
     return "limit" if row["peer"] == "C" else times(row["ratio_to_baseline_p50"])
 
 
-def jitter_tables(content: Row) -> Iterator[BenchTable]:
+def jitter_tables(content: Row) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
     if "jitter" in content:
         columns = {"": "policy", "load": "load", "wait": "wait", **_PERCENTILES}
@@ -93,7 +84,7 @@ def jitter_tables(content: Row) -> Iterator[BenchTable]:
         yield _table(heading, content["jitter"], columns | {"ticks lost": _percent("lost_pct")})
 
 
-def realtime_tables(content: Row) -> Iterator[BenchTable]:
+def realtime_tables(content: Row) -> Iterator[Table]:
     """Misses in real time, and why ticks were missed."""
     rows = content.get("loop", {}).get("realtime")
     if rows is None:
@@ -131,7 +122,7 @@ def lockstep_name(row: Row) -> str:
     return f"{row['link']}, a sample late" if row["delay_samples"] else str(row["link"])
 
 
-def lockstep_tables(content: Row) -> Iterator[BenchTable]:
+def lockstep_tables(content: Row) -> Iterator[Table]:
     """The closed loop as fast as possible, over links and, by law, in one process."""
     loop = content.get("loop", {})
     if "lockstep" not in loop:
@@ -159,7 +150,7 @@ def lockstep_tables(content: Row) -> Iterator[BenchTable]:
     )
 
 
-def kernel_tables(content: Row) -> Iterator[BenchTable]:
+def kernel_tables(content: Row) -> Iterator[Table]:
     """ns per step of every law."""
     by_law: dict[str, Row] = {}
     reals = list(dict.fromkeys(r["real"] for r in content.get("kernel", ())))

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn
 
 from gfm_hil.cli.common import new_folder, progress
-from gfm_hil.core.terminal import numbers, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.links import link_names
 from gfm_hil.run.run_folder import check_free
 
@@ -158,10 +158,7 @@ def _print(tables: Iterable[Any], remarks: Iterable[str]) -> None:
     console = terminal()
     console.width = max(console.width, _WIDTH)
     for table in tables:
-        drawn = numbers(*map(escape, table.columns), title=escape(table.heading))
-        for row in table.rows:
-            drawn.add_row(*map(escape, row))
-        console.print(drawn, end="\n\n")
+        console.print(table, end="\n\n")
     for remark in remarks:
         console.print(f"• {escape(remark)}", highlight=False)
 

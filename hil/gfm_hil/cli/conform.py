@@ -4,41 +4,28 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
-from rich.table import Table
 
-from gfm_hil.cli.common import (
-    EXIT_INTERRUPTED,
-    EXIT_OTHERWISE,
-    above,
-    add_map,
-    new_folder,
-    progress,
-)
+from gfm_hil.api.studies import conform
+from gfm_hil.cli.common import add_map, add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.stopping import Interrupt
-from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.realtime.priority import processors
-from gfm_hil.studies.campaign.execute import WorkerLost
+from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
-from gfm_hil.studies.conformity.execute import Found, execute, foreign_controller, make_jobs
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, load_under_test, shipped_sets
-from gfm_runtime import law_file, law_names, law_titles
-from gfm_runtime.inner_file import named_inner
+from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, shipped_sets
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS
+from gfm_runtime import law_names
 
 EXIT_FAILED = 1
 _EXIT = {PASS: 0, FAIL: EXIT_FAILED, CANNOT: 4, INFORMATIVE: 4}
-_COLOURS = {PASS: "green", FAIL: "red", CANNOT: "yellow", INFORMATIVE: "blue"}
+_STYLES = {PASS: "good", FAIL: "bad", CANNOT: "warn", INFORMATIVE: "dim"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -89,80 +76,42 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "-o", "--out", metavar="DIR", help="folder; runs/conform-<time> by default"
     )
-    command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
+    command.add_argument(
+        "--workers", type=int, default=processors(), metavar="N",
+        help="processes; all cores by default",
+    )  # fmt: skip
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
     command.add_argument("--list", action="store_true", help="list the tests, and run nothing")
-    command.add_argument("--json", action="store_true", help="print results.json, nothing else")
-    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_study_options(command, "results.json")
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
-    cases = load_cases(options.against or [ALL])
+    against = options.against or [ALL]
     if options.list:
+        cases = load_cases(against)
         if options.json:
             print(json.dumps([_plain(case) for case in cases], indent=2))
         else:
-            terminal().print(_list(cases))
+            rows = [[*_plain(case).values()] for case in cases]
+            terminal().print(Table(("test", "runs", "title", "source"), rows, text=None))
         return 0
     if not options.law and options.controller is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
-    if options.workers is not None and not 1 <= options.workers <= 1024:
-        raise UserError(f"--workers {options.workers}: must lie in [1, 1024]")
-    foreign = foreign_controller(options.controller, options.map)
-    given = [n for law in options.law or [] for n in _names(law)]
-    for name in given:
-        law_file(name)
-    titles = law_titles(given)
-    laws = [*titles.values()]
-    if options.inner is not None:
-        named_inner(options.inner)
-    under = load_under_test(options.converter)
+    laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
     folder = new_folder(options.out, "conform")
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder}: is not empty; choose another --out")
-    files = {
-        title: str(Path(name).absolute()) if name.endswith(".toml") else name
-        for name, title in titles.items()
-    }
-    jobs = make_jobs(
-        files, cases, options.inner, under, folder / "converters", folder, not options.no_figures,
-        foreign,
-    )  # fmt: skip
-    found: list[Found] = []
-    lost = None
-    workers = options.workers or processors()
-    columns = BarColumn(), TaskProgressColumn(), "{task.fields[at]}", TimeRemainingColumn()
     began = time.monotonic()
-    with Interrupt() as interrupt, progress("{task.description}", *columns,
-                                            quiet=options.quiet) as bar:  # fmt: skip
-        task = bar.add_task("conform", total=len(jobs), at="starting …")
-
-        def keep(one: Found) -> None:
-            found.append(one)
-            bad = sum(f.verdict in (FAIL, CANNOT) for f in found)
-            at = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
-            bar.update(task, advance=1, at=escape(at))
-
-        try:
-            execute(jobs, workers, keep, lambda: interrupt.came, above(bar))
-        except WorkerLost as problem:
-            lost = problem
-        except KeyboardInterrupt:  # a second signal: the runs under way are lost
-            interrupt.ask()
-    if len(found) < len(jobs):
-        why = str(lost) if lost else "interrupted"
-        done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
-        print(f"gfmhil: {why}; {done}", file=sys.stderr)
-        return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
-    names = [*laws, *([foreign.name] if foreign else [])]
-    result = Conformity(names, options.inner, under, cases, found, folder)
-    result.write(folder)
+    with watching("conform", options.quiet, stoppable=True) as watch:
+        found = conform(
+            laws, against, folder, inner=options.inner, converter=options.converter,
+            controller=options.controller, ports=options.map,
+            workers=options.workers, figures=not options.no_figures, watch=watch,
+        )  # fmt: skip
     if options.json:
-        print(json.dumps(result.plain(), indent=1))
+        print(json.dumps(found.plain(), indent=1))
     else:
-        _print(result, time.monotonic() - began)
-    return _EXIT[result.verdict]
+        _print(found, time.monotonic() - began)
+    return _EXIT[found.verdict]
 
 
 def _diff(options: argparse.Namespace) -> int:
@@ -176,20 +125,18 @@ def _diff(options: argparse.Namespace) -> int:
         console = terminal()
         for note in found.notes:
             console.print(escape(note), highlight=False, soft_wrap=True)
-        table = Table("", "law", "test", "part", "clause", "verdict", "measured", box=None,
-                      pad_edge=False)  # fmt: skip
-        for row in found.rows:
-            where = map(escape, (row.law, row.test, row.part, row.clause.clause))
-            shown = f"[red]{row.change}[/]" if row.counts else row.change
-            table.add_row(shown, *where, row.verdict, escape(row.value))
-        if found.rows:
-            console.print(table)
+        heads = "", "law", "test", "part", "clause", "verdict", "measured"
+        rows = [
+            [
+                Cell(row.change, "bad" if row.counts else ""), row.law, row.test, row.part,
+                row.clause.clause, row.verdict, row.value,
+            ]
+            for row in found.rows
+        ]  # fmt: skip
+        if rows:
+            console.print(Table(heads, rows, text=None))
         console.print(found.words, highlight=False)
     return EXIT_FAILED if found.worse else 0
-
-
-def _names(law: str) -> Sequence[str]:
-    return law_names() if law == ALL else [law]
 
 
 def _plain(case: Case) -> dict[str, Any]:
@@ -197,19 +144,11 @@ def _plain(case: Case) -> dict[str, Any]:
     return {"test": case.id, "runs": runs, "title": case.test.title, "source": source}
 
 
-def _list(cases: Sequence[Case]) -> Table:
-    table = Table("test", "runs", "title", "source", box=None, pad_edge=False)
-    for case in cases:
-        runs = str(len(case.test.runs()))
-        table.add_row(case.id, runs, case.test.title, case.test.source.words())
-    return table
-
-
 def _print(result: Conformity, wall_s: float) -> None:
     """The short table that ends the command."""
     console = terminal()
+    rows: list[list[Any]] = []
     if len(result.laws) == 1:
-        table = Table("test", "", "why", box=None, pad_edge=False)
         for case in result.cases:
             verdict = result.matrix[result.laws[0], case.id]
             wrong = [
@@ -218,23 +157,17 @@ def _print(result: Conformity, wall_s: float) -> None:
                 if f.verdict == verdict != PASS
                 for text in dict.fromkeys(v.text for v in f.wrong) or [f.reason]
             ]
-            table.add_row(case.id, f"[{_COLOURS[verdict]}]{verdict}[/]", escape("\n".join(wrong)))
-        console.print(table)
+            rows.append([case.id, Cell(verdict, _STYLES[verdict]), "\n".join(wrong)])
+        console.print(Table(("test", "", "why"), rows, text=None))
     else:
-        for table in fitting(console, result.laws, lambda laws: _matrix(result, laws)):
+        cells = {at: Cell(f"{SIGNS[v]} {v}", _STYLES[v]) for at, v in result.matrix.items()}
+        rows = [[case.id, *(cells[law, case.id] for law in result.laws)] for case in result.cases]
+        for table in Table(["test", *result.laws], rows, text=None).fitting(console):
             console.print(table)
     verdicts = list(result.matrix.values())
     told = ", ".join(f"{verdicts.count(v)} {v}" for v in SIGNS if v in verdicts)
-    count = len(result.found)
+    count = len(result.parts)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)
     report = Path(result.folder or ".") / "report.html"
     console.print(escape(f"report: {report}"), highlight=False, soft_wrap=True)
-
-
-def _matrix(result: Conformity, laws: Sequence[str]) -> Table:
-    table = Table("test", *map(escape, laws), box=None, pad_edge=False)
-    for case in result.cases:
-        cells = [result.matrix[law, case.id] for law in laws]
-        table.add_row(case.id, *[f"[{_COLOURS[v]}]{SIGNS[v]} {v}[/]" for v in cells])
-    return table

@@ -38,7 +38,7 @@ COMMANDS = {
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
-    "identify": ("identify", "measure a converter's dq admittance, and judge grids by it"),
+    "scan": ("scan", "measure a converter's dq admittance, and judge grids by it"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
     "firmware": (
@@ -56,6 +56,10 @@ COMMANDS = {
     "controller": ("roles", "start the controller alone; it binds the endpoint"),
     "plant": ("roles", "start the plant emulator alone; it connects to the endpoint"),
 }
+
+
+#: names of earlier versions: the module of each, whose ``call`` says what it is called now
+_EARLIER = {"identify": "scan"}
 
 
 class _Version(argparse.Action):
@@ -78,8 +82,9 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action=_Version, help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    if command in COMMANDS:
-        module = import_module(f"gfm_hil.cli.{COMMANDS[command][0]}")
+    if command in COMMANDS or command in _EARLIER:
+        name = _EARLIER.get(command) or COMMANDS[command][0]
+        module = import_module(f"gfm_hil.cli.{name}")
         chosen = commands.add_parser(command)
         chosen.set_defaults(call=getattr(module, "call", None))  # some have only sub-commands
         module.add(chosen)
@@ -100,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given:
         top.print_help()
         return 0
-    if not given[0].startswith("-") and given[0] not in COMMANDS:
+    if not given[0].startswith("-") and given[0] not in {**COMMANDS, **_EARLIER}:
         return _refuse(_no_command(given[0]))
     options, unknown = top.parse_known_args(given)
     if unknown:

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+MEMORY = Path("/dev/shm")  # of shm_open(3) on Linux
 PATIENCE_S = 10.0  # a process of ours holds an exclusive lock for milliseconds
 _LOOK_S = 0.01
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
@@ -26,6 +27,24 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 def is_private(found: os.stat_result) -> bool:
     """Whether a file or folder belongs to our user and no other user has any access to it."""
     return found.st_uid == os.geteuid() and not found.st_mode & 0o077
+
+
+def private_folder() -> Path:
+    """The folder of our user in memory, made if it is not there; nobody else has any access to it.
+
+    Raises:
+        PermissionError: what is there belongs to another user, is open to others or no folder.
+    """
+    place = MEMORY / f"gfmhil-{os.geteuid()}"
+    with contextlib.suppress(FileExistsError):
+        place.mkdir(0o700)
+    found = place.lstat()
+    if not stat.S_ISDIR(found.st_mode) or not is_private(found):
+        mode = stat.S_IMODE(found.st_mode)
+        raise PermissionError(
+            f"{place} is not a folder of our user alone (owner uid {found.st_uid}, mode {mode:04o})"
+        )
+    return place
 
 
 def is_guarded(folder: os.stat_result) -> bool:
@@ -59,7 +78,7 @@ def lock(handle: int, operation: int, patience_s: float = PATIENCE_S) -> None:
 
 
 def make(prefix: str, where: Path) -> tuple[Path, int]:
-    """Make a folder in ``where``; returns it with a lock to pass to ``let_go``."""
+    """Make a folder in ``where``; returns it with a lock to pass to ``release``."""
     while True:
         place = Path(tempfile.mkdtemp(prefix=prefix, dir=where))
         with contextlib.suppress(FileNotFoundError):  # removed before we locked it: try another
@@ -81,12 +100,12 @@ def hold(place: Path) -> int:
         lock(handle, fcntl.LOCK_SH)
         place.stat()  # it may have been removed meanwhile
     except BaseException:
-        let_go(handle)
+        release(handle)
         raise
     return handle
 
 
-def let_go(handle: int) -> None:
+def release(handle: int) -> None:
     """Undo ``make`` or ``hold``; the folder stays."""
     os.close(handle)
 
@@ -97,13 +116,13 @@ def temporary(prefix: str) -> Iterator[Path]:
     where = Path(tempfile.gettempdir())
     for left, handle in left_behind(prefix, where):
         shutil.rmtree(left, ignore_errors=True)
-        let_go(handle)
+        release(handle)
     place, handle = make(prefix, where)
     try:
         yield place
     finally:
         shutil.rmtree(place, ignore_errors=True)
-        let_go(handle)
+        release(handle)
 
 
 def held(place: Path) -> bool:
@@ -142,7 +161,7 @@ def left_behind(prefix: str, where: Path) -> Iterator[tuple[Path, int]]:
                     raise PermissionError
                 lock(handle, fcntl.LOCK_EX, patience_s=0.0)
             except OSError:
-                let_go(handle)
+                release(handle)
                 continue
             yield place, handle
     finally:

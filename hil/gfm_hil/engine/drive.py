@@ -23,6 +23,7 @@ from gfm_hil.engine.loop_records import (
     Records,
     ReturnReason,
     Side,
+    limited_reader,
     make_loop,
 )
 from gfm_hil.engine.plant_ticks import plant_ticks
@@ -33,7 +34,7 @@ from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import PLANT_LEFT
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_plant import NO_FRESH_U
 from gfm_plant.names import CONTROLLER_GONE, CONTROLLER_LEFT
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
@@ -53,7 +54,7 @@ class Share(NamedTuple):
 
     bench: Bench
     link: Link
-    part: Part
+    part: RolePart
     timeline: Timeline
     crowded: bool = False
 
@@ -68,8 +69,10 @@ class _End:
         plant = role == "plant"
         self.bench, self.link = bench, link
         self.writer = FrameWriter("y" if plant else "u", bench.inner)
-        self.reader = FrameReader.of(role, scenario)
-        self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
+        hold = int(bench.controller.ctl["hold"][0])  # of the watchdog, for both sides
+        every = getattr(link, "every", 1)
+        self.reader = limited_reader(role, scenario, hold, every)
+        self.loop = make_loop(scenario, 0 if plant else -1, t0_ns, hold, every)
         sleeps_soon = share.crowded and port.patient is not None
         self.loop["spin_limit"] = _SOON if sleeps_soon else port.spin_limit
         w, r = self.writer, self.reader
@@ -223,7 +226,7 @@ def _records(bench: Bench) -> ControllerRecords:
     return ControllerRecords(c.ctl, c.laws, c.states, c.est)
 
 
-def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
+def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
     nowhere: Any = _NullLink()
     unused: Any = None

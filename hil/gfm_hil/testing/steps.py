@@ -26,7 +26,7 @@ _EVENT: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
 
 
-class Plan:
+class StepPlan:
     """Events and duration of a test, in addition to a scenario's own events."""
 
     def __init__(self, base: Scenario) -> None:
@@ -124,7 +124,7 @@ class Steps:
             if self._skip is None:
                 raise
             self._skip(f"--gfmhil-link {self._link_wanted}: {problem}")
-        self._plan = Plan(self._setting.scenario)
+        self._plan = StepPlan(self._setting.scenario)
         self._run: Run | None = None
         self._ran = 0  # planned ticks of ``_run``
 
@@ -240,7 +240,7 @@ class Steps:
         return self._setting
 
     @property
-    def _planned(self) -> Plan:
+    def _planned(self) -> StepPlan:
         _ = self.setting  # starts the experiment
         return self._plan
 
