@@ -19,7 +19,7 @@ from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.ports.commands import Operator
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.recording.log import read_log
 from gfm_hil.scenario.events import Reference
 
@@ -115,7 +115,7 @@ def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, a
 def test_no_descriptor_left_is_not_the_end_of_a_run(
     ends, run, tmp_path, monkeypatch, attack_now
 ) -> None:
-    record = open_record(run().folder)
+    record = open_recording(run().folder)
     record.folder = tmp_path
     assert present(tmp_path) == ["controller"] and record.ended() is None
 
@@ -123,9 +123,9 @@ def test_no_descriptor_left_is_not_the_end_of_a_run(
         raise OSError(errno.EMFILE, "Too many open files")
 
     checks = (lambda: present(tmp_path), lambda: Operator(tmp_path), record.ended)
-    for where, name in ((Path, "read_text"), (os, "open")):
+    for where in ("gfm_hil.engine.announcement.read_json", "os.open"):
         with monkeypatch.context() as patch:
-            patch.setattr(where, name, full)
+            patch.setattr(where, full)
             for check in checks:
                 with pytest.raises((UserError, OSError), match="Too many open files"):
                     check()
@@ -137,7 +137,7 @@ def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
     with scratch.temporary("gfmhil-commands-") as place:
         assert scratch.held(place)
         (tmp_path / "commands_plant.json").write_text("[1]", encoding="utf-8")
-        with pytest.raises(UserError, match=r"commands_plant\.json: not an announcement"):
+        with pytest.raises(UserError, match=r"commands_plant\.json: must be an object"):
             present(tmp_path)
     assert not scratch.held(place)
 
@@ -156,11 +156,11 @@ def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_n
 
 @pytest.mark.attack("10.4", "who told the run to stop?", "nothing in events.jsonl")
 def test_the_log_says_who_told_and_who_stopped(ends, tmp_path, attack_now) -> None:
-    operator = Operator(tmp_path, through="tell")
-    operator.tell(P_REF)
+    operator = Operator(tmp_path, through="command")
+    operator.command(P_REF)
     operator.stop()
     operator.close()
-    who = {"through": "tell", "uid": os.getuid(), "pid": os.getpid()}
+    who = {"through": "command", "uid": os.getuid(), "pid": os.getpid()}
     told, end = read_log(tmp_path / "events_controller.jsonl")
     for line in (told, end):
         assert {k: v for k, v in line["operator"].items() if k != "name"} == who

@@ -16,25 +16,24 @@ from collections.abc import Iterator, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-#: each command's module and what it does. A module's ``add`` gives the command's parser its
-#: options, ``call`` carries the command out and returns the exit code. Only the module of the
-#: command that is called is imported, so that the light commands load no numba.
+from gfm_hil.ports import PORTS, make_port
+
+#: each command's module (none: it is a port) and what it does. A module's ``add`` gives the
+#: command's parser its options, ``call`` carries the command out and returns the exit code. Only
+#: the module of the command that is called is imported, so that the light commands load no numba.
 COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
-    "tell": ("tell", "command a run that is going on, or print its newest tick"),
+    "command": ("command", "command a run that is going on, or print its newest tick"),
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
     "merge": (
         "merge",
         "join the run folders of a controller and a plant started apart",
     ),
-    "scope": ("scope", "show a run in the browser while it goes on, or afterwards"),
-    "modbus": ("modbus", "serve a run that is going on as a SunSpec device on Modbus/TCP"),
-    "xcp": ("xcp", "serve a run that is going on to a calibration tool, by XCP on UDP"),
+    **{name: ("", entry.text) for name, entry in PORTS.items()},
     "export": (
         "export",
         "write a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",
     ),
-    "stream": ("stream", "stream what a run records to PlotJuggler, your own tools or Prometheus"),
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
@@ -56,6 +55,9 @@ COMMANDS = {
     "controller": ("roles", "start the controller alone; it binds the endpoint"),
     "plant": ("roles", "start the plant emulator alone; it connects to the endpoint"),
 }
+
+#: names that go on working for one version
+_FORMER = {"tell": "command"}
 
 
 class _Version(argparse.Action):
@@ -79,7 +81,11 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     top.add_argument("--version", action=_Version, help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     if command in COMMANDS:
-        module = import_module(f"gfm_hil.cli.{COMMANDS[command][0]}")
+        module: Any = (
+            make_port(command)
+            if command in PORTS
+            else import_module(f"gfm_hil.cli.{COMMANDS[command][0]}")
+        )
         chosen = commands.add_parser(command)
         chosen.set_defaults(call=getattr(module, "call", None))  # some have only sub-commands
         module.add(chosen)
@@ -91,7 +97,10 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in _FORMER:
+        print(f"gfmhil {given[0]} is now gfmhil {_FORMER[given[0]]}", file=sys.stderr)
+        given[0] = _FORMER[given[0]]
     for text in given:
         if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
             why = "-- cannot be a value; for a file of that name write ./--"

@@ -20,13 +20,11 @@ from gfm_hil.cli.common import (
     why_it_ended,
     window,
 )
-from gfm_hil.cli.companion import companion
-from gfm_hil.cli.modbus import PORT as MODBUS_PORT
-from gfm_hil.cli.scope import need_websockets
-from gfm_hil.cli.stream import PORT
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_for_model
 from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
+from gfm_hil.ports import PORTS
+from gfm_hil.ports.companion import OWN_NUMBER, companion
 from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
 
@@ -56,18 +54,11 @@ def add(command: argparse.ArgumentParser) -> None:
         "--waveforms", type=window, metavar="FROM:TO",
         help="override waveforms: the window of the figure of the three phases, s",
     )  # fmt: skip
-    command.add_argument(
-        "--scope", nargs="?", type=int, const=-1, metavar="PORT",
-        help="serve a scope of it to the browser; it stays when the run is over, until Ctrl-C",
-    )  # fmt: skip
-    command.add_argument(
-        "--stream", nargs="?", type=int, const=PORT, metavar="PORT",
-        help="stream it while it goes on, as gfmhil stream does",
-    )  # fmt: skip
-    command.add_argument(
-        "--modbus", nargs="?", type=int, const=MODBUS_PORT, metavar="PORT",
-        help="serve it as a SunSpec device while it goes on, as gfmhil modbus does",
-    )  # fmt: skip
+    for name, entry in PORTS.items():
+        command.add_argument(
+            f"--{name}", nargs="?", type=int, const=OWN_NUMBER, metavar="PORT",
+            help=f"{entry.text}, as gfmhil {name} does (port {entry.number})",
+        )  # fmt: skip
 
 
 def call(options: argparse.Namespace) -> int:
@@ -78,17 +69,11 @@ def call(options: argparse.Namespace) -> int:
     if scenario.network is not None:
         return _run_network(scenario, folder, options)
     with contextlib.ExitStack() as stack:
-        scope = None
-        if options.scope is not None:
-            need_websockets()
-            port = None if options.scope < 0 else options.scope
-            scope = stack.enter_context(companion("scope", folder, port, ends_itself=False))
-        if options.stream is not None:
-            stack.enter_context(companion("stream", folder, options.stream, ready=2))
-        if options.modbus is not None:
-            if scenario.link.type == INPROC:
-                raise UserError("--modbus: a run in process takes no commands; choose --link")
-            stack.enter_context(companion("modbus", folder, options.modbus))
+        stay = {}
+        for name, number in _ports(options).items():
+            beside = companion(name, folder, number, scenario.link.type == INPROC)
+            if (process := stack.enter_context(beside)) is not None:
+                stay[name] = process
         with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
             command = _model_command(scenario, options, notice)
             figures = not options.no_figures
@@ -97,11 +82,18 @@ def call(options: argparse.Namespace) -> int:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
             print_summary(run.summary, folder, why_it_ended(run))
-        if scope is not None and scope.poll() is None and run.summary["status"] != "interrupted":
-            print("the scope stays open until Ctrl-C", file=sys.stderr, flush=True)
-            with contextlib.suppress(KeyboardInterrupt):
-                scope.wait()
+        for name, process in stay.items():
+            if process.poll() is None and run.summary["status"] != "interrupted":
+                print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)
+                with contextlib.suppress(KeyboardInterrupt):
+                    process.wait()
     return exit_code(run.summary)
+
+
+def _ports(options: argparse.Namespace) -> dict[str, int]:
+    """The numbers of the ports that the options name."""
+    named = {name: getattr(options, name) for name in PORTS}
+    return {name: number for name, number in named.items() if number is not None}
 
 
 def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Notice) -> list[str]:
@@ -130,12 +122,11 @@ def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) 
     """Run several converters, each of which gets a run folder of its own."""
     if options.controller is not None:
         raise UserError("--controller: controls one converter; a network runs without it")
-    for name in ("scope", "stream", "modbus"):
-        if getattr(options, name) is not None:
-            raise UserError(
-                f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
-                " folder of a converter"
-            )
+    for name in _ports(options):
+        raise UserError(
+            f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
+            " folder of a converter"
+        )
     with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
         figures = not options.no_figures
         runs = run_network(scenario, folder, progress, notice, figures=figures)
