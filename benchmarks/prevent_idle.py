@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 
 WAYS = ("never", "always")
@@ -28,7 +28,7 @@ def misses(link: str, way: str, seconds: float, folder: Path) -> int:
         "link": {"type": link, "peer_timeout_s": 5.0},
         "late_policy": {"hold": 10**9},
     }
-    run = run_scenario(check_scenario(content, "benchmark"), folder, figures=False)
+    run = run_scenario(check_scenario(content, "benchmark"), folder)
     return int(run.summary["misses"])
 
 

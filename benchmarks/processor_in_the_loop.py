@@ -12,8 +12,8 @@ import time
 
 import numpy as np
 
+from gfm_hil.controllers import PilController
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.models import PilModel
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.scenario.model import load_scenario
 from gfm_runtime.firmware import TARGETS
@@ -25,7 +25,7 @@ class Bench:
     """A law on a target, with measurements at the operating point."""
 
     def __init__(self, law: str, target: str) -> None:
-        self.model = PilModel(target)
+        self.model = PilController(target)
         bench = make_bench(load_scenario("pref_step", in_process=True, law=law), self.model.real)
         bench.controller.ctl["y"][0, :5] = bench.start.y
         self.model.begin(bench.controller)

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from _figures.common import FIGURES, GREY
 
-from gfm_hil.results.runner import Run, run_scenario
+from gfm_hil.run.runner import Run, run_scenario
 from gfm_hil.scenario.model import check_scenario
 
 T_S = 1e-3  # s, so that the pause is what is late here and nothing else
@@ -35,7 +35,7 @@ def run(place: Path, name: str, extrapolate: int, impairment: dict[str, Any] | N
         "link": {"type": "shm", "peer_timeout_s": 5.0, "impairment": impairment},
         "events": [{"tick": STEP, "type": "reference", "P_ref": 0.8}],
     }
-    return run_scenario(check_scenario(content, name), place / name, figures=False)
+    return run_scenario(check_scenario(content, name), place / name)
 
 
 def main() -> None:

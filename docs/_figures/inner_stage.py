@@ -19,10 +19,9 @@ from matplotlib.figure import Figure
 from gfm_design.margins.delays import overall_delay
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.linear import Mode
-from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.results.cycles import cycle_means, cycle_ticks
+from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.figures import COLOURS, dress
-from gfm_hil.results.run import Run
+from gfm_hil.run.cycles import cycle_means, cycle_ticks
 from gfm_hil.scenario.expectation import reason_name
 from gfm_plant import Plant
 from gfm_runtime import load_law

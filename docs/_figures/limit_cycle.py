@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.results.figures import COLOURS, dress
-from gfm_hil.results.runner import Run
+from gfm_hil.run.runner import Run
 from gfm_plant import Plant
 
 LSB = 2.0 / 2**12  # of E_u on the DS2101, p.u.

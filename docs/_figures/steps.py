@@ -11,7 +11,7 @@ import numpy as np
 from _figures.common import DOCS, FIGURES, LAWS, number, run, scenario, write_table
 
 from gfm_hil.results.figures import draw_comparison, draw_run
-from gfm_hil.results.runner import Run
+from gfm_hil.run.runner import Run
 
 COLUMNS = (
     ("p_peak", "p peak [p.u.]", 3),

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import COLOURS
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 
 _SHOWN = ("y_p", "y_omega_u", "u_i_u")
 
@@ -25,7 +25,7 @@ def from_mf4() -> None:
     ]
     case = scenario("pref_step", law="droop-5", events=events, duration=1.8)
     with tempfile.TemporaryDirectory() as place:
-        run_scenario(case, Path(place) / "run", figures=False)
+        run_scenario(case, Path(place) / "run")
         file = Path(place) / "step.mf4"
         export_run(Path(place) / "run", "mf4", file)
         with MDF(file) as mdf:

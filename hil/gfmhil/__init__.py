@@ -9,45 +9,30 @@ Python::
 Runs stay in memory and print nothing. Errors are ``UserError`` and ``LawError``, in one line.
 """
 
+import ast
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from gfm_hil.core import blas as _blas  # noqa: F401  before NumPy is first imported
 
+# the stub beside this file says in which module each name is
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
 _HOMES = {
-    "UserError": "gfm_hil.core.errors",
-    "load_run": "gfm_hil.results.run",
-    "NetworkRun": "gfm_hil.results.network_run",
-    "Run": "gfm_hil.results.run",
-    "load_scenario": "gfm_hil.scenario.model",
-    "Scenario": "gfm_hil.scenario.model",
-    "CampaignResult": "gfm_hil.studies.campaign.result",
-    "Identification": "gfm_hil.studies.identification",
-    "identify": "gfm_hil.studies.identification",
-    "Law": "gfm_hil.studies.law",
-    "laws": "gfm_hil.studies.law",
-    "Loop": "gfm_hil.studies.loop",
-    "run": "gfm_hil.studies.notebook",
-    "run_network": "gfm_hil.studies.notebook",
-    "campaign": "gfm_hil.studies.notebook",
-    "compare": "gfm_hil.studies.notebook",
-    "conform": "gfm_hil.studies.notebook",
-    "Conformity": "gfm_hil.studies.conformity.result",
-    "Comparison": "gfm_hil.studies.notebook",
-    "LawError": "gfm_runtime.errors",
+    name.name: str(line.module)
+    for line in _STUB.body
+    if isinstance(line, ast.ImportFrom)
+    for name in line.names
 }
-
-_MODULES = ("design", "envelopes")
-
-__all__ = sorted([*_HOMES, *_MODULES])
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for, when it is."""
-    if name in _MODULES:
-        return import_module(f"gfmhil.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'gfmhil' has no attribute {name!r}")
+    if _HOMES[name] == __name__:
+        return import_module(f"{__name__}.{name}")
     return getattr(import_module(_HOMES[name]), name)
 
 

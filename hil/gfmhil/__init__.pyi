@@ -1,6 +1,13 @@
+from gfm_hil.api.runs import Comparison as Comparison
+from gfm_hil.api.runs import NetworkRun as NetworkRun
+from gfm_hil.api.runs import Run as Run
+from gfm_hil.api.runs import compare as compare
+from gfm_hil.api.runs import load_run as load_run
+from gfm_hil.api.runs import merge as merge
+from gfm_hil.api.runs import recover as recover
+from gfm_hil.api.runs import run as run
+from gfm_hil.api.runs import run_network as run_network
 from gfm_hil.core.errors import UserError as UserError
-from gfm_hil.results.run import Run as Run
-from gfm_hil.results.run import load_run as load_run
 from gfm_hil.scenario.model import Scenario as Scenario
 from gfm_hil.scenario.model import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
@@ -10,11 +17,8 @@ from gfm_hil.studies.identification import identify as identify
 from gfm_hil.studies.law import Law as Law
 from gfm_hil.studies.law import laws as laws
 from gfm_hil.studies.loop import Loop as Loop
-from gfm_hil.studies.notebook import Comparison as Comparison
 from gfm_hil.studies.notebook import campaign as campaign
-from gfm_hil.studies.notebook import compare as compare
 from gfm_hil.studies.notebook import conform as conform
-from gfm_hil.studies.notebook import run as run
 from gfm_runtime.errors import LawError as LawError
 from gfmhil import design as design
 from gfmhil import envelopes as envelopes

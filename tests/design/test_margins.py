@@ -32,8 +32,8 @@ from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
-from gfm_hil.recording.run import RecordedRun
-from gfm_hil.results.loop_delay import loop_delay
+from gfm_hil.recording.run import Run
+from gfm_hil.run.loop_delay import loop_delay
 from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
 from gfm_plant import load_converter, phase_jump
 from gfm_runtime import Law, load_law
@@ -284,7 +284,7 @@ def test_grid_strength_and_region() -> None:
             assert (found < 0.0) == (region.sigma[i, j] < 0.0)
 
 
-def late_run(missed: slice) -> RecordedRun:
+def late_run(missed: slice) -> Run:
     """A run in real time with some ticks missed, 60 us there and back."""
     due = np.arange(1000, dtype=np.int64) * 100_000
     received = due + 60_000
@@ -292,7 +292,7 @@ def late_run(missed: slice) -> RecordedRun:
     timing = {"plant_scheduled": due, "plant_sent": due, "plant_received": received}
     scenario = Scenario(title="late", duration=0.1, mode="realtime")
     columns = {"tick": np.arange(1000)}
-    return RecordedRun(scenario, {"mode": "realtime"}, columns, timing=timing)
+    return Run(scenario, {"mode": "realtime"}, columns, timing=timing)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.recording.parts import Part
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
 from gfm_hil.scenario.profiles import read_profile
 from gfm_hil.scenario.toml_out import scenario_toml
@@ -289,7 +289,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
         "",
     )  # fmt: skip
     finished, going, held = place / "finished", place / "going", place / "held"
-    run_scenario(scenario, finished, figures=False)
+    run_scenario(scenario, finished)
     held.mkdir(0o700)
     going.mkdir()
     (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")

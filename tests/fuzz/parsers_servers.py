@@ -30,7 +30,7 @@ from gfm_hil.ports.modbus.image import BASE, VENDOR
 from gfm_hil.ports.scope import server as scope_server
 from gfm_hil.ports.scope.access import Access
 from gfm_hil.ports.scope.recording import open_recording
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 
 from ..support.modbus_device import Bench as MadeUp
@@ -167,7 +167,7 @@ def _requests() -> st.SearchStrategy[bytes]:
 def _scope(place: Path) -> Iterator[Take]:
     """An input is a page's messages, one per line; ``@token@`` stands for the token."""
     run = {"title": "f", "duration": 0.1, "law": "vsg-2", "link": {"type": "inproc"}}
-    done = run_scenario(check_scenario(run, ""), place / "run", figures=False)
+    done = run_scenario(check_scenario(run, ""), place / "run")
     access, served, ports = Access(), Served(), list[int]()
     scope = scope_server.Scope(open_recording(done.folder), access)
     pace, scope_server.FRAMES_PER_S = scope_server.FRAMES_PER_S, 500

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import Scenario, check_scenario
 
 from ..support.uml import Kernel
@@ -48,7 +48,7 @@ def run(make: Make, tmp_path: Path) -> RunIt:
     count = iter(range(100))
 
     def call(**content: Any) -> Run:
-        return run_scenario(make(**content), tmp_path / f"run{next(count)}", figures=False)
+        return run_scenario(make(**content), tmp_path / f"run{next(count)}")
 
     return call
 

@@ -12,7 +12,7 @@ import pytest
 
 import gfmhil
 from gfm_design.model.closed_loop import REFERENCES
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import load_scenario
 
 
@@ -21,7 +21,7 @@ def test_a_run_in_memory_has_the_bits_of_one_in_a_folder(tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
     scenario = load_scenario("pref_step", law="vsg-2", duration=2.5, link__type="inproc",
                              mode="lockstep")  # fmt: skip
-    other = run_scenario(scenario, tmp_path / "run", figures=False)
+    other = run_scenario(scenario, tmp_path / "run")
     assert run.status == "completed" and run.folder is None
     for name in ("p", "true_p", "y_v_dc", "u_E_u", "f_hz", "t", "law"):
         assert np.array_equal(run.signals[name], other.signals[name])

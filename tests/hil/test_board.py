@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
 
 from ..support.firmware import bench
 from ..support.processes import write

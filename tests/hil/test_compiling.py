@@ -12,7 +12,7 @@ from numba import njit
 
 from gfm_hil.engine.compiling import compile_everything, compile_sets
 from gfm_hil.links import link_names
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 
 pytestmark = pytest.mark.processes
 
@@ -95,7 +95,7 @@ def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
         about = {"type": link, "peer_timeout_s": 60.0, "options": options}
         scenario = make(link=about, duration=0.005, inner=inner)
         folder = tmp_path / f"{link}-{inner}"
-        run = run_scenario(scenario, folder, notice=said.append, figures=False)
+        run = run_scenario(scenario, folder, notice=said.append)
         assert run.summary["status"] == "completed"
     assert said == ["starting controller and plant …"] * len(kinds)
     assert cached(root) == before

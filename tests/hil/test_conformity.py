@@ -19,9 +19,8 @@ from pydantic import TypeAdapter
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory
+from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario
 from gfm_hil.scenario.toml_out import toml_text
 from gfm_hil.studies import envelopes

@@ -11,8 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram
-from gfm_hil.results.run import Run
 from gfm_hil.scenario.model import Scenario, load_scenario, shipped_scenarios
 
 Make = Callable[..., Scenario]
@@ -125,9 +125,7 @@ def test_every_shipped_scenario_is_drawn_within_its_picture(name: str) -> None:
 
 
 def test_the_report_shows_it(make: Make, tmp_path: Path) -> None:
-    from gfm_hil.results.runner import run_scenario
-
-    one: Run = run_scenario(make(events=[FAULT]), tmp_path / "run")
+    one = gfmhil.run(make(events=[FAULT]), folder=tmp_path / "run")
     report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert 'alt="network" src="data:image/svg+xml;base64,' in report
     drawn = one.file("network.svg").read_bytes()

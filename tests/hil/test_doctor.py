@@ -10,7 +10,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.realtime.environment import environment
-from gfm_hil.results import doctor
+from gfm_hil.run import doctor
 
 GOOD = {
     "preemption": "PREEMPT_RT",

@@ -26,7 +26,7 @@ from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.parts import Part
-from gfm_hil.results.run_folder import finish
+from gfm_hil.run.run_folder import finish
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 from gfm_plant import NO_FRESH_U
@@ -159,7 +159,7 @@ def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now
     end = {"role": "controller", "faults": faults, "e2e": found.reader.e2e}
     (place / "link_controller.json").write_text(json.dumps(end), encoding="utf-8")
     (place / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
-    summary = finish(scenario, place, [scenario.law], 0.0, figures=False).summary
+    summary = finish(scenario, place, [scenario.law], 0.0).summary
     assert summary["e2e"] == {"controller": "invalid"}
     assert summary["faults"] == {"controller": {f: n for f, n in faults.items() if n}}
     when, _, state, code = found.liar.last_words()

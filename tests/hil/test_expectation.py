@@ -12,7 +12,7 @@ import pytest
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_hil.scenario.model import check_scenario, load_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
@@ -52,7 +52,7 @@ def test_a_trip_for_another_reason_is_not_the_one_expected(tmp_path, attack_now)
     (tmp_path / "nan.py").write_text(SENDS_NAN)
     scenario = load_scenario("switchover", mode="lockstep", link__peer_timeout_s=20.0)
     run = run_scenario(
-        scenario, tmp_path / "run", figures=False,
+        scenario, tmp_path / "run",
         controller_command=(sys.executable, str(tmp_path / "nan.py"), "{endpoint}", "{scenario}"),
     )  # fmt: skip
     assert run.summary["status"] == "tripped" == run.summary["expected"]
@@ -66,7 +66,7 @@ def test_a_trip_for_another_reason_is_not_the_one_expected(tmp_path, attack_now)
 
 
 def test_the_shipped_experiment_ends_as_it_expects(tmp_path):
-    run = run_scenario(switchover(), tmp_path / "run", figures=False)
+    run = run_scenario(switchover(), tmp_path / "run")
     assert (run.summary["status"], run.summary["unmet"]) == ("tripped", [])
     (event,) = run.summary["events"]
     assert event["cut_short"].startswith("over-current at 1.4")

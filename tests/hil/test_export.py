@@ -18,9 +18,9 @@ from scipy.io import loadmat
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import CONTROLLER_INNER, INSTRUCTIONS, PLANT_INNER, TABLE, describe
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 from gfm_hil.results.export import FORMATS, export_run
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 from gfm_plant.names import TRIP_REASONS
 from gfm_runtime.states import STATES
@@ -32,17 +32,17 @@ EVENTS = [
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory) -> RecordedRun:
+def table(tmp_path_factory) -> Run:
     """A run between two processes, so that there are times; its operator did something, too."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     content = {"title": "to be exported", "duration": 0.05, "link": {"type": "shm"}}
-    run_scenario(check_scenario({**content, "events": EVENTS}, "test"), folder, figures=False)
+    run_scenario(check_scenario({**content, "events": EVENTS}, "test"), folder)
     log = folder / "events.jsonl"
     told = {"tick": 77, "t": 0.0077, "event": "grid-phase-jump", "label": "phase jump 1°"}
     first, *rest = log.read_text(encoding="utf-8").splitlines(keepends=True)
     line = json.dumps({**told, "by": "operator"}) + "\n"
     log.write_text("".join([first, line, *rest]), encoding="utf-8")
-    run = RecordedRun.load(folder)
+    run = Run.load(folder)
     signals, timing = ({name: x[:] for name, x in c.items()} for c in (run.columns, run.timing))
     return replace(run, columns=signals, timing=timing)
 
@@ -185,4 +185,4 @@ def test_what_cannot_be_done_is_said_in_a_line(table, tmp_path, capsys, monkeypa
 def test_a_run_that_is_not_over_is_to_be_streamed(tmp_path):
     (tmp_path / "scenario.toml").touch()
     with pytest.raises(UserError, match="the run is not over, see gfmhil stream"):
-        RecordedRun.load(tmp_path)
+        Run.load(tmp_path)

@@ -13,9 +13,9 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.can.dbc import INNER, SEGMENT, STATUS, VECTORS
 from gfm_hil.links.can.loopback import LoopbackBus
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 from gfm_hil.results.export import export_run
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 
 BUS = "127.0.0.1:{port}"
@@ -56,7 +56,7 @@ def run_over_can(folder: Path, port: int, content=CONTENT, **options) -> list[ca
     listener = Listener(channel)
     listener.start()
     try:
-        run_scenario(check_scenario(content, "test"), folder, figures=False)
+        run_scenario(check_scenario(content, "test"), folder)
     finally:
         listener.stop()
     return listener.heard
@@ -111,7 +111,7 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
 def test_cantools_decodes_what_the_run_recorded(tmp_path):
     run_over_can(tmp_path / "run", 19530)
     found, dbc = exported(tmp_path / "run", tmp_path)
-    table = RecordedRun.load(tmp_path / "run")
+    table = Run.load(tmp_path / "run")
     for group in ("y", "u"):
         message = dbc.get_message_by_name(VECTORS[group])
         frames = [m for m in found if m.arbitration_id == message.frame_id]

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import gfm_hil.models
+import gfm_hil.controllers
 from gfm_hil.engine.handshake import _Hello
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameReader, FrameWriter
@@ -34,7 +34,7 @@ pytestmark = [
     pytest.mark.timeout(0 if "GFMHIL_FUZZ_RUNS" in os.environ else 240),
 ]
 
-HEADERS = Path(gfm_hil.models.__file__).parent
+HEADERS = Path(gfm_hil.controllers.__file__).parent
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DRIVERS = Path(__file__).parents[1] / "support" / "fuzz_c"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror", "-O1"]

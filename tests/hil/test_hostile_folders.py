@@ -27,8 +27,8 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.recording import parts as recording
-from gfm_hil.results.run_folder import recover
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.run_folder import recover
+from gfm_hil.run.runner import run_scenario
 
 pytestmark = [
     pytest.mark.processes,
@@ -67,7 +67,7 @@ def whole(tmp_path_factory) -> Path:
 
     folder = tmp_path_factory.mktemp("good") / "whole"
     given = {"title": "test", "duration": 0.05, "link": {"type": "inproc"}, "events": EVENTS}
-    run_scenario(check_scenario(given, "test"), folder, figures=False)
+    run_scenario(check_scenario(given, "test"), folder)
     return folder
 
 
@@ -82,9 +82,9 @@ def cut(whole) -> Path:
         def stop(*_: object) -> None:
             raise Unfinished
 
-        patch.setattr("gfm_hil.results.runner.finish", stop)
+        patch.setattr("gfm_hil.run.runner.finish", stop)
         with pytest.raises(Unfinished):
-            run_scenario(load_scenario(whole / "scenario.toml"), folder, figures=False)
+            run_scenario(load_scenario(whole / "scenario.toml"), folder)
     (folder / "ended.json").write_text(json.dumps(ENDED))
     for role in ("plant", "controller"):
         (folder / f"link_{role}.json").write_text(json.dumps({**LINK_END, "role": role}))

@@ -19,8 +19,8 @@ from gfm_hil.ports.streams.follow import NewRows
 from gfm_hil.ports.streams.samples import Sampler
 from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER
 from gfm_hil.recording.live import LiveRun
-from gfm_hil.results.run_folder import recover
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.run_folder import recover
+from gfm_hil.run.runner import run_scenario
 from gfm_runtime.signals import NU_INNER, NY_INNER
 
 from ..support.links import PATIENT, RIG, assert_same, run_pair
@@ -142,15 +142,15 @@ def test_an_old_frame_is_refused_by_its_version(make):
 
 def test_the_parts_of_a_cut_run_are_followed_streamed_and_recovered(make, tmp_path, monkeypatch):
     scenario = make(law="vsg-2", inner="virtual-stator", plant=GRID, events=[JUMP], duration=0.03)
-    whole = run_scenario(scenario, tmp_path / "a", figures=False).signals
+    whole = run_scenario(scenario, tmp_path / "a").signals
 
     def stop(*given: Any) -> None:
         raise Unfinished
 
     with monkeypatch.context() as patch:
-        patch.setattr("gfm_hil.results.runner.finish", stop)
+        patch.setattr("gfm_hil.run.runner.finish", stop)
         with pytest.raises(Unfinished):
-            run_scenario(scenario, tmp_path / "b", figures=False)
+            run_scenario(scenario, tmp_path / "b")
     live = LiveRun(tmp_path / "b")
     for role, name in (("plant", "u_E_q"), ("controller", "i_ref_d")):
         assert live.row(role, 200)[name] == whole[name][200]

@@ -14,10 +14,11 @@ from scipy.io import loadmat
 
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER
+from gfm_hil.recording.run import Run
 from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import draw_signals
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.results.report import write_report
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 
 COLUMNS = (*PLANT_INNER, *CONTROLLER_INNER)
@@ -38,7 +39,8 @@ def limited(tmp_path_factory: pytest.TempPathFactory) -> Run:
             {"t": 0.09, "type": "law", "law": "droop-1"},
         ],
     }
-    return run_scenario(check_scenario(content, "test"), tmp_path_factory.mktemp("run") / "run")
+    folder = tmp_path_factory.mktemp("run") / "run"
+    return run_scenario(check_scenario(content, "test"), folder, report=write_report)
 
 
 def test_the_summary_names_the_stage_of_each_law(limited, run):

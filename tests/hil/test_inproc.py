@@ -16,7 +16,8 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.results.report import write_report
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import check_scenario
 from gfm_runtime import load_law
 from gfm_runtime.inner import INNER_CONSTANTS
@@ -55,7 +56,7 @@ def test_the_operating_point_knows_grid_references_and_sensors(run):
 def test_without_an_equilibrium_nothing_starts(make, tmp_path):
     scenario = make(references={"P_ref": 2.0}, plant={"factors": {"L_g": 100.0}})
     with pytest.raises(UserError, match=r"^references, plant\.grid: P = 2\.0 p\.u\."):
-        run_scenario(scenario, tmp_path / "run", figures=False)
+        run_scenario(scenario, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -247,7 +248,7 @@ def test_a_measurement_out_of_range_leads_to_the_safe_state(run):
 
 def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
     from gfm_hil.engine.setup import make_bench
-    from gfm_hil.results.run_folder import finish
+    from gfm_hil.run.run_folder import finish
 
     scenario = make(duration=2.0)
     bench = make_bench(scenario)
@@ -274,7 +275,7 @@ def test_the_same_seed_gives_the_same_noise_and_another_another(run):
 
 def test_the_folder_of_a_run_holds_what_the_design_says(make, tmp_path):
     scenario = make(events=[at(0.05, type="reference", P_ref=0.6)])
-    run_scenario(scenario, tmp_path / "run")
+    run_scenario(scenario, tmp_path / "run", report=write_report)
     assert {path.name for path in (tmp_path / "run").iterdir()} == {
         "scenario.toml", "signals.npz", "timing.npz", "events.jsonl", "summary.json",
         "report.html", "signals.png", "waveforms.png", "network.svg",

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-import gfm_hil.models
+import gfm_hil.controllers
 
 from ..support.firmware import cc
 from ..support.processes import GFMHIL, PATIENCE_S, wait_for, write
@@ -48,7 +48,7 @@ LONG = {"law": "vsg-2", "duration": 600.0, "link": {"type": "shm", "peer_timeout
 
 
 def library(folder: Path) -> str:
-    include = Path(gfm_hil.models.__file__).parent
+    include = Path(gfm_hil.controllers.__file__).parent
     source = Path(__file__).parents[1] / "support" / "foreign_library.c"
     done = cc(folder, "-shared", "-fPIC", f"-I{include}", str(source), "-o", "fails.so", "-lm")
     assert done.returncode == 0, done.stderr

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-import gfm_hil.models
+import gfm_hil.controllers
 from gfm_hil.cli import main
+from gfm_hil.controllers import BenchContext, PortMap, library, open_controller
+from gfm_hil.controllers.external import ControllerError
 from gfm_hil.core.errors import UserError
-from gfm_hil.models import BenchContext, PortMap, library, open_model
-from gfm_hil.models.model import ModelError
 from gfm_hil.realtime.priority import processors
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
 
 from ..support.firmware import cc
 from ..support.processes import write
 
-HEADERS = Path(gfm_hil.models.__file__).parent
+HEADERS = Path(gfm_hil.controllers.__file__).parent
 EXAMPLE = Path(__file__).parents[2] / "examples" / "foreign_controller"
 FAILS = Path(__file__).parents[1] / "support" / "foreign_library.c"
 FLAGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror", "-O2"]
@@ -72,7 +72,7 @@ def test_phases_are_those_of_the_turning_frame(
     fake = Fake(lambda t: phases(0.9 * V, w * (t + fake.setup.delay) + 0.3))
     monkeypatch.setattr(library, "_loaded", lambda path: fake)
     ports = PortMap(step_s=step_ticks * rig.T_s)
-    model = library.LibraryModel(tmp_path / "x.so", ports, rig)
+    model = library.LibraryController(tmp_path / "x.so", ports, rig)
     assert fake.setup.delay == pytest.approx((delay + step_ticks / 2) * rig.T_s)
     places = {name: k for k, name in enumerate(carried("y", True))}
     y, u, ref = np.zeros(11), np.array([0.5, speed, 0.8, 0.1]), np.ones(5)
@@ -109,7 +109,7 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     monkeypatch.setattr(library, "_loaded", lambda path: Fake(None))
     with pytest.raises(UserError, match=message):
-        library.LibraryModel(tmp_path / "x.so", ports, rig)
+        library.LibraryController(tmp_path / "x.so", ports, rig)
 
 
 def test_the_headers_folder_is_told(capsys: pytest.CaptureFixture[str]) -> None:
@@ -245,7 +245,7 @@ def test_what_is_no_such_library_is_refused(
         ("fails.so", "refuses this bench"),
     ):
         with pytest.raises(UserError, match=message):
-            open_model(f"c:{tmp_path / name}", PortMap(), rig)
+            open_controller(f"c:{tmp_path / name}", PortMap(), rig)
 
 
 # --- the adapter of a firmware whose tasks a timer calls ---
@@ -291,9 +291,9 @@ def adapted(folder: Path, firmware: str) -> Path:
 def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path: Path) -> None:
     path = adapted(tmp_path / "tasks", "other.c")
     rig, ports = BenchContext(1e-4, True, MEGAWATT), PortMap(step_s=2e-4)
-    model = library.LibraryModel(path, ports, rig)
+    model = library.LibraryController(path, ports, rig)
     with pytest.raises(UserError, match="refuses this bench"):  # its variables are static
-        library.LibraryModel(path, ports, rig)
+        library.LibraryController(path, ports, rig)
     places = {name: k for k, name in enumerate(carried("y", True))}
     y, u = np.zeros(11), np.array([0.5, 1.0, 0.9, 0.1])
     y[[places["v_d"], places["v_q"], places["i_d"], places["i_q"]]] = 0.9, 0.1, 0.5, -0.1
@@ -321,7 +321,7 @@ def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path: Path
     assert u[2] + 1j * u[3] == pytest.approx(0.9 + 0.1j, rel=0.05)  # turned by half a period
     ctypes.c_int.in_dll(of, "pwm_on").value = 0
     model.tick(ref, y, u)
-    with pytest.raises(ModelError, match="fault 1, the firmware does not enable its PWM"):
+    with pytest.raises(ControllerError, match="fault 1, the firmware does not enable its PWM"):
         model.tick(ref, y, u)
     model.close()
 

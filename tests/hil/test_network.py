@@ -18,8 +18,8 @@ import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.log import read_log
-from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.runner import run_network
+from gfm_hil.run.network_run import NetworkRun
+from gfm_hil.run.runner import run_network
 from gfm_hil.scenario.model import find_scenario, load_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 
@@ -145,7 +145,7 @@ def test_a_reset_converter_waits_for_a_voltage_that_it_can_start_on(tmp_path: Pa
     given["network"]["loads"] = {"base": {**BUS, "P": 0.3},
                                  "step": {**BUS, "P": 1.2, "Q": 0.1, "closed": False}}  # fmt: skip
     given["events"][0] = {"type": "breaker", "name": "step", "t": 0.1, "closed": True}
-    run = run_network(load_scenario(given), tmp_path / "run", figures=False)["A"]
+    run = run_network(load_scenario(given), tmp_path / "run")["A"]
     assert run.status == "tripped" and run.signals["true_trip"][-1] > 0
     log = read_log(tmp_path / "run" / "A" / "events.jsonl")
     (line,) = [e for e in log if e["event"] == "waits"]

@@ -19,8 +19,8 @@ from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
-from gfm_hil.results.run_folder import merge_roles
-from gfm_hil.results.runner import run_network
+from gfm_hil.run.run_folder import merge_roles
+from gfm_hil.run.runner import run_network
 from gfm_hil.scenario.model import load_scenario
 from gfm_hil.scenario.toml_out import toml_text
 
@@ -103,7 +103,7 @@ def test_over_links_a_run_is_that_in_process(link: str, tmp_path: Path) -> None:
     members = with_members(A={"link": over(link)}, B=trip)
     members["loads"]["step"]["P"] = 0.6
     given = load_scenario(content(network=members, events=events, after_trip="wait", duration=2.0))
-    found = run_network(given, tmp_path / "run", figures=False)
+    found = run_network(given, tmp_path / "run")
     memory = gfmhil.run_network(given)
     assert found.status == memory.status == "completed"
     for name in "AB":

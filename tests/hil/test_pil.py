@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
+from gfm_hil.controllers import BenchContext, PortMap, open_controller, pil
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.models import BenchContext, PortMap, open_model, pil
-from gfm_hil.results import runner
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
 from gfm_hil.scenario.model import find_scenario, load_scenario
 from gfm_runtime.firmware import TARGETS
 
@@ -298,7 +298,7 @@ def test_what_is_no_such_machine_is_refused_with_what_it_says(
 ) -> None:
     instead(tmp_path, "qemu-system-arm", does, monkeypatch)
     monkeypatch.setattr(pil, "_START_S", 0.5 if "sleep" in does else 30.0)
-    model = open_model("pil:m4f", PortMap(), BenchContext())
+    model = open_controller("pil:m4f", PortMap(), BenchContext())
     bench = setup.make_bench(load_scenario("pref_step", in_process=True, law="vsg-2"), "float32")
     with pytest.raises(UserError, match=re.escape(reason)):
         model.begin(bench.controller)
@@ -322,13 +322,13 @@ def test_a_missing_tool_and_a_wrong_target_are_named(
     with pytest.raises(
         UserError, match=r"pil:m0: must be pil: and one of host, clang, m4f, m7, m3, rv"
     ):
-        open_model("pil:m0", PortMap(), BenchContext())
+        open_controller("pil:m0", PortMap(), BenchContext())
     with pytest.raises(UserError, match=r"pil:s390x: has the other order of bytes"):
-        open_model("pil:s390x", PortMap(), BenchContext())
+        open_controller("pil:s390x", PortMap(), BenchContext())
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(
         UserError, match=r"m4f: arm-none-eabi-gcc is not there; apt-get install gcc"
     ):
-        open_model("pil:m4f", PortMap(), BenchContext())
+        open_controller("pil:m4f", PortMap(), BenchContext())
     with pytest.raises(UserError, match=r"pil:m4f: has our signals, and takes no map"):
-        open_model("pil:m4f", PortMap(fixed={"i_u": 0.5}), BenchContext())
+        open_controller("pil:m4f", PortMap(fixed={"i_u": 0.5}), BenchContext())

@@ -11,8 +11,8 @@ import pytest
 
 import gfmhil
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.run import load_run
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.recording.run import load_run
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.events import GridProfile
 from gfm_hil.scenario.model import check_scenario, load_scenario
 
@@ -59,7 +59,7 @@ def test_the_grid_follows_the_lines_at_every_tick(course):
 def test_it_is_the_same_over_a_link_and_its_file_is_kept(course, tmp_path):
     here = gfmhil.run(content(course))
     scenario = check_scenario(content(course, link={"type": "shm"}), "test")
-    run = run_scenario(scenario, tmp_path / "run", figures=False)
+    run = run_scenario(scenario, tmp_path / "run")
     for name in ("omega_g", "V_g", "p"):
         np.testing.assert_array_equal(run.signals[name], here.signals[name])
     copy = tmp_path / "run" / "profiles" / "course.csv"

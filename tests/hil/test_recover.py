@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gfm_hil.api.runs import recover
 from gfm_hil.cli import main
 from gfm_hil.core import files
 from gfm_hil.core.errors import Unfinished, UserError
@@ -29,10 +30,11 @@ from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.recording import npz
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.parts import Part
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 from gfm_hil.results.export import export_run
-from gfm_hil.results.run_folder import finish, recover
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.results.report import write_report
+from gfm_hil.run.run_folder import finish
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 
 from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
@@ -76,14 +78,14 @@ def left(make, tmp_path, monkeypatch):
     """A run folder before ``finish``, and the arguments of ``finish``."""
     found = []
 
-    def stop(scenario, folder, laws, wall_s, figures, outside):
-        found.append((scenario, folder, laws, wall_s, figures, outside))
+    def stop(*arguments):
+        found.append(arguments)
         raise Unfinished
 
     with monkeypatch.context() as patch:
-        patch.setattr("gfm_hil.results.runner.finish", stop)
+        patch.setattr("gfm_hil.run.runner.finish", stop)
         with pytest.raises(Unfinished):
-            run_scenario(make(events=EVENTS), tmp_path / "left", figures=False)
+            run_scenario(make(events=EVENTS), tmp_path / "left")
     return found[0]
 
 
@@ -244,7 +246,7 @@ def test_no_room_for_a_file_leaves_what_recover_needs(name, left, monkeypatch, c
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", full)
         with pytest.raises(Unfinished, match=r"No space left .* then gfmhil recover"):
-            finish(scenario, folder, laws, wall_s, True, outside)
+            finish(scenario, folder, laws, wall_s, write_report, outside)
         if name != "ended.json":
             assert main(["recover", str(folder)]) == 3
             assert capsys.readouterr().err.count("\n") == 1
@@ -297,7 +299,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
     run = recover(folder)
     assert run.summary["status"] == "safe"
     assert run.summary["reason"] == ("events_both.jsonl cannot be written: No space left on device")
-    told = [e for e in RecordedRun.load(folder).events if e["event"] == "reference"]
+    told = [e for e in Run.load(folder).events if e["event"] == "reference"]
     assert 0 < len(told) < 249
     assert 0 <= run.summary["ticks"] - told[-1]["tick"] <= 10  # the run ended where its log did
     assert np.isfinite(run.signals["true_p"]).all()
@@ -358,7 +360,8 @@ def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, att
     events.append({"type": "reference", "tick": 12, "Q_ref": 0.1})  # two at a tick
     with monkeypatch.context() as patch:
         patch.setattr(npz.Column, "__getitem__", counting)
-        run = run_scenario(make(duration=ticks * 1e-4, events=events), tmp_path / "run")
+        scenario = make(duration=ticks * 1e-4, events=events)
+        run = run_scenario(scenario, tmp_path / "run", report=write_report)
     starts = [e["tick"] for e in run.summary["events"]]
     assert len(starts) == 8000 and starts == sorted(starts)
     assert read < 40 * ticks  # every column a few times, for any number of events
@@ -367,7 +370,7 @@ def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, att
 
 
 def test_metrics_of_a_file_are_those_of_arrays(run, make):
-    from gfm_hil.results.metrics import event_metrics
+    from gfm_hil.run.metrics import event_metrics
 
     done = run(duration=0.5, events=EVENTS)
     whole = dict(done.signals)
@@ -379,7 +382,7 @@ def test_metrics_of_a_file_are_those_of_arrays(run, make):
 @pytest.mark.parametrize("piece", [7, 100, 1 << 18])
 def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeypatch):
     from gfm_hil.recording import columns
-    from gfm_hil.results import cycles, metrics
+    from gfm_hil.run import cycles, metrics
 
     whole = dict(run(duration=0.3, events=EVENTS).signals)
     expected = metrics.event_metrics(whole, 200, 3000, 1e-4, 50.0)
@@ -393,10 +396,11 @@ def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeyp
 def test_finishing_takes_the_memory_of_pieces(make, tmp_path):
     """A run of 24 s, whose columns take 63 MB."""
     scenario = make(duration=24.0)
-    run_scenario(make(duration=1.0), tmp_path / "warm")  # imports and compiles, which take more
+    # imports and compiles, which take more
+    run_scenario(make(duration=1.0), tmp_path / "warm", report=write_report)
     tracemalloc.start()
     try:
-        run = run_scenario(scenario, tmp_path / "run")
+        run = run_scenario(scenario, tmp_path / "run", report=write_report)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -428,7 +432,7 @@ def test_the_memory_of_recover_does_not_grow_with_the_run(make, tmp_path, attack
         if role == "controller":
             part.signals[:, 5] = 0
     code = (
-        "import sys; from pathlib import Path; from gfm_hil.results.run_folder import recover\n"
+        "import sys; from pathlib import Path; from gfm_hil.api.runs import recover\n"
         "print(recover(Path(sys.argv[1])).summary['ticks'])\n"
         "print(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
     )

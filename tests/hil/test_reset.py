@@ -13,7 +13,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.links import Link
 from gfm_hil.links.frame import frame_dtype
 from gfm_hil.recording.log import read_log
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import CONTROLLER_SAFE
 from gfm_runtime.states import READY, RUNNING, SAFE
@@ -41,7 +41,7 @@ def scenario(**more) -> Scenario:
 
 
 def test_after_a_reset_the_run_is_that_of_a_fresh_start(tmp_path):
-    run = run_scenario(scenario(), tmp_path / "a", figures=False)
+    run = run_scenario(scenario(), tmp_path / "a")
     s = run.signals
     assert run.summary["status"] == "completed"
     tripped = np.flatnonzero(s["true_trip"] != 0)
@@ -50,14 +50,14 @@ def test_after_a_reset_the_run_is_that_of_a_fresh_start(tmp_path):
     assert s["state"][RESET] == READY
     assert (s["state"][RESET + 1 :] == RUNNING).all()
     assert (s["ref_P_ref"][RESET + 1 :] == 0.5).all()
-    fresh = run_scenario(scenario(events=[]), tmp_path / "b", figures=False).signals
+    fresh = run_scenario(scenario(events=[]), tmp_path / "b").signals
     again = s["tick"] > RESET
     for name in s.keys() - {"tick", "t"}:  # the same bits as a new run
         assert np.array_equal(s[name][again], fresh[name][: again.sum()]), name
 
 
 def test_while_it_waits_the_bridge_is_blocked(tmp_path):
-    s = run_scenario(scenario(), tmp_path / "a", figures=False).signals
+    s = run_scenario(scenario(), tmp_path / "a").signals
     waiting = slice(RESET - 100, RESET)
     assert np.abs(s["true_i"][waiting]).max() < 1e-12
     assert np.ptp(s["u_E_u"][waiting]) == 0.0
@@ -65,7 +65,7 @@ def test_while_it_waits_the_bridge_is_blocked(tmp_path):
 
 @pytest.mark.parametrize("kind", ["shm", "zmq", "portable"])
 def test_over_a_link_it_is_the_same_to_the_bit(kind, tmp_path):
-    ours = run_scenario(scenario(), tmp_path / "a", figures=False).signals
+    ours = run_scenario(scenario(), tmp_path / "a").signals
     portable = kind == "portable"
     pair = run_pair(
         scenario(),
@@ -83,7 +83,7 @@ def test_over_a_link_it_is_the_same_to_the_bit(kind, tmp_path):
 
 
 def test_without_a_reset_it_ends_as_what_it_waits_for(tmp_path):
-    run = run_scenario(scenario(events=FALLS[:1]), tmp_path / "a", figures=False)
+    run = run_scenario(scenario(events=FALLS[:1]), tmp_path / "a")
     assert run.summary["status"] == "tripped"
     assert run.summary["ticks"] == 1200
     pair = run_pair(scenario(events=FALLS[:1]), tmp_path / "b", "shm")
@@ -96,7 +96,7 @@ def test_a_safe_controller_blocks_the_plant_and_both_come_back(kind, tmp_path):
     events = [{"type": "grid-phase-jump", "tick": TRIP, "degrees": 120.0}, FALLS[-1]]
     what = scenario(events=events, plant={"protection": {"over_current": {"enabled": False}}})
     if kind == "inproc":
-        s = run_scenario(what, tmp_path / "a", figures=False).signals
+        s = run_scenario(what, tmp_path / "a").signals
     else:
         s = run_pair(what, tmp_path / "a", kind).signals
     safe = int(np.flatnonzero(s["state"] == SAFE)[0])
@@ -111,7 +111,7 @@ def test_a_safe_controller_blocks_the_plant_and_both_come_back(kind, tmp_path):
 
 
 def test_a_reset_of_what_runs_is_refused_and_written_down(tmp_path):
-    run = run_scenario(scenario(events=[FALLS[-1]]), tmp_path / "a", figures=False)
+    run = run_scenario(scenario(events=[FALLS[-1]]), tmp_path / "a")
     assert run.summary["status"] == "completed"
     log = (tmp_path / "a" / "events.jsonl").read_text()
     assert "the controller is RUNNING, not SAFE" in log
@@ -126,13 +126,13 @@ def test_other_gains_are_those_of_a_law_that_has_them(tmp_path):
     """From a steady state, a change of D_p gives the run of a law file with that D_p."""
     gains = {"type": "gains", "tick": 0, "values": {"D_p": 0.02}}
     step = {"type": "reference", "tick": 100, "P_ref": 0.6}
-    ours = run_scenario(scenario(events=[gains, step]), tmp_path / "a", figures=False)
+    ours = run_scenario(scenario(events=[gains, step]), tmp_path / "a")
     assert ours.summary["laws"] == ["vsg-2", "other gains 1"]
-    plain = run_scenario(scenario(events=[step]), tmp_path / "b", figures=False)
+    plain = run_scenario(scenario(events=[step]), tmp_path / "b")
     path = tmp_path / "mine.toml"
     text = files("gfm_runtime").joinpath("laws", "vsg-2.toml").read_text()
     path.write_text(text.replace("value = 0.01\n", "value = 0.02\n"))
-    theirs = run_scenario(scenario(events=[step], law=str(path)), tmp_path / "c", figures=False)
+    theirs = run_scenario(scenario(events=[step], law=str(path)), tmp_path / "c")
     away = np.abs(ours.signals["true_p"] - theirs.signals["true_p"]).max()
     assert away < 1e-6
     assert np.abs(ours.signals["true_p"] - plain.signals["true_p"]).max() > 1e-3
@@ -141,13 +141,13 @@ def test_other_gains_are_those_of_a_law_that_has_them(tmp_path):
 def test_a_gain_that_a_law_does_not_have_is_refused_before_anything_starts(tmp_path):
     gains = {"type": "gains", "tick": 0, "values": {"k_99": 0.02}}
     with pytest.raises(UserError, match=r"events, k_99 = 0\.02: .*parameter k_99: unknown"):
-        run_scenario(scenario(events=[gains]), tmp_path / "a", figures=False)
+        run_scenario(scenario(events=[gains]), tmp_path / "a")
 
 
 @pytest.mark.parametrize("kind", ["shm", "portable"])
 def test_answers_that_come_twice_while_it_waits_are_not_taken_for_new_ones(kind, tmp_path):
     """The plant repeats y so soon that most answers come more than once."""
-    ours = run_scenario(scenario(), tmp_path / "a", figures=False).signals
+    ours = run_scenario(scenario(), tmp_path / "a").signals
     impairment = {"duplicate": 0.2, "loss": 0.05, "seed": 3}
     link = {**PATIENT, "repeat_s": 0.0005, "impairment": impairment}
     options = {"portable": True} if kind == "portable" else {}
@@ -172,7 +172,7 @@ def test_an_answer_lost_just_before_the_reset_is_repeated_as_it_was(tmp_path, en
     def touch(role: Role, link: Link) -> Any:
         return Tampering(link, drop) if role == "controller" else link
 
-    ours = run_scenario(scenario(), tmp_path / "a", figures=False).signals
+    ours = run_scenario(scenario(), tmp_path / "a").signals
     pair = run_pair(scenario(), tmp_path / "b", "zmq", touch=touch, endpoint=endpoint)
     assert dropped == [RESET - 1]
     assert_same(pair.signals, ours)

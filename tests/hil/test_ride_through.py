@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario.model import check_scenario
 
 CYCLE = 200  # ticks

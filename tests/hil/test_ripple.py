@@ -10,7 +10,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.ripple import remaining_ripple
+from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.scenario.model import check_scenario, load_scenario
 from gfm_hil.scenario.toml_out import scenario_toml
 

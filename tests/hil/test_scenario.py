@@ -297,7 +297,7 @@ def test_lockstep_waits_longer_than_real_time_unless_the_scenario_says(make) -> 
     for mode in ("lockstep", "realtime"):
         for link in ({"type": "shm"}, {"type": "shm", "peer_timeout_s": 4.0}):
             found = make(mode=mode, link=link)
-            waits[mode, len(link)] = found.peer_timeout_s, found.model_timeout_s
+            waits[mode, len(link)] = found.peer_timeout_s, found.answer_timeout_s
     assert waits == {
         ("lockstep", 1): (20.0, 10.0),
         ("realtime", 1): (0.5, 0.25),

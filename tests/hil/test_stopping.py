@@ -12,7 +12,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.results import run_folder, runner
+from gfm_hil.run import run_folder, runner
 
 pytestmark = pytest.mark.processes
 

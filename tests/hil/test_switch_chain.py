@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import load_scenario
 
 CHAIN = ["mimo-gfm", "vsg-2", "droop-1", "matching-1", "dvoc", "mimo-gfm"]
@@ -15,7 +15,7 @@ COMMANDS = ("u_i_u", "u_omega_u", "u_E_u")
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory):
     scenario = load_scenario("switch_chain", link__type="inproc")
-    return run_scenario(scenario, tmp_path_factory.mktemp("chain") / "run", figures=False)
+    return run_scenario(scenario, tmp_path_factory.mktemp("chain") / "run")
 
 
 def test_every_law_was_in_force_in_its_turn_and_nothing_tripped(chain):

@@ -11,8 +11,8 @@ import pytest
 import gfmhil
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.log import read_log
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_network, run_scenario
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import run_network, run_scenario
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import load_converter
 
@@ -57,7 +57,7 @@ def test_over_a_link_it_closes_in_the_same_tick(tmp_path: Path) -> None:
     given = content(0.4, **CHECK | {"degrees": 60.0, "within_s": 0.2})
     given |= {"duration": 1.0, "link": {"type": "shm", "peer_timeout_s": 30.0}}
     given["events"].append({**given["events"][-1], "t": 0.7, "check": {**CHECK, "within_s": 0.03}})
-    found = run_scenario(load_scenario(given), tmp_path / "run", figures=False)
+    found = run_scenario(load_scenario(given), tmp_path / "run")
     memory = gfmhil.run(given)
     labels = [event["label"] for event in memory.summary["events"]]
     assert labels[2] == "grid breaker on, synchronous"
@@ -70,7 +70,7 @@ def test_over_a_link_it_closes_in_the_same_tick(tmp_path: Path) -> None:
 def test_a_black_start_ends_on_the_grid(tmp_path: Path) -> None:
     """The angle of the bus, from what A records at rest, is the one that the log names."""
     scenario = load_scenario("black_start")
-    run = run_network(scenario, tmp_path / "run", figures=False)
+    run = run_network(scenario, tmp_path / "run")
     assert run.status == "completed"
     line = read_log(tmp_path / "run" / "A" / "events.jsonl")[-2]
     assert line["label"] == "tie on, synchronous"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.checks import Window, damped, envelope, overshoot, read_envelope, settles
+from gfm_hil.run.checks import Window, damped, envelope, overshoot, read_envelope, settles
 from gfm_hil.testing import Experiment
 
 pytestmark = pytest.mark.processes

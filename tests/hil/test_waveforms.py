@@ -24,10 +24,10 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.trigger import Trigger, edges
 from gfm_hil.recording.columns import DERIVED, PHASES, WAVES, describe, wave
+from gfm_hil.recording.run import Run
+from gfm_hil.recording.waveforms import three_phase
 from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import draw_waveforms
-from gfm_hil.results.run import Run
-from gfm_hil.results.waveforms import three_phase
 from gfm_plant import (
     TRUTH,
     Bases,

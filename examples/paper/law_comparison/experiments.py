@@ -32,7 +32,7 @@ def experiment(name: str, law: str) -> dict[str, Any]:
         law: catalogue name or law file.
 
     Returns:
-        status, reason, the metrics of the event (``results.metrics``), i_peak [p.u.], dp (largest
+        status, reason, the metrics of the event (``run.metrics``), i_peak [p.u.], dp (largest
         deviation of p from before the event), bump_pu of a switchover, and trace, p over time
         every ``TRACE_EVERY`` ticks.
     """

@@ -32,8 +32,9 @@ from gfm_hil.bench.pair import pair
 from gfm_hil.bench.rounds import RUNS, Plan, Spread, quickest, rounds
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
+from gfm_hil.engine.processes import Progress
 from gfm_hil.links import link_kind, open_link
-from gfm_hil.results.runner import Progress, run_scenario
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
 
 LAW = "mimo-gfm"
@@ -256,7 +257,7 @@ def _run(
 ) -> tuple[Timing, list[str], str]:
     """Run a scenario; returns its timing, the scheduling of its sides, and how it ended."""
     folder = place / f"run-{time.monotonic_ns()}"
-    summary = run_scenario(scenario, folder, progress, figures=False).summary
+    summary = run_scenario(scenario, folder, progress).summary
     if summary["status"] == "interrupted":  # the run has caught Ctrl-C
         raise KeyboardInterrupt
     with np.load(folder / "timing.npz") as file:

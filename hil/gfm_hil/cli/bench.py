@@ -15,7 +15,7 @@ from rich.progress import BarColumn, TaskProgressColumn
 from gfm_hil.cli.common import new_folder, progress
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.links import link_names
-from gfm_hil.results.run_folder import check_free
+from gfm_hil.run.run_folder import check_free
 
 _WIDTH = 100  # columns: a table cut short is no use in a file
 

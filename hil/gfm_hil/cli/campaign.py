@@ -17,7 +17,7 @@ from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, above, new_fold
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.realtime.priority import processors
-from gfm_hil.results.runner import Notice
+from gfm_hil.run.runner import Notice
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import WorkerLost, cluster, execute, processes, run_alone
 from gfm_hil.studies.campaign.loading import load_campaign

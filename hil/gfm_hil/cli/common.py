@@ -25,12 +25,11 @@ from rich.table import Table
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import target_of
 from gfm_hil.core.terminal import fitting, numbers, terminal
-from gfm_hil.recording.run import controlled_by
-from gfm_hil.results.network_run import NetworkRun
+from gfm_hil.engine.processes import Progress as TellProgress
+from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages, staged
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import Notice
-from gfm_hil.results.runner import Progress as TellProgress
+from gfm_hil.run.network_run import NetworkRun
+from gfm_hil.run.runner import Notice
 from gfm_hil.scenario.model import Scenario, load_scenario
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
@@ -258,13 +257,17 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
     console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
 
 
-def print_network(runs: NetworkRun, folder: Path) -> None:
-    """The tables that end a run of several converters."""
-    for name, run in runs.items():
+def print_run(run: Run | NetworkRun, folder: Path, why: bool = False) -> None:
+    """The tables that end a run; with ``why`` also what made it unstable, see ``why_it_ended``."""
+    reason = why_it_ended(run) if why or isinstance(run, NetworkRun) else ""
+    if isinstance(run, Run):
+        print_summary(run.summary, folder, reason)
+        return
+    for name, one in run.items():
         print(f"\n{name}")
-        print_summary(run.summary, folder / name)
-    if why := why_it_ended(runs):
-        print(f"\n{why}")
+        print_summary(one.summary, folder / name)
+    if reason:
+        print(f"\n{reason}")
 
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:
@@ -277,11 +280,13 @@ def events_table(events: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def exit_code(summary: dict[str, Any]) -> int:
-    """0 as expected, 130 interrupted, 3 otherwise."""
-    if not summary["unmet"]:
+def exit_code(run: Run | NetworkRun) -> int:
+    """0 as expected, 130 interrupted, 3 otherwise; of a network the worst one of its runs."""
+    if isinstance(run, NetworkRun):
+        return max(exit_code(one) for one in run.values())
+    if not run.summary["unmet"]:
         return 0
-    return EXIT_INTERRUPTED if summary["status"] == "interrupted" else EXIT_OTHERWISE
+    return EXIT_INTERRUPTED if run.status == "interrupted" else EXIT_OTHERWISE
 
 
 def split_laws(text: str) -> list[str]:

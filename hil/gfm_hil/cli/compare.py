@@ -10,6 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from gfm_hil.api.runs import run
 from gfm_hil.cli.common import (
     add_scenario_options,
     exit_code,
@@ -23,11 +24,10 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.engine.setup import ONE_CONVERTER
+from gfm_hil.recording.run import Run
 from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.report import cell, event_rows
-from gfm_hil.results.run import Run
-from gfm_hil.results.run_folder import check_free
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.run.run_folder import check_free
 from gfm_hil.scenario.model import find_scenario
 from gfm_runtime import law_titles
 
@@ -62,14 +62,14 @@ def call(options: argparse.Namespace) -> int:
     runs: dict[str, Run] = {}
     for name, scenario in scenarios.items():
         with progress_bar(scenario, name, options.quiet) as (progress, notice):
-            runs[name] = run_scenario(scenario, folder / name, progress, notice)
+            runs[name] = run(scenario, folder=folder / name, progress=progress, notice=notice)
         if runs[name].summary["status"] == "interrupted":
             break
-    events = max((run.summary["events"] for run in runs.values()), key=len)
-    signals = {name: run.columns for name, run in runs.items() if "true_p" in run.columns}
+    events = max((one.summary["events"] for one in runs.values()), key=len)
+    signals = {name: one.columns for name, one in runs.items() if "true_p" in one.columns}
     if signals:
         draw_comparison(folder / "comparison.png", base, signals, events)
-    summaries = {name: run.summary for name, run in runs.items()}
+    summaries = {name: one.summary for name, one in runs.items()}
     write_text(folder / "comparison.json", json.dumps(summaries, indent=2) + "\n")
     if options.json:
         print(json.dumps(summaries, indent=2))
@@ -78,7 +78,7 @@ def call(options: argparse.Namespace) -> int:
         for why in filter(None, map(why_it_ended, runs.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
         terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
-    return max(exit_code(run.summary) for run in runs.values())
+    return max(exit_code(one) for one in runs.values())
 
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.terminal import terminal
-from gfm_hil.results.doctor import examine, worst
+from gfm_hil.run.doctor import examine, worst
 
 
 def add(command: argparse.ArgumentParser) -> None:

@@ -202,7 +202,7 @@ def call_golden(options: argparse.Namespace) -> int:
 
 def call_include(_: argparse.Namespace) -> int:
     """Print the folder of our headers; returns the exit code."""
-    print(files("gfm_hil.models"))
+    print(files("gfm_hil.controllers"))
     return 0
 
 

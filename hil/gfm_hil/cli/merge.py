@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gfm_hil.cli.common import exit_code, new_folder, print_summary
-from gfm_hil.results.run_folder import merge_roles
+from gfm_hil.api.runs import merge
+from gfm_hil.cli.common import exit_code, new_folder, print_run
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -22,6 +22,6 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Make the folder; returns the exit code of the run."""
     folder = new_folder(options.out, "merged")
-    run = merge_roles(options.first, options.second, folder)
-    print_summary(run.summary, folder)
-    return exit_code(run.summary)
+    run = merge(options.first, options.second, folder)
+    print_run(run, folder)
+    return exit_code(run)

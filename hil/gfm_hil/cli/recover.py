@@ -6,10 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from gfm_hil.cli.common import print_network, print_summary
-from gfm_hil.recording.run import converters_of
-from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run_folder import recover
+from gfm_hil.api.runs import recover
+from gfm_hil.cli.common import print_run
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -24,12 +22,9 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Complete the folder; returns the exit code."""
-    folder: Path = options.folder
-    run = NetworkRun.recover(folder) if converters_of(folder) else recover(folder)
+    run = recover(options.folder)
     if options.json:
         print(json.dumps(run.summary, indent=2))
-    elif isinstance(run, NetworkRun):
-        print_network(run, folder)
     else:
-        print_summary(run.summary, options.folder)
+        print_run(run, options.folder)
     return 0

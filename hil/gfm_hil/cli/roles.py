@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
-import time
-from collections.abc import Iterator
-from pathlib import Path
 
 from gfm_hil.cli.common import (
     add_map,
@@ -15,19 +11,16 @@ from gfm_hil.cli.common import (
     endpoints,
     exit_code,
     new_folder,
-    print_network,
-    print_summary,
+    print_run,
     resolve,
 )
+from gfm_hil.controllers import FORMS, BenchContext, open_controller, read_map
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.compiling import compiled_bench, compiled_benches
-from gfm_hil.engine.process import run_role
 from gfm_hil.links import link_names
-from gfm_hil.models import FORMS, BenchContext, open_model, read_map
 from gfm_hil.realtime.priority import one_processor
-from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
+from gfm_hil.results.report import write_report
+from gfm_hil.run.runner import run_part, run_side
 from gfm_hil.scenario.model import Scenario
 from gfm_plant import load_converter
 from gfm_runtime.errors import meant
@@ -55,45 +48,24 @@ def call(options: argparse.Namespace) -> int:
     given = _given(scenario, endpoints(options))
     if options.model is not None and role == "plant":
         raise UserError("--model: the plant has no model; start the controller with it")
-    model = None
+    external = None
     if options.model is not None:
         ports = read_map(options.map)
         with one_processor(scenario.mode):
-            model = open_model(options.model, ports, _bench_context(scenario))
+            external = open_controller(options.model, ports, _bench_context(scenario))
     folder = new_folder(options.out, role)
-    places = {name: folder / name for name in scenario.parts} or {"": folder}
     if options.part:  # of `gfmhil run`, which puts the parts together
-        with _all_in_use(places):
-            run_role(role, scenario, folder, given, lambda text: None, model)
+        run_part(role, scenario, folder, given, external)
         return 0
-    check_free(folder, scenario.ticks * len(places), scenario.has_inner)
 
     def notice(text: str) -> None:
         if not options.quiet:
             print(text, file=sys.stderr, flush=True)
 
-    if scenario.parts:
-        benches = compiled_benches(scenario, notice, (role,))
-    else:
-        benches = [compiled_bench(scenario, notice, (role,))]
-    for place in places.values():
-        place.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    with _all_in_use(places), cut_short(folder):
-        run_role(role, scenario, folder, given, notice, model)
-        wall_s = time.monotonic() - began
-        runs = {
-            name: finish(bench.scenario, place, bench.controller.labels, wall_s)
-            for bench, (name, place) in zip(benches, places.items(), strict=True)
-        }
-    if scenario.parts:
-        whole = NetworkRun(scenario, runs, folder)
-        whole.conclude(folder)
-        if not options.quiet:
-            print_network(whole, folder)
-    elif not options.quiet:
-        print_summary(runs[""].summary, folder)
-    return max(exit_code(run.summary) for run in runs.values())
+    run = run_side(role, scenario, folder, given, notice, write_report, external)
+    if not options.quiet:
+        print_run(run, folder)
+    return exit_code(run)
 
 
 def _bench_context(scenario: Scenario) -> BenchContext:
@@ -141,11 +113,3 @@ def _given(scenario: Scenario, named: dict[str, str]) -> dict[str, str]:
                 f"link.endpoint{of}: not set; a side started alone needs one (--endpoint)"
             )
     return named
-
-
-@contextlib.contextmanager
-def _all_in_use(places: dict[str, Path]) -> Iterator[None]:
-    with contextlib.ExitStack() as stack:
-        for place in places.values():
-            stack.enter_context(in_use(place))
-        yield

@@ -5,28 +5,28 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import subprocess
 import sys
-from pathlib import Path
 
+from gfm_hil.api.runs import run as run_one
+from gfm_hil.api.runs import run_network
 from gfm_hil.cli.common import (
     add_map,
     add_scenario_options,
     exit_code,
     new_folder,
-    print_network,
-    print_summary,
+    print_run,
     progress_bar,
     resolve,
-    why_it_ended,
     window,
 )
+from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_for_model
-from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
 from gfm_hil.ports import PORTS
 from gfm_hil.ports.companion import OWN_NUMBER, companion
-from gfm_hil.results.runner import Notice, model_command, run_network, run_scenario
-from gfm_hil.scenario.model import INPROC, Scenario, find_scenario
+from gfm_hil.recording.run import Run
+from gfm_hil.run.network_run import NetworkRun
+from gfm_hil.scenario.model import INPROC, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -66,28 +66,36 @@ def call(options: argparse.Namespace) -> int:
         options.mode = "lockstep"  # QEMU keeps no time
     scenario = resolve(options, law=options.law, waveforms=options.waveforms)
     folder = new_folder(options.out, find_scenario(options.scenario).stem)
-    if scenario.network is not None:
-        return _run_network(scenario, folder, options)
+    figures = not options.no_figures
     with contextlib.ExitStack() as stack:
-        stay = {}
-        for name, number in _ports(options).items():
-            beside = companion(name, folder, number, scenario.link.type == INPROC)
-            if (process := stack.enter_context(beside)) is not None:
-                stay[name] = process
-        with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-            command = _model_command(scenario, options, notice)
-            figures = not options.no_figures
-            run = run_scenario(scenario, folder, progress, notice, figures, command)
+        run: Run | NetworkRun
+        stay: dict[str, subprocess.Popen[str]] = {}
+        if scenario.network is not None:
+            _check_network(options)
+            with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+                run = run_network(
+                    scenario, folder, figures=figures, progress=progress, notice=notice
+                )
+        else:
+            for name, number in _ports(options).items():
+                beside = companion(name, folder, number, scenario.link.type == INPROC)
+                if (process := stack.enter_context(beside)) is not None:
+                    stay[name] = process
+            with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+                run = run_one(
+                    scenario, folder=folder, controller=options.controller, ports=options.map,
+                    figures=figures, progress=progress, notice=notice,
+                )  # fmt: skip
         if options.json:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
-            print_summary(run.summary, folder, why_it_ended(run))
+            print_run(run, folder, why=True)
         for name, process in stay.items():
-            if process.poll() is None and run.summary["status"] != "interrupted":
+            if process.poll() is None and run.status != "interrupted":
                 print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)
                 with contextlib.suppress(KeyboardInterrupt):
                     process.wait()
-    return exit_code(run.summary)
+    return exit_code(run)
 
 
 def _ports(options: argparse.Namespace) -> dict[str, int]:
@@ -96,30 +104,8 @@ def _ports(options: argparse.Namespace) -> dict[str, int]:
     return {name: number for name, number in named.items() if number is not None}
 
 
-def _model_command(scenario: Scenario, options: argparse.Namespace, notice: Notice) -> list[str]:
-    """The program that steps the model of --controller; empty without one.
-
-    Raises:
-        UserError: there is no such model or map, the run is in process, has no operating point, or
-            does not carry what the model measures.
-    """
-    if options.controller is None:
-        if options.map is not None:
-            raise UserError("--map: is of a model; name it by --controller")
-        return []
-    if scenario.link.type == INPROC:
-        raise UserError("--controller: is a process, and a run in process has none; choose --link")
-    real = precision(options.controller)
-    if not options.controller.startswith(PIL):
-        model_file(options.controller, FORMS)
-    read_map(options.map)
-    check_currents(options.controller, scenario.has_inner)
-    compile_for_model(scenario, notice, real)
-    return model_command(options.controller, options.map)
-
-
-def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) -> int:
-    """Run several converters, each of which gets a run folder of its own."""
+def _check_network(options: argparse.Namespace) -> None:
+    """Refuse what is of one converter."""
     if options.controller is not None:
         raise UserError("--controller: controls one converter; a network runs without it")
     for name in _ports(options):
@@ -127,11 +113,3 @@ def _run_network(scenario: Scenario, folder: Path, options: argparse.Namespace) 
             f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
             " folder of a converter"
         )
-    with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-        figures = not options.no_figures
-        runs = run_network(scenario, folder, progress, notice, figures=figures)
-    if options.json:
-        print(json.dumps(runs.summary, indent=2), flush=True)
-    else:
-        print_network(runs, folder)
-    return max(exit_code(run.summary) for run in runs.values())

@@ -15,8 +15,8 @@ from numba.core import event
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.inproc import compile_loop, rows
-from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.links import link_kind, link_names
@@ -138,25 +138,25 @@ def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
     return compile_sets(sets, notice), len(sets)
 
 
-def compile_for_model(
+def compile_external(
     scenario: Scenario, notice: Callable[[str], None], real: str = "float64"
 ) -> None:
-    """Compile what a controller calls that steps a model in place of the law.
+    """Compile what the controller's side calls to step an external controller.
 
     Args:
         scenario, notice: as for ``compiled_bench``.
-        real: of the model's laws.
+        real: of its laws.
 
     Raises:
         UserError: as ``make_bench``.
     """
     bench = make_bench(scenario, real)
-    bench.model = SteppedModel(_Nothing(), bench.controller, bench.u)
-    compile_sets([_role("controller", [bench], " of a model")], notice)
+    bench.external = SteppedController(_Nothing(), bench.controller, bench.u)
+    compile_sets([_role("controller", [bench], " of an external controller")], notice)
 
 
 class _Nothing:
-    """A model that is not there."""
+    """An external controller that is not there."""
 
     name, real = "nothing", "float64"
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers import ControllerError
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import Role
 from gfm_hil.engine.controller_ticks import controller_ticks
@@ -30,7 +31,6 @@ from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.engine.waiting import part_from
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
-from gfm_hil.models import ModelError
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import PLANT_LEFT
 from gfm_hil.recording.parts import Part
@@ -170,8 +170,8 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
     end, ctl = _End("controller", share, t0_ns, flags), bench.controller.ctl
     loop, own, in_network = end.loop[0], _records(bench), bench.scenario.network is not None
     why, ticks = ReturnReason.EVENT, _ticks(bench)
-    if bench.model is not None:
-        bench.model.last_words = lambda: end.last_words(STOPPED, 0, bench.u)
+    if bench.external is not None:
+        bench.external.last_words = lambda: end.last_words(STOPPED, 0, bench.u)
     loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running or in_network:
         event = timeline.next_tick()
@@ -183,7 +183,7 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
             event = timeline.next_tick()
         try:
             why = end.checked(ticks(*end.side, own, event))
-        except ModelError as problem:
+        except ControllerError as problem:
             timeline.end("safe", str(problem), end.tick)
             end.last_words(STOPPED, 0, bench.u)
             break
@@ -215,7 +215,7 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
 
 
 def _ticks(bench: Bench) -> Callable[..., ReturnReason]:
-    return bench.model or controller_ticks
+    return bench.external or controller_ticks
 
 
 def _records(bench: Bench) -> ControllerRecords:

@@ -33,7 +33,7 @@ def run_loop(
     A link without a port gets a thread that pumps its messages.
 
     Raises:
-        PeerLost: a model in place of the law does not answer; its thread is left behind.
+        PeerLost: an external controller does not answer; its thread is left behind.
 
     Args:
         shares: of the controller one, of the plant one for each converter.
@@ -44,7 +44,7 @@ def run_loop(
         flags = np.zeros(FLAGS, np.int64)
     shares = [share._replace(link=ported(share.link)) for share in shares]
     timelines = [share.timeline for share in shares]
-    model = shares[0].bench.model if role == "controller" else None
+    external = shares[0].bench.external if role == "controller" else None
     for share in shares:
         getattr(share.link, "start", _nothing)()
     found: list[FrameReader] = []
@@ -70,11 +70,11 @@ def run_loop(
             for timeline in timelines:
                 timeline.flush()
             flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
-            if model is not None:
-                model.watch(timelines[0], shares[0].bench.scenario.model_timeout_s)
+            if external is not None:
+                external.watch(timelines[0], shares[0].bench.scenario.answer_timeout_s)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
-        while thread.is_alive() and not (model is not None and model.abandoned):
+        while thread.is_alive() and not (external is not None and external.abandoned):
             with contextlib.suppress(KeyboardInterrupt):
                 thread.join()
         for timeline in timelines:

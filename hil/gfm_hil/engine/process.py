@@ -14,23 +14,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers import ControllerError, ExternalController
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.drive import Share, compile_loops
+from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
-from gfm_hil.engine.model_ticks import SteppedModel
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, gains_of, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
 from gfm_hil.links.impaired.link import ImpairedLink
-from gfm_hil.models import Model, ModelError
 from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import (
     ask_for_real_time,
@@ -50,7 +50,7 @@ from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import carried
 
 if TYPE_CHECKING:
-    from gfm_hil.models import PilModel
+    from gfm_hil.controllers import PilController
 
 
 def run_role(
@@ -59,7 +59,7 @@ def run_role(
     folder: Path,
     endpoints: Mapping[str, str] = MappingProxyType({}),
     notice: Callable[[str], None] = print,
-    model: Model | PilModel | None = None,
+    external: ExternalController | PilController | None = None,
 ) -> Outcome:
     """Run one side of a scenario at its endpoints; record to ``folder``.
 
@@ -67,7 +67,7 @@ def run_role(
 
     Args:
         endpoints: by converter, where the scenario's links name none.
-        model: of the controller: what computes u in place of the law.
+        external: of the controller: what computes u in place of the law.
 
     Returns:
         How it ended, of several converters the weightiest; the parts of the recording,
@@ -77,13 +77,13 @@ def run_role(
         UserError: an endpoint cannot be opened, or the scenario has no operating point.
     """
     with Interrupt() as interrupt, ExitStack() as stack:
-        real = "float64" if model is None else model.real
+        real = "float64" if external is None else external.real
         benches = make_benches(scenario) if scenario.parts else [make_bench(scenario, real)]
         sides = []
-        if model is not None:
+        if external is not None:
             stack.enter_context(one_processor(scenario.mode))
-            benches[0].model = _stepped(model, benches[0])
-            stack.callback(benches[0].model.close)
+            benches[0].external = _stepped(external, benches[0])
+            stack.callback(benches[0].external.close)
         _begin(folder, scenario)
         for bench in benches:
             name = bench.scenario.converter or ""
@@ -96,26 +96,26 @@ def run_role(
         return _run(role, sides, notice, interrupt)
 
 
-def _stepped(model: Model | PilModel, bench: Bench) -> SteppedModel:
-    """A model ready for tick 0 at the operating point.
+def _stepped(external: ExternalController | PilController, bench: Bench) -> SteppedController:
+    """An external controller ready for tick 0 at the operating point.
 
     Raises:
         UserError: it refuses, or the scenario has events that are about a law.
     """
-    from gfm_hil.models import PilModel  # brings compilers in, which few runs need
+    from gfm_hil.controllers import PilController  # brings compilers in, which few runs need
 
     scenario = bench.scenario
-    if not isinstance(model, PilModel):
+    if not isinstance(external, PilController):
         for event in scenario.events:
             if isinstance(event, (LawChange, Gains)):
-                raise UserError(f"events, {event.label()}: {model.name} has a law of its own")
+                raise UserError(f"events, {event.label()}: {external.name} has a law of its own")
     elif scenario.mode == "realtime":
-        raise UserError(f"mode = 'realtime': {model.name} keeps no time; choose --mode lockstep")
+        raise UserError(f"mode = 'realtime': {external.name} keeps no time; choose --mode lockstep")
     try:
-        return SteppedModel(
-            model, bench.controller, bench.u, gains_of(scenario, bench.controller.omega_b)
+        return SteppedController(
+            external, bench.controller, bench.u, gains_of(scenario, bench.controller.omega_b)
         )
-    except ModelError as problem:
+    except ControllerError as problem:
         raise UserError(str(problem)) from None
 
 
@@ -255,13 +255,13 @@ def _meet(
         PeerLost: one did not come.
     """
     meeting, failed = Meeting(len(sides)), threading.Event()
-    model = sides[0].bench.model
+    external = sides[0].bench.external
 
     def meet(side: _Side) -> Start:
         try:
             return shake_hands(
                 role, side.good, side.scenario, lambda: stopped() or failed.is_set(), notice,
-                meeting, OUR_CONTROLLER if model is None else model.name,
+                meeting, OUR_CONTROLLER if external is None else external.name,
             )  # fmt: skip
         except PeerLost as problem:
             if len(sides) > 1 and not failed.is_set():

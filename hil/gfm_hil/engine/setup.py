@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gfm_design.model.operating_point import OperatingPoint, operating_point, operating_points
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.model_ticks import SteppedModel
+from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.retune import Retuned, retuned
 from gfm_hil.scenario.events import Gains, LawChange, Reset
 from gfm_hil.scenario.model import Scenario, plant_of
@@ -39,7 +39,7 @@ class Bench:
         controller: the controller, its first law at rest and RUNNING.
         y: measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
         u: inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
-        model: what computes u in place of the law; None for the law.
+        external: what computes u in place of the law; None for the law.
     """
 
     scenario: Scenario
@@ -49,7 +49,7 @@ class Bench:
     start: OperatingPoint
     y: NDArray[np.float64]
     u: NDArray[np.float64]
-    model: SteppedModel | None = None
+    external: SteppedController | None = None
 
     @property
     def inner(self) -> bool:

@@ -153,8 +153,8 @@ class Timeline:
             ticket.done.set()
 
     def _carry_out(self, event: Any, tick: int, **more: Any) -> None:
-        if self._bench.model is not None:
-            self._bench.model.check(event, self._bench.controller)
+        if self._bench.external is not None:
+            self._bench.external.check(event, self._bench.controller)
         match event:
             case Reference():
                 for name, value in event.values().items():

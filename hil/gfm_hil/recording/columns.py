@@ -256,7 +256,7 @@ def _derived() -> dict[str, Described]:
 
 
 DERIVED = _derived()
-"""The columns of `gfm_hil.results.waveforms`: they are not recorded but follow from what is.
+"""The columns of `gfm_hil.recording.waveforms`: they are not recorded but follow from what is.
 
 A phase's voltage is that against the star point of the three: with three wires there is no zero
 sequence."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,13 @@ from gfm_hil.recording.columns import (
 )
 from gfm_hil.recording.log import most_bytes, read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
+from gfm_hil.recording.waveforms import three_phase
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.profiles import look_beside
 from gfm_plant import Bases, load_converter
 from gfm_runtime.toml_file import read_toml
 
+_NOT_METRICS = ("t", "tick", "type", "label")
 _LAST = 253402300799.0  # s since 1970, of the year 9999
 #: columns of which a recording has all or none
 _TOGETHER = (
@@ -50,6 +52,7 @@ _TOGETHER = (
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.axes import Axes
 
 
 class Signals(Mapping[str, NDArray[Any]]):
@@ -91,7 +94,7 @@ class Signals(Mapping[str, NDArray[Any]]):
 
 
 @dataclass(frozen=True, repr=False)
-class RecordedRun:
+class Run:
     """A finished run.
 
     Attributes:
@@ -115,6 +118,11 @@ class RecordedRun:
     folder: Path | None = None
     timing: Columns = field(default_factory=dict)
     law_text: str = ""
+
+    if TYPE_CHECKING:  # functions of rooms further up, which ``gfm_hil.api.runs`` adds
+        plot: ClassVar[Callable[..., list[Axes]]]
+        plot_waveforms: ClassVar[Callable[..., list[Axes]]]
+        save: ClassVar[Callable[..., Path]]
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -202,6 +210,40 @@ class RecordedRun:
         recorded = self.recorded
         for first in range(0, self.ticks, ticks):
             yield first, {name: x[first : first + ticks] for name, x in recorded.items()}
+
+    @property
+    def metrics(self) -> dict[str, dict[str, Any]]:
+        """What each event brought, by ``label @ t s`` (overshoot, settling, nadir and more, with
+        the units of their names)."""
+        return {
+            f"{event['label']} @ {event['t']:g} s": {
+                key: value for key, value in event.items() if key not in _NOT_METRICS
+            }
+            for event in self.summary["events"]
+        }
+
+    def three_phase(
+        self, start: float = 0.0, stop: float = math.inf, si: bool = False
+    ) -> dict[str, NDArray[Any]]:
+        """v_abc of the filter capacitor and i_abc of the bridge and of the line, at every tick.
+
+        Args:
+            start, stop: from when to before when, s.
+            si: in V and A instead of in p.u. of the nominal peak value of a phase.
+
+        Returns:
+            ``t`` in s, and v_a … v_c, i_a … i_c, i_oa … i_oc, in V and A under names such as v_a_V
+            and i_oa_A; shape (ticks,) each.
+
+        Raises:
+            UserError: the recording lacks what this needs.
+        """
+        waves = three_phase(self.columns, bases(self.scenario), si)
+        first, last = (
+            round(min(max(0.0, t / self.scenario.T_s), self.ticks)) for t in (start, stop)
+        )
+        rows = {"t": self.columns["t"], **waves}
+        return {name: np.asarray(column[first:last]) for name, column in rows.items()}
 
     @property
     def status(self) -> str:

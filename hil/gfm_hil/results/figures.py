@@ -21,7 +21,7 @@ from gfm_hil.core.files import replacing
 from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, Columns, Rows, pieces, wave
 from gfm_hil.recording.run import bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
-from gfm_hil.results.waveforms import NEEDS, three_phase, usual_window
+from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.scenario.model import Scenario
 

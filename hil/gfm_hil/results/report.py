@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.core.files import write_text
-from gfm_hil.recording.run import controlled_by
-from gfm_hil.results.summary import END_METRICS
+from gfm_hil.recording.run import Run, controlled_by
+from gfm_hil.run.network_run import NetworkRun
+from gfm_hil.run.summary import END_METRICS
 from gfm_hil.scenario.model import Scenario
 
 if TYPE_CHECKING:
@@ -129,14 +130,30 @@ def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str
     return f'<div class="scroll"><table>{title}{body}</table></div>'
 
 
-def write_report(
+def write_report(run: Run | NetworkRun) -> None:
+    """Draw the figures of a run and write report.html into its folder; of several converters in a
+    network only the figures that they share."""
+    # a second of imports, which the sides' processes do without
+    from gfm_hil.results.diagram import draw_diagram
+    from gfm_hil.results.figures import draw_comparison, draw_run
+
+    folder, scenario = run.folder, run.scenario
+    assert folder is not None
+    if isinstance(run, NetworkRun):
+        draw_comparison(folder / "converters.png", scenario, run.columns, run.events)
+        draw_diagram(folder, scenario)
+        return
+    pictures = draw_run(folder, scenario, run.columns, run.timing, run.summary)
+    _write_page(folder, scenario, run.summary, pictures, draw_diagram(folder, scenario))
+
+
+def _write_page(
     folder: Path,
     scenario: Scenario,
     summary: dict[str, Any],
     pictures: Sequence[Picture],
     diagram: Path,
-) -> Path:
-    """Write report.html into the run folder; returns its path."""
+) -> None:
     status = html.escape(summary["status"])
     look, expected = ("expected", ", as expected:") if as_expected(summary) else (status, "")
     facts = [
@@ -198,7 +215,6 @@ def write_report(
 <h2>Scenario as resolved</h2><pre>{resolved}</pre></html>
 """,
     )
-    return path
 
 
 def _events(events: Sequence[dict[str, Any]]) -> str:

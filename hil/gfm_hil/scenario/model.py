@@ -309,7 +309,7 @@ class Scenario(_Model):
         return self.link.peer_timeout_s or PEER_TIMEOUT_S[self.mode]
 
     @property
-    def model_timeout_s(self) -> float:
+    def answer_timeout_s(self) -> float:
         """How long a model may take for an answer, s. It is half of the peer's time, so that its
         controller can still say what has failed."""
         return self.peer_timeout_s / 2

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.runner import run_in_memory
+from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.law import Law, law_files
 from gfm_plant import make_plant

@@ -41,9 +41,8 @@ from gfm_design.margins.admittance import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.recording.run import controlled_by
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory, run_scenario
+from gfm_hil.recording.run import Run, controlled_by
+from gfm_hil.run.runner import run_in_memory, run_scenario
 from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
 from gfm_hil.studies.law import Law
 from gfm_hil.studies.loop import scenario_loop
@@ -532,7 +531,7 @@ def _run(
     made = load_scenario(content, in_process=not foreign)
     if foreign:
         folder = place / f"run-{axis}-{starts[-1]}"
-        run = run_scenario(made, folder, figures=False, controller_command=foreign)
+        run = run_scenario(made, folder, controller_command=foreign)
     else:
         run = run_in_memory(made)
     if run.status != "completed":

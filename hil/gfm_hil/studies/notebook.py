@@ -1,21 +1,16 @@
-"""What a notebook calls: a run, several laws side by side or a campaign, in memory and silent."""
+"""What a notebook calls: a campaign, or conformity tests, in memory and silent."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_in_memory, run_network_in_memory
-from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.studies.campaign.axes import find_axes
 from gfm_hil.studies.campaign.execute import execute, processes
 from gfm_hil.studies.campaign.loading import check_campaign, find_campaign
@@ -31,104 +26,7 @@ from gfm_runtime.inner_file import named_inner
 from gfm_runtime.toml_file import read_toml
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-def run(
-    scenario: str | Path | Scenario | dict[str, Any],
-    law: str | Path | Law | None = None,
-    **changes: Any,
-) -> Run:
-    """Run a scenario in this process, in lockstep, and keep the result in memory.
-
-    Args:
-        scenario: name of a shipped one, path of a file, content of a file, or a checked scenario.
-        law: name, law file or ``Law``; the scenario's own if None.
-        changes: keys of the scenario with ``__`` for the dot, e.g. ``duration=2.0`` [s],
-            ``plant__factors__L_g=2.0``.
-
-    Raises:
-        UserError: one line a mistake; or the scenario has no operating point.
-        LawError: the law is none.
-    """
-    with law_files([] if law is None else [law]) as files:
-        for file in files.values():
-            changes = {**changes, "law": file}
-        made = run_in_memory(load_scenario(scenario, in_process=True, **changes))
-    return _named(made, law) if isinstance(law, Law) else made
-
-
-def run_network(scenario: str | Path | Scenario | dict[str, Any], **changes: Any) -> NetworkRun:
-    """Run a scenario with several converters in this process, and keep the result in memory.
-
-    Args:
-        scenario, changes: as for ``run``.
-
-    Raises:
-        UserError: one line a mistake; it has no network; or no operating point.
-    """
-    checked = load_scenario(scenario, in_process=True, **changes)
-    if checked.network is None:
-        raise UserError("network: the scenario has none; use gfmhil.run")
-    return run_network_in_memory(checked)
-
-
-def _named(made: Run, law: Law) -> Run:
-    """The run of a ``Law``: its name in place of its temporary file, and its text."""
-    scenario = made.scenario.model_copy(update={"law": law.name})
-    return replace(made, scenario=scenario, law_text=law.to_toml())
-
-
-@dataclass(frozen=True, repr=False)
-class Comparison(Mapping[str, Run]):
-    """Runs of one scenario by the name of their law."""
-
-    runs: dict[str, Run]
-
-    def __getitem__(self, law: str) -> Run:
-        return self.runs[law]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.runs)
-
-    def __len__(self) -> int:
-        return len(self.runs)
-
-    @property
-    def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """The metrics of each run by law, see ``Run.metrics``."""
-        return {law: one.metrics for law, one in self.runs.items()}
-
-    def plot(self) -> list[Axes]:
-        """p, frequency, q and v_dc of all laws in one figure."""
-        from matplotlib import pyplot
-
-        from gfm_hil.results import figures
-
-        first = next(iter(self.runs.values()))
-        events = max((one.summary["events"] for one in self.runs.values()), key=len)
-        columns = {law: one.columns for law, one in self.runs.items()}
-        figure = pyplot.figure(figsize=figures.SIZE_LAWS, layout="constrained")
-        return figures.draw_laws(figure, first.scenario, columns, events)
-
-    def __repr__(self) -> str:
-        lines = [f"  {law}: {one.status}" for law, one in self.runs.items()]
-        return "\n".join(["<Comparison", *lines, ">"])
-
-
-def compare(
-    scenario: str | Path | Scenario | dict[str, Any],
-    laws: Sequence[str | Path | Law],
-    **changes: Any,
-) -> Comparison:
-    """Run a scenario under several laws; arguments and errors as for ``run``."""
-    if not laws:
-        raise UserError("laws: name some laws to compare")
-    with law_files(laws) as files:
-        names = [*files]
-    return Comparison(
-        {name: run(scenario, law, **changes) for name, law in zip(names, laws, strict=True)}
-    )
+    pass
 
 
 def campaign(

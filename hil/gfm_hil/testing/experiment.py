@@ -9,8 +9,8 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.results import checks
-from gfm_hil.results.modes import acting, free_from
+from gfm_hil.run import checks
+from gfm_hil.run.modes import acting, free_from
 from gfm_hil.testing.setting import beside
 from gfm_hil.testing.steps import Steps
 

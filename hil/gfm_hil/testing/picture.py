@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import unit_of
-from gfm_hil.results.checks import Finding
+from gfm_hil.recording.run import Run
 from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
-from gfm_hil.results.run import Run
+from gfm_hil.run.checks import Finding
 from gfm_hil.scenario.model import Scenario
 
 _BLUE, _RED, _GREEN, *_ = COLOURS

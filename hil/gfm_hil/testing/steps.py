@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
-from gfm_hil.recording.run import Signals
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.recording.run import Run, Signals
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario.events import Event
 from gfm_hil.scenario.model import Scenario, check_scenario
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
@@ -290,7 +289,6 @@ class Steps:
         run = run_scenario(
             plan.scenario(plan.tick),
             self._new_folder(),
-            figures=False,
             controller_command=self.setting.controller_command,
         )
         if run.summary["reason"] == "stopped by the operator":

@@ -17,8 +17,8 @@ from gfm_design.margins.disk import DiskMargin
 from gfm_design.margins.tolerance import End, GridStrength, Range
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.terminal import numbers, terminal
-from gfm_hil.results.loop_delay import LoopDelay
 from gfm_hil.results.report import finite
+from gfm_hil.run.loop_delay import LoopDelay
 
 
 def margins_as_json(

@@ -16,9 +16,9 @@ from gfm_hil.cli.design.common import add_converter_option, add_inner_option, ch
 from gfm_hil.cli.design.margin_report import margins_as_json, no_margins, print_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.recording.run import RecordedRun
-from gfm_hil.results.loop_delay import loop_delay
+from gfm_hil.recording.run import Run
 from gfm_hil.results.report import finite
+from gfm_hil.run.loop_delay import loop_delay
 from gfm_hil.studies.loop import Loop, scenario_loop
 from gfm_hil.studies.margin_figures import draw_delay, draw_region
 
@@ -47,7 +47,7 @@ def call(options: argparse.Namespace) -> int:
     """Report the margins; exit code 3 for an unstable loop, which has none."""
     run, given = None, options.scenario
     if options.run is not None:
-        run, given = RecordedRun.load(options.run), str(options.run / "scenario.toml")
+        run, given = Run.load(options.run), str(options.run / "scenario.toml")
     scenario = chosen_scenario(given, options)
     if options.figures and scenario.network is not None:
         raise UserError("--figures: they are those of one converter on its line to the grid")

@@ -19,7 +19,7 @@ from gfm_hil.recording.columns import (
     wave,
 )
 from gfm_hil.recording.timing import LATE, MISS_NEEDS, ROUND_TRIP, SLACK, Duration, missed
-from gfm_hil.results.waveforms import NEEDS, Phase
+from gfm_hil.recording.waveforms import NEEDS, Phase
 from gfm_runtime.signals import names
 
 _LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5, "": 1.0}  # of a channel's range, by its unit

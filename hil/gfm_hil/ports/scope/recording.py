@@ -12,7 +12,7 @@ from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.recording.live import begun as recording
 from gfm_hil.recording.log import read_events, read_summary
-from gfm_hil.recording.run import RecordedRun, nominal_frequency, read_scenario
+from gfm_hil.recording.run import Run, nominal_frequency, read_scenario
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime import LawError, law_titles, load_law
 
@@ -117,10 +117,9 @@ def open_recording(folder: Path) -> Recording:
     """
     scenario = read_scenario(folder)
     if (folder / "summary.json").is_file():
-        run = RecordedRun.load(folder)
-        record = Recording(
-            folder, scenario, run.recorded, [_law(label) for label in run.laws], False
-        )
+        run = Run.load(folder)
+        laws = [_law(label) for label in run.laws]
+        record = Recording(folder, scenario, run.recorded, laws, live=False)
         record._done = record.capacity = run.ticks
         return record
     if not begun(folder):

@@ -25,7 +25,7 @@ from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.vectors import CanFrame, VectorSender
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 from gfm_runtime.signals import Vector, carried
 from gfm_runtime.states import INIT, PLANT_TRIP, REASONS, SAFE
 
@@ -35,7 +35,7 @@ _PIECE = 1 << 16  # ticks
 Timed = tuple[float, CanFrame]
 
 
-def write_blf(run: RecordedRun, file: Path) -> None:
+def write_blf(run: Run, file: Path) -> None:
     """Write a run; times are of each sender's clock since tick 0, in lockstep those of the run."""
     options = can_options(run)
     with can.BLFWriter(file) as writer:
@@ -48,7 +48,7 @@ def write_blf(run: RecordedRun, file: Path) -> None:
             )  # fmt: skip
 
 
-def dbc_text(run: RecordedRun) -> str:
+def dbc_text(run: Run) -> str:
     """The DBC by which the frames are to be read."""
     options = can_options(run)
     if options.dbc is None:
@@ -56,13 +56,13 @@ def dbc_text(run: RecordedRun) -> str:
     return Path(options.dbc).read_text(encoding="utf-8")
 
 
-def can_options(run: RecordedRun) -> CanOptions:
+def can_options(run: Run) -> CanOptions:
     """The run's own if it went over CAN, else the link's defaults."""
     link, inner = run.scenario.link, "u_E_q" in run.recorded
     return CanOptions(**(link.options if link.type == "can" else {})).of_run(inner)
 
 
-def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
+def can_frames(run: Run, options: CanOptions) -> Iterator[Timed]:
     """The frames of both sides in the order of their times.
 
     Raises:
@@ -78,7 +78,7 @@ def can_frames(run: RecordedRun, options: CanOptions) -> Iterator[Timed]:
     return heapq.merge(*roles, key=lambda timed: timed[0])
 
 
-def _measurements(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
+def _measurements(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
     writer, sender = FrameWriter("y", plan.inner), VectorSender(plan, "y", options.heartbeat)
     clock = _Clock(run, "plant")
@@ -92,7 +92,7 @@ def _measurements(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator
                 yield from ((times[k - first], frame) for frame in sender.frames(message))
 
 
-def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Timed]:
+def _commands(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The controller's: an answer to every vector that it got.
 
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
@@ -117,18 +117,18 @@ def _commands(run: RecordedRun, options: CanOptions, plan: Plan) -> Iterator[Tim
                     yield from ((times[j], frame) for frame in frames)
 
 
-def _pieces(run: RecordedRun) -> Iterator[tuple[int, int]]:
+def _pieces(run: Run) -> Iterator[tuple[int, int]]:
     """The ticks of a run, first and last of a piece that is held in memory."""
     return ((a, min(a + _PIECE, run.ticks)) for a in range(0, run.ticks, _PIECE))
 
 
-def _vector(run: RecordedRun, group: Vector, first: int, last: int) -> NDArray[np.float64]:
+def _vector(run: Run, group: Vector, first: int, last: int) -> NDArray[np.float64]:
     """Rows of a vector, shape (ticks, n), p.u."""
     carries = carried(group, "u_E_q" in run.recorded)
     return np.column_stack([run.recorded[f"{group}_{n}"][first:last] for n in carries])
 
 
-def _taken(run: RecordedRun, first: int, last: int) -> NDArray[np.bool_]:
+def _taken(run: Run, first: int, last: int) -> NDArray[np.bool_]:
     """Ticks at which the plant took a command in time; in process it always does."""
     received = run.recorded.get("plant_received", run.recorded["tick"])
     return received[first:last] >= 0
@@ -137,7 +137,7 @@ def _taken(run: RecordedRun, first: int, last: int) -> NDArray[np.bool_]:
 class _Clock:
     """When a side sent its frame of each tick, s from tick 0."""
 
-    def __init__(self, run: RecordedRun, role: str) -> None:
+    def __init__(self, run: Run, role: str) -> None:
         self._t = run.recorded["t"] if run.summary["mode"] == "lockstep" else None
         if self._t is None:
             self._sent, due = run.recorded[f"{role}_sent"], run.recorded[f"{role}_scheduled"]
@@ -158,7 +158,7 @@ class _Clock:
 class _SafeReasons:
     """Codes of the reasons for which the controller was in SAFE; the log has them in words."""
 
-    def __init__(self, run: RecordedRun) -> None:
+    def __init__(self, run: Run) -> None:
         said = [
             line for line in run.events if "controller" in line.get("role", "") and "reason" in line
         ]

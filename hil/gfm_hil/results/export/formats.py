@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing, write_text
-from gfm_hil.recording.run import RecordedRun, bases
-from gfm_hil.results.waveforms import three_phase
+from gfm_hil.recording.run import Run, bases
+from gfm_hil.recording.waveforms import three_phase
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def export_run(
 
     Args:
         phases: with the three phases of voltages and currents as further columns, in p.u. or in V
-            and A; see ``gfm_hil.results.waveforms``.
+            and A; see ``gfm_hil.recording.waveforms``.
 
     Returns:
         What was written: the file and, of CAN frames, their DBC.
@@ -76,7 +76,7 @@ def export_run(
             file cannot be written.
     """
     check_format(name)
-    run, form = RecordedRun.load(folder), FORMATS[name]
+    run, form = Run.load(folder), FORMATS[name]
     if phases is not None:
         if not form.columns:
             fitting = ", ".join(name for name, form in FORMATS.items() if form.columns)

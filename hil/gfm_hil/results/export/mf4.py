@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import Described
 from gfm_hil.recording.log import event_text
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 
 _ROWS = 1 << 17  # handed over at a time
 _ATTACHED = {
@@ -25,7 +25,7 @@ _ATTACHED = {
 }
 
 
-def write_mf4(run: RecordedRun, file: Path) -> None:
+def write_mf4(run: Run, file: Path) -> None:
     """Write a run."""
     from asammdf import MDF, Signal
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.log import event_text
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 
 _LINES = 10_000  # of CSV, turned into Python's numbers at a time
 _ROWS = 1 << 17  # of a row group of Parquet, which is held in memory
 
 
-def write_csv(run: RecordedRun, file: Path) -> None:
+def write_csv(run: Run, file: Path) -> None:
     """Write one header line with the names, then a line a tick. A float is the shortest text that
     is read back as the same float."""
     with file.open("w", newline="", encoding="utf-8") as out:
@@ -27,7 +27,7 @@ def write_csv(run: RecordedRun, file: Path) -> None:
             writer.writerows(zip(*(x.tolist() for x in block.values()), strict=True))
 
 
-def write_mat(run: RecordedRun, file: Path) -> None:
+def write_mat(run: Run, file: Path) -> None:
     """Write a run: columns as variables (ticks, 1), ``unit``, ``comment`` and ``words`` as structs
     with a field a column, ``laws``, ``events`` and ``scenario``."""
     from scipy.io import savemat
@@ -71,7 +71,7 @@ class _OneByOne(dict[str, Any]):
         yield from super().items()
 
 
-def write_parquet(run: RecordedRun, file: Path) -> None:
+def write_parquet(run: Run, file: Path) -> None:
     """Write a run; laws, events, summary and scenario lie in the file's own metadata."""
     import pyarrow as pa
     from pyarrow import parquet

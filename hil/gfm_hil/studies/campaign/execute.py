@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.runner import run_scenario
+from gfm_hil.results.report import write_report
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.worker import Job, Record, record, run_chunk
 from gfm_runtime.children import end_with_parent
@@ -169,7 +170,7 @@ def run_alone(campaign: Campaign, run: int, law: str, folder: Path) -> Record:
     if folder.exists() and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     try:
-        whole = run_scenario(scenario, folder)
+        whole = run_scenario(scenario, folder, report=write_report)
         summary, p = whole.summary, whole.signals["true_p"]
     except UserError as problem:
         summary = {"status": "no-steady-state", "reason": str(problem), "events": []}

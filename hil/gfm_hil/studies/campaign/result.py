@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.results.metrics import METRICS
+from gfm_hil.run.metrics import METRICS
 from gfm_hil.studies.campaign.axes import Axis, find_axes
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.worker import Record

@@ -13,8 +13,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compiled_bench
 from gfm_hil.recording.parts import Kept
 from gfm_hil.results.report import finite
-from gfm_hil.results.runner import run_in_memory
-from gfm_hil.results.summary import READ
+from gfm_hil.run.runner import run_in_memory
+from gfm_hil.run.summary import READ
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
 

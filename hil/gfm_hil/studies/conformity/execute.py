@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_for_model, compiled_bench, compiled_benches
-from gfm_hil.models import FORMS, PIL, check_currents, model_file, precision, read_map
-from gfm_hil.results.run import Run
-from gfm_hil.results.runner import (
-    model_command,
+from gfm_hil.engine.compiling import compile_external, compiled_bench, compiled_benches
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import (
+    external_command,
     run_in_memory,
     run_network_in_memory,
     run_scenario,
@@ -61,7 +61,7 @@ class Foreign:
         """
         if self.model.startswith(PIL):
             return self.model
-        kind, path = model_file(self.model)
+        kind, path = controller_file(self.model)
         return f"{kind}:{path.name}"
 
 
@@ -161,7 +161,7 @@ def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign |
             raise UserError(f"map {ports}: {model} has our signals, and takes no map")
         precision(model)
         return Foreign(model)
-    kind, path = model_file(model, FORMS)
+    kind, path = controller_file(model, FORMS)
     file = None if ports is None else Path(ports).absolute()
     read_map(file)
     return Foreign(f"{kind}:{path}", file)
@@ -266,7 +266,7 @@ def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
                 continue
             if job.foreign is not None:
                 compiled_bench(scenario, notice, ("plant",))
-                compile_for_model(scenario, notice)
+                compile_external(scenario, notice)
             else:
                 (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
             seen.add(kind)
@@ -339,7 +339,7 @@ def _plot(job: Job, asked: Nfp) -> Found:
         scenario = _scenario(job)
         found = identify(
             None, scenario, start_hz=asked.from_hz, stop_hz=asked.to_hz, points=asked.points,
-            controller_command=model_command(foreign.model, foreign.ports) if foreign else (),
+            controller_command=external_command(foreign.model, foreign.ports) if foreign else (),
         )  # fmt: skip
     except UserError as problem:
         return _no_run(job, [asked], problem)
@@ -395,8 +395,8 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     """
     if job.foreign is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        command = model_command(job.foreign.model, job.foreign.ports)
-        run = run_scenario(scenario, folder, figures=False, controller_command=command)
+        command = external_command(job.foreign.model, job.foreign.ports)
+        run = run_scenario(scenario, folder, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt
         return run, {}

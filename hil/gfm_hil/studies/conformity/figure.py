@@ -12,9 +12,9 @@ from matplotlib.patches import Rectangle
 
 from gfm_hil.core.files import replacing
 from gfm_hil.recording.columns import printed, unit_of
-from gfm_hil.recording.run import RecordedRun, nominal_frequency
-from gfm_hil.results.cycles import cycle_means, cycle_ticks
+from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
+from gfm_hil.run.cycles import cycle_means, cycle_ticks
 from gfm_hil.studies.conformity.judge import (
     CANNOT,
     FAIL,
@@ -37,7 +37,7 @@ _TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "fre
 _LIGHT = "#c9d6e2"
 
 
-def draw_part(path: Path, title: str, run: RecordedRun, verdicts: Sequence[Verdict]) -> Picture:
+def draw_part(path: Path, title: str, run: Run, verdicts: Sequence[Verdict]) -> Picture:
     """Draw one run: every tick in light grey, one-cycle means in blue, the limits that were judged
     in the colour of their verdict, and below each panel the windows without limits."""
     judged = [v.signal for v in verdicts if v.signal and v.signal != "omega_u"]

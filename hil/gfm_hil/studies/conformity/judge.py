@@ -1,7 +1,7 @@
 """What a finished run says to the criteria of a test: nothing runs here, and nothing is written.
 
 Powers, voltages, currents and frequencies are judged by their means over one cycle of the nominal
-frequency (``results.cycles``); only how fast p rises, and the angle, are of every tick.
+frequency (``run.cycles``); only how fast p rises, and the angle, are of every tick.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import unit_of
-from gfm_hil.recording.run import RecordedRun, nominal_frequency
-from gfm_hil.results import checks
-from gfm_hil.results.cycles import cycle_means, cycle_ticks, whole_ticks
-from gfm_hil.results.modes import acting, free_from, swing
-from gfm_hil.results.ripple import remaining_ripple
+from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.run import checks
+from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.run.modes import acting, free_from, swing
+from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.scenario.events import GridFrequency, GridImpedance, PhaseJump
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.conformity.model import (
@@ -94,10 +94,10 @@ class Verdict:
 
 
 def judge(
-    run: RecordedRun,
+    run: Run,
     criteria: Sequence[Criterion],
     under: UnderTest,
-    others: Mapping[str, RecordedRun] | None = None,
+    others: Mapping[str, Run] | None = None,
 ) -> list[Verdict]:
     """The verdicts of all criteria, each at each of its times.
 
@@ -174,7 +174,7 @@ def worst(outcomes: Sequence[str]) -> Outcome:
     return next((outcome for outcome in order if outcome in outcomes), CANNOT)
 
 
-def _first(run: RecordedRun) -> float:
+def _first(run: Run) -> float:
     """When the first event happens, s; 0 without any."""
     T_s = run.scenario.T_s
     return min((e.at(T_s) * T_s for e in run.scenario.events), default=0.0)
@@ -185,9 +185,9 @@ class _Judge:
 
     def __init__(
         self,
-        run: RecordedRun,
+        run: Run,
         under: UnderTest,
-        others: Mapping[str, RecordedRun],
+        others: Mapping[str, Run],
         criterion: Criterion,
         at: float,
     ) -> None:

@@ -17,9 +17,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers.external import (
+    BenchContext,
+    ControllerError,
+    check_currents,
+    run_name,
+    ticks_a_step,
+)
+from gfm_hil.controllers.ports import PortMap
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.model import BenchContext, ModelError, check_currents, run_name, ticks_a_step
-from gfm_hil.models.ports import PortMap
 from gfm_runtime.signals import carried, names
 
 VERSION = 1
@@ -46,7 +52,7 @@ class _Output(c.Structure):
     _fields_ = (("e", _Phases), ("i_dc", c.c_double))
 
 
-class LibraryModel:
+class LibraryController:
     """A controller in a shared library.
 
     Args:
@@ -100,14 +106,14 @@ class LibraryModel:
         self._ref = {name: k for k, name in enumerate(names("ref"))}
 
     def start(self, u: NDArray[np.float64]) -> None:
-        """See ``Model``; the library itself starts at the first tick, which has measurements."""
+        """See ``ExternalController``; the library starts at the first tick, with measurements."""
         self._ticks, self._speed = 0, float(u[1])
         self._now(complex(u[2], u[3]), float(u[0]))
 
     def tick(
         self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
     ) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         if self._ticks % self._every == 0:
             self._measure(ref, y)
             if self._ticks == 0:
@@ -121,7 +127,7 @@ class LibraryModel:
         self._ticks += 1
 
     def close(self) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         self._of.gfmhil_free(self._self)
 
     def _angle(self, ticks: float) -> float:
@@ -161,11 +167,13 @@ class LibraryModel:
                 self._of.gfmhil_fault.restype = c.c_char_p
                 said = self._of.gfmhil_fault(c.c_void_p(self._self), c.c_int(number))
             words = (said or b"").decode("utf-8", "replace").strip() or "it does not say what it is"
-            raise ModelError(f"{self.name}: blocks the bridge: fault {number}, {words}")
+            raise ControllerError(f"{self.name}: blocks the bridge: fault {number}, {words}")
         given = {**{f"e[{k}]": e for k, e in enumerate(self._out.e)}, "i_dc": self._out.i_dc}
         for field, value in given.items():
             if not math.isfinite(value):
-                raise ModelError(f"{self.name}: out->{field} = {value} at t = {self._in.t:g} s")
+                raise ControllerError(
+                    f"{self.name}: out->{field} = {value} at t = {self._in.t:g} s"
+                )
 
 
 def _phases(space: complex) -> tuple[float, float, float]:

@@ -15,8 +15,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from gfm_hil.recording.columns import PIECE, Columns, Rows, pieces
-from gfm_hil.results.cycles import Vector, cycle_means, cycle_ticks, whole_ticks
-from gfm_hil.results.modes import LONGEST, fast_mode, swing
+from gfm_hil.run.cycles import Vector, cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.run.modes import LONGEST, fast_mode, swing
 
 ROCOF_WINDOW = 0.1  # s; df/dt is the slope over this window
 METRICS = (

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.run import RecordedRun
+from gfm_hil.recording.run import Run
 from gfm_hil.recording.timing import ROUND_TRIP, Spread, missed
 
 
@@ -72,7 +72,7 @@ class LoopDelay:
         )
 
 
-def loop_delay(run: RecordedRun, set_s: float, margin_s: float) -> LoopDelay:
+def loop_delay(run: Run, set_s: float, margin_s: float) -> LoopDelay:
     """The delays of a run, compared with a margin.
 
     Args:

@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers.external import (
+    BenchContext,
+    ControllerError,
+    MappedController,
+    run_name,
+    ticks_a_step,
+)
+from gfm_hil.controllers.ports import PortMap, wire
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import Archive
-from gfm_hil.models.model import BenchContext, ModelError, Wired, run_name, ticks_a_step
-from gfm_hil.models.ports import PortMap, wire
 from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import command_rows
 
@@ -23,12 +29,12 @@ _MEMBERS = 10_000  # of an archive, at most
 _UNPACKED, _DESCRIPTION = 1 << 29, 1 << 25  # bytes of all members, and of the one that FMPy parses
 
 
-class FmuModel(Wired):
+class FmuController(MappedController):
     """An FMU with a library for this machine.
 
     Args:
         path: of the .fmu.
-        ports, context: as for ``open_model``.
+        ports, context: as for ``open_controller``.
 
     Raises:
         UserError: FMPy is missing, it cannot read the file, or the ports do not fit.
@@ -81,7 +87,7 @@ class FmuModel(Wired):
         self._said = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
     def start(self, u: NDArray[np.float64]) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         self._ticks = 0
         try:
             if not self._fresh:
@@ -95,7 +101,7 @@ class FmuModel(Wired):
             self._it.enterInitializationMode()
             self._it.exitInitializationMode()
         except self._failed as problem:
-            raise ModelError(self._why(problem)) from None
+            raise ControllerError(self._why(problem)) from None
 
     def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         outputs = np.zeros(len(self._names))
@@ -106,11 +112,11 @@ class FmuModel(Wired):
             for kind, places, references in self._out:
                 outputs[places] = getattr(self._it, f"get{kind}")(references)
         except self._failed as problem:
-            raise ModelError(self._why(problem)) from None
+            raise ControllerError(self._why(problem)) from None
         return outputs
 
     def close(self) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         with contextlib.suppress(self._failed):
             self._it.terminate()
             self._it.freeInstance()

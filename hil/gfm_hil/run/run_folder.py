@@ -12,7 +12,8 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,14 @@ from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.parts import check_parts, place_of, remove_parts
-from gfm_hil.recording.run import began, converters_of, read_recording, read_scenario
-from gfm_hil.results.run import Run
-from gfm_hil.results.summary import origin, stages, summarise
+from gfm_hil.recording.run import Run, began, converters_of, read_recording, read_scenario
+from gfm_hil.run.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario, load_scenario
 from gfm_hil.scenario.toml_out import write_scenario
+
+#: draws the figures of a ``Run`` and writes its report into its folder, as ``results.report`` does;
+#: is called with a ``NetworkRun`` too, for what its runs share
+Report = Callable[[Any], object]
 
 _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
@@ -72,7 +76,7 @@ def finish(
     folder: Path,
     laws: list[str],
     wall_s: float,
-    figures: bool = True,
+    report: Report | None = None,
     outside: Outcome | None = None,
 ) -> Run:
     """Turn the parts that the sides left in ``folder`` into the files of a run.
@@ -81,21 +85,23 @@ def finish(
         scenario, folder: of the run.
         laws: labels of the controller's laws, which the recording refers to by index.
         wall_s: how long it took.
-        figures: draw them and write report.html.
+        report: draws the figures and writes report.html; None for a folder without them.
         outside: how it ended as seen from outside the sides, which may not have lived to say.
 
     Raises:
         Unfinished: a file cannot be written; ``recover`` completes the folder.
         KeyboardInterrupt: SIGINT, SIGTERM or SIGHUP came; the message says the same.
     """
-    ended = _Ended(wall_s=wall_s, figures=figures, outside=outside)
+    ended = _Ended(wall_s=wall_s, figures=report is not None, outside=outside)
     with _kept(folder):
         write_text(folder / _ENDED, ended.model_dump_json())
-        return _complete(scenario, folder, laws, wall_s, figures, outside)
+        return _complete(scenario, folder, laws, wall_s, report, outside)
 
 
-def recover(folder: Path) -> Run:
+def recover(folder: Path, report: Report | None = None) -> Run:
     """Complete the folder of a run that was cut off; leave one that is complete as it is.
+
+    ``report`` as for ``finish``; it is not called for a run that was to have none.
 
     What lies in the folder may be anything: no link in it is followed, and nothing is removed or
     written elsewhere than there and in the run's own folder in memory.
@@ -123,7 +129,8 @@ def recover(folder: Path) -> Run:
             ended = _Ended(**read_json(folder / _ENDED, _Ended))
         except FileNotFoundError:  # it was cut off while it ran
             ended = _Ended(wall_s=_lasted(folder))
-        return _complete(scenario, folder, laws, ended.wall_s, ended.figures, ended.outside)
+        report = report if ended.figures else None
+        return _complete(scenario, folder, laws, ended.wall_s, report, ended.outside)
 
 
 class _Ended(BaseModel):
@@ -225,7 +232,7 @@ def _complete(
     folder: Path,
     laws: list[str],
     wall_s: float,
-    figures: bool,
+    report: Report | None,
     outside: Outcome | None,
 ) -> Run:
     """Make the files of a run, then remove what they were made of; may be repeated at any point."""
@@ -242,7 +249,7 @@ def _complete(
     summary = summarise(scenario, signals, timing, log, worst(log, outside), links, wall_s)
     summary |= stages(scenario) | origin(scenario, began(folder))
     run = Run(scenario, summary, signals, labels, log, folder, timing)
-    _conclude(run, figures)
+    _conclude(run, report)
     return run
 
 
@@ -256,7 +263,43 @@ def _link_ends(folder: Path) -> dict[Role, dict[str, Any]]:
     return ends
 
 
-def merge_roles(first: Path, second: Path, folder: Path) -> Run:
+def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
+    """Write the folder of a run in memory, or copy that of another; returns it.
+
+    A law that was an object is there as ``law.toml``, which the scenario names.
+
+    Raises:
+        UserError: the folder holds something already, or cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder}: is not empty; choose another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if run.folder is not None:
+            shutil.copytree(run.folder, folder, dirs_exist_ok=True)
+            return folder
+        arrays = {name: np.asarray(column[:]) for name, column in run.columns.items()}
+        scenario = run.scenario
+        if run.law_text:
+            law = folder.absolute() / "law.toml"
+            write_text(law, run.law_text)
+            scenario = scenario.model_copy(update={"law": str(law)})
+        write_scenario(folder, scenario)
+        laws = Table.of(laws=np.array(run.laws))
+        write_npz(folder / "signals.npz", [laws, Table.of(**arrays)])
+        write_npz(folder / "timing.npz", [])
+        lines = "".join(json.dumps(event) + "\n" for event in run.events)
+        write_text(folder / "events.jsonl", lines)
+        if report is not None:
+            report(replace(run, columns=arrays, folder=folder))
+        write_text(folder / "summary.json", json.dumps(run.summary, indent=2) + "\n")
+    except OSError as problem:
+        raise UserError(f"{folder}: {problem.strerror}") from None
+    return folder
+
+
+def merge_roles(first: Path, second: Path, folder: Path, report: Report | None = None) -> Run:
     """Put what the two sides of a run left, each in a folder of its own, into one run folder.
 
     Rows end where the plant's recording does, as in a run whose sides were started together.
@@ -264,6 +307,7 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
     Args:
         first, second: the finished folders of controller and plant, in any order; they stay.
         folder: new or empty.
+        report: as for ``finish``.
 
     Raises:
         UserError: a folder is not that of one side, they are not of the same run or of the same
@@ -311,7 +355,7 @@ def merge_roles(first: Path, second: Path, folder: Path) -> Run:
         summary |= {key: plant.summary[key] for key in kept if key in plant.summary}
         summary["machines"] = controller.summary["machines"] | plant.summary["machines"]
         whole = Run(plant.scenario, summary, signals, labels, log, folder, timing)
-        _conclude(whole, figures=True)
+        _conclude(whole, report)
     except OSError as problem:
         shutil.rmtree(folder, ignore_errors=True)
         raise UserError(f"{folder}: {problem.strerror or problem}") from None
@@ -336,20 +380,14 @@ def _padded(columns: Columns, rows: int, missing: float) -> Table:
     return Table({name: column.dtype for name, column in columns.items()}, rows, read)
 
 
-def _conclude(run: Run, figures: bool) -> None:
-    """Draw a run's figures, write its report and then its summary, and remove what is left over."""
+def _conclude(run: Run, report: Report | None) -> None:
+    """Have a run's report written, then write its summary, and remove what is left over."""
     assert run.folder is not None
-    folder, scenario, summary = run.folder, run.scenario, run.summary
-    if figures and summary["ticks"]:
-        # a second of imports, which the sides' processes do without
-        from gfm_hil.results.diagram import draw_diagram
-        from gfm_hil.results.figures import draw_run
-        from gfm_hil.results.report import write_report
-
-        pictures = draw_run(folder, scenario, run.columns, run.timing, summary)
-        write_report(folder, scenario, summary, pictures, draw_diagram(folder, scenario))
+    folder = run.folder
+    if report is not None and run.ticks:
+        report(run)
     sync_folder(folder)
-    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    write_text(folder / "summary.json", json.dumps(run.summary, indent=2) + "\n")
     sync_folder(folder)
     _clear(folder)
 

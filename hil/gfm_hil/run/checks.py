@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import printed, unit_of
-from gfm_hil.results.modes import fast_mode, swing
+from gfm_hil.run.modes import fast_mode, swing
 
 Vector = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""What a model is to the controller's process, and what those that are not ours share."""
+"""What an external controller is to its process, and what those that are not ours share."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers.ports import PortWiring
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.ports import Wiring
 from gfm_plant import Bases
 
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
@@ -18,7 +18,7 @@ _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 @dataclass(frozen=True)
 class BenchContext:
-    """What a model is connected to.
+    """What a controller is connected to.
 
     Attributes:
         T_s: sampling time of the run, s.
@@ -33,11 +33,11 @@ class BenchContext:
     delay: float = 0.0
 
 
-class ModelError(Exception):
-    """A model fails while it runs; the message names it and says what it said."""
+class ControllerError(Exception):
+    """A controller fails while it runs; the message names it and says what it said."""
 
 
-class Model(Protocol):
+class ExternalController(Protocol):
     """A controller that is not ours.
 
     Attributes:
@@ -52,7 +52,7 @@ class Model(Protocol):
         """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
 
         Raises:
-            ModelError: it refuses.
+            ControllerError: it refuses.
         """
 
     def tick(
@@ -61,20 +61,20 @@ class Model(Protocol):
         """One tick: u[k] from the references (5,) and the measurements, p.u.
 
         Raises:
-            ModelError: it fails, or blocks the bridge.
+            ControllerError: it fails, or blocks the bridge.
         """
 
     def close(self) -> None:
         """End it, and remove what it left."""
 
 
-class Wired:
-    """A model whose ports a map wires to the signals, and which steps every so many ticks; each
-    kind sets the wiring, the outputs' names and how many ticks."""
+class MappedController:
+    """A controller whose ports a map wires to the signals, and which steps every so many ticks;
+    each kind sets the wiring, the outputs' names and how many ticks."""
 
     real = "float64"
     name: str
-    _wiring: Wiring
+    _wiring: PortWiring
     _names: list[str]
     _every: int
     _ticks = 0
@@ -82,12 +82,12 @@ class Wired:
     def tick(
         self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
     ) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         if self._ticks % self._every == 0:
             outputs, blocks = self._step(self._wiring.inputs(ref, y)), self._wiring.blocks
             if blocks >= 0 and outputs[blocks] != 0:
                 what = f"{self._names[blocks]} = {outputs[blocks]:g}"
-                raise ModelError(f"{self.name}: blocks the bridge: {what}")
+                raise ControllerError(f"{self.name}: blocks the bridge: {what}")
             self._wiring.take(outputs, u)
         self._ticks += 1
 
@@ -96,7 +96,7 @@ class Wired:
 
 
 def refuse_source(text: str) -> None:
-    """Check that a model is no source.
+    """Check that a controller is no source.
 
     Raises:
         UserError: it is; the message says how to compile it.
@@ -124,14 +124,14 @@ def check_currents(text: str, inner: bool) -> None:
         )
 
 
-def run_name(kind: str, model: str) -> str:
-    """What a run calls a model, from what the model calls itself."""
-    plain = "".join(c if " " <= c <= "~" else "?" for c in f"{kind} {model}")
+def run_name(kind: str, controller: str) -> str:
+    """What a run calls a controller, from what the controller calls itself."""
+    plain = "".join(c if " " <= c <= "~" else "?" for c in f"{kind} {controller}")
     return plain[:_LONGEST].strip()
 
 
 def ticks_a_step(where: str, step_s: float, T_s: float) -> int:
-    """How many ticks of T_s [s] pass between two steps of a model.
+    """How many ticks of T_s [s] pass between two steps of a controller.
 
     Raises:
         UserError: its step is not a whole number of ticks.

@@ -1,7 +1,7 @@
 """What may stand in the controller's place: real-code DLLs of IEEE/CIGRE, FMUs, and our own laws on
 another processor.
 
-A model that is not ours computes u from the references and measurements; a map names its ports
+A controller that is not ours computes u from the references and measurements; a map names its ports
 where they are not called as our signals.
 """
 

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers.external import ControllerError
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import our_controller_on
-from gfm_hil.models.model import ModelError
 from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
 from gfm_runtime.children import END_NOW, guarded
@@ -43,7 +43,7 @@ _SIGNALS = {BAD_Y: carried("y", True), RESULTS["BAD_REF"][0]: REF_NAMES}
 _SAID = dict(RESULTS.values())
 
 
-class PilModel:
+class PilController:
     """The laws of a run on a target; a context in which its program runs.
 
     Args:
@@ -101,7 +101,7 @@ class PilModel:
             folder = self._ends.enter_context(scratch.temporary("gfmhil-pil-"))
             self._run(build_loop(modules, controller.T_s, self._target, folder))
             self._check(modules, golden(modules, SHIPPED))
-        except (LawError, ModelError) as problem:
+        except (LawError, ControllerError) as problem:
             self.close()
             raise UserError(f"controller pil: {problem}") from None
 
@@ -130,7 +130,7 @@ class PilModel:
                 stdout=self._log, stderr=self._log, start_new_session=True,
             )  # fmt: skip
         except OSError as problem:
-            raise ModelError(f"{self.name}: cannot be started: {problem.strerror}") from None
+            raise ControllerError(f"{self.name}: cannot be started: {problem.strerror}") from None
         self._ends.callback(self._end)
         self._starts = select.poll()
         self._starts.register(self._from, select.POLLIN)
@@ -142,7 +142,7 @@ class PilModel:
         """Step the program through golden rows; from then on reading waits for ever.
 
         Raises:
-            ModelError: a bit is not the kernel's, or the program has ended.
+            ControllerError: a bit is not the kernel's, or the program has ended.
         """
         differ = []
         for row in rows.words:
@@ -168,7 +168,7 @@ class PilModel:
         """Load the controller's active law in its present state.
 
         Raises:
-            ModelError: the program has ended.
+            ControllerError: the program has ended.
         """
         c = self._controller
         k = int(c.ctl["active"][0])
@@ -190,7 +190,7 @@ class PilModel:
             u: shape (3,) or (4,); NaN in what is not finite.
 
         Raises:
-            ModelError: the program has ended, or refuses.
+            ControllerError: the program has ended, or refuses.
         """
         ctl, states = self._controller.ctl, self._controller.states
         request, answer = self._request, self._answer
@@ -227,7 +227,7 @@ class PilModel:
         """The next answer.
 
         Raises:
-            ModelError: the program has ended.
+            ControllerError: the program has ended.
         """
         into = self._answer.view(np.uint8).data
         while len(into):
@@ -241,7 +241,7 @@ class PilModel:
                 raise self._ended()
             into = into[got:]
 
-    def _ended(self) -> ModelError:
+    def _ended(self) -> ControllerError:
         """How the program has ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
@@ -249,13 +249,13 @@ class PilModel:
         how = f"by {signal.Signals(-code).name}" if code and code < 0 else f"with code {code}"
         return self._problem(f"{self._program.target.run[0]} has ended {how}")
 
-    def _problem(self, what: str) -> ModelError:
+    def _problem(self, what: str) -> ControllerError:
         """What is wrong, and what QEMU and the program have said first."""
         # pread: QEMU writes on where the file's position is
         log = os.pread(self._log.fileno(), _BYTES, 0).decode("utf-8", "replace").strip()
         lines = log.partition("\n\n")[0].splitlines()[:_LINES]
         said = "".join(c if c.isprintable() else " " for c in "; ".join(lines))
-        return ModelError(": ".join([self.name, what, *filter(None, [said])]))
+        return ControllerError(": ".join([self.name, what, *filter(None, [said])]))
 
     def _place(self, k: int) -> int:
         """The program's number of the controller's law k."""
@@ -265,13 +265,13 @@ class PilModel:
         """Say why there is no u; an output that is not finite the controller itself reports.
 
         Raises:
-            ModelError: the law refuses its inputs, or the answer is none.
+            ControllerError: the law refuses its inputs, or the answer is none.
         """
         names = {**_SIGNALS, BAD_U: range(n_u)}.get(result, ())
         if not 0 <= channel < len(names):
             raise self._problem(f"answers {result} for signal {channel}, which no law does")
         if result != BAD_U:
-            raise ModelError(f"{self.name}: refuses: {_SAID[result]}: {names[channel]}")
+            raise ControllerError(f"{self.name}: refuses: {_SAID[result]}: {names[channel]}")
 
     def _end(self) -> None:
         self._process.send_signal(END_NOW)

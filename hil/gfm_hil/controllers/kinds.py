@@ -1,4 +1,4 @@
-"""How a model is opened by its kind."""
+"""How a controller is opened by its kind."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from gfm_hil.controllers.dll import DllController
+from gfm_hil.controllers.external import BenchContext, ExternalController, refuse_source
+from gfm_hil.controllers.fmu import FmuController
+from gfm_hil.controllers.library import LibraryController
+from gfm_hil.controllers.ports import PortMap
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.models.dll import DllModel
-from gfm_hil.models.fmu import FmuModel
-from gfm_hil.models.library import LibraryModel
-from gfm_hil.models.model import BenchContext, Model, refuse_source
-from gfm_hil.models.ports import PortMap
 
 if TYPE_CHECKING:
-    from gfm_hil.models.pil import PilModel
+    from gfm_hil.controllers.pil import PilController
 
 PIL = "pil:"
-_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], Model]] = {
-    "dll": DllModel,
-    "fmu": FmuModel,
-    "c": LibraryModel,
+_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ExternalController]] = {
+    "dll": DllController,
+    "fmu": FmuController,
+    "c": LibraryController,
 }
 _FILES = "dll:FILE, fmu:FILE or c:FILE"
 FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
@@ -32,8 +32,10 @@ _LOOK_S = 0.05
 T = TypeVar("T")
 
 
-def open_model(text: str, ports: PortMap, context: BenchContext) -> Model | PilModel:
-    """The model that ``text`` names.
+def open_controller(
+    text: str, ports: PortMap, context: BenchContext
+) -> ExternalController | PilController:
+    """The controller that ``text`` names.
 
     Args:
         text: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` for a library that has the interface of
@@ -42,14 +44,14 @@ def open_model(text: str, ports: PortMap, context: BenchContext) -> Model | PilM
         context: what it is connected to.
 
     Raises:
-        UserError: there is no such file, it is no such model, its ports do not fit, or a signal
-            came while its code kept us.
+        UserError: there is no such file, its ports do not fit, or a signal came
+            while its code kept us.
     """
     if text.startswith(PIL):
         if ports != PortMap():
             raise UserError(f"controller {text}: has our signals, and takes no map")
         return _pil(text)
-    kind, path = model_file(text, FORMS)
+    kind, path = controller_file(text, FORMS)
     where = "gfmhil_new" if kind == "c" else "being opened"
     return until_signal(f"{path.name}: {where}", lambda: _KINDS[kind](path, ports, context))
 
@@ -77,8 +79,8 @@ def until_signal(what: str, work: Callable[[], T]) -> T:
     return found.result()
 
 
-def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
-    """The kind and the file of the model ``KIND:FILE``; ``forms`` is what the message allows.
+def controller_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
+    """The kind and the file of the controller ``KIND:FILE``; ``forms`` is what the message allows.
 
     Raises:
         UserError: there is no such kind or file.
@@ -94,7 +96,7 @@ def model_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
 
 
 def precision(text: str) -> str:
-    """The precision, float64 or float32, of the laws beside the model that ``text`` names.
+    """The precision, float64 or float32, of the laws beside the controller that ``text`` names.
 
     Raises:
         UserError: it is a target that is not there.
@@ -102,7 +104,9 @@ def precision(text: str) -> str:
     return _pil(text).real if text.startswith(PIL) else "float64"
 
 
-def _pil(text: str) -> PilModel:
-    from gfm_hil.models.pil import PilModel  # brings the compilers in, which few runs need
+def _pil(text: str) -> PilController:
+    from gfm_hil.controllers.pil import (
+        PilController,  # brings the compilers in, which few runs need
+    )
 
-    return PilModel(text.removeprefix(PIL))
+    return PilController(text.removeprefix(PIL))

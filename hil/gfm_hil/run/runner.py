@@ -5,17 +5,19 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
+from gfm_hil.controllers import ExternalController, PilController
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES
+from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compiled_bench, compiled_benches
 from gfm_hil.engine.inproc import run_inproc
+from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
@@ -23,14 +25,12 @@ from gfm_hil.recording.columns import Rows
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
 from gfm_hil.recording.parts import Kept, Part, remove_parts
-from gfm_hil.results.network_run import NetworkRun
-from gfm_hil.results.run import Run
-from gfm_hil.results.run_folder import check_free, cut_short, finish, in_use
-from gfm_hil.results.summary import origin, stages, summarise
+from gfm_hil.recording.run import Run
+from gfm_hil.run.network_run import NetworkRun
+from gfm_hil.run.run_folder import Report, check_free, cut_short, finish, in_use
+from gfm_hil.run.summary import origin, stages, summarise
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
-
-__all__ = ["Notice", "Progress", "Run", "run_scenario"]
 
 Notice = Callable[[str], None]
 
@@ -40,7 +40,7 @@ def run_scenario(
     folder: Path,
     progress: Progress = lambda ticks, misses: None,
     notice: Notice = lambda text: None,
-    figures: bool = True,
+    report: Report | None = None,
     controller_command: Sequence[str] = (),
 ) -> Run:
     """Run a scenario and leave a run folder.
@@ -50,7 +50,8 @@ def run_scenario(
         folder: where to write; new or empty.
         progress: told how far the run is.
         notice: told what a person should know while waiting.
-        figures: draw the figures and write report.html.
+        report: draws the figures and writes report.html, as ``results.report.write_report``
+            does; None for a folder without them.
         controller_command: program and arguments of another controller instead of ours, for a
             link that is none of ``inproc``; see ``Processes``. Here ``{folder}`` becomes the run
             folder.
@@ -84,10 +85,10 @@ def run_scenario(
             raise
         wall_s = time.monotonic() - began
         labels = bench.controller.labels
-        return finish(scenario, folder, labels, wall_s, figures, outside.get(""))
+        return finish(scenario, folder, labels, wall_s, report, outside.get(""))
 
 
-def model_command(model: str, ports: Path | None) -> list[str]:
+def external_command(model: str, ports: Path | None) -> list[str]:
     """The ``controller_command`` of a run whose controller steps a model in place of the law.
 
     Args:
@@ -105,12 +106,12 @@ def run_network(
     folder: Path,
     progress: Progress = lambda ticks, misses: None,
     notice: Notice = lambda text: None,
-    figures: bool = True,
+    report: Report | None = None,
 ) -> NetworkRun:
     """Run a scenario with a network and leave a folder with a run folder for each converter.
 
     Args:
-        scenario, folder, progress, notice, figures: as for ``run_scenario``.
+        scenario, folder, progress, notice, report: as for ``run_scenario``.
 
     Raises:
         UserError: the folder is in use, or there is no operating point.
@@ -143,10 +144,76 @@ def run_network(
         wall_s = time.monotonic() - began
         for name, place, bench in zip(names, places, benches, strict=True):
             labels = bench.controller.labels
-            runs[name] = finish(bench.scenario, place, labels, wall_s, figures, outside.get(name))
+            runs[name] = finish(bench.scenario, place, labels, wall_s, report, outside.get(name))
         whole = NetworkRun(scenario, runs, folder)
-        whole.conclude(folder, figures)
+        whole.conclude(folder, report)
     return whole
+
+
+def run_side(
+    role: Role,
+    scenario: Scenario,
+    folder: Path,
+    endpoints: Mapping[str, str],
+    notice: Notice = lambda text: None,
+    report: Report | None = None,
+    external: ExternalController | PilController | None = None,
+) -> Run | NetworkRun:
+    """Run one side alone, whose peer another process or machine runs, and leave a run folder of
+    what it recorded, or one for each converter of a network.
+
+    Args:
+        role: the side.
+        scenario, folder, notice, report: as for ``run_scenario``.
+        endpoints: by converter, in place of the scenario's.
+        external: computes u in place of the law.
+
+    Raises:
+        UserError: the folder is in use, no operating point, an endpoint that is occupied.
+    """
+    places = _places(scenario, folder)
+    check_free(folder, scenario.ticks * len(places), scenario.has_inner)
+    if scenario.parts:
+        benches = compiled_benches(scenario, notice, (role,))
+    else:
+        benches = [compiled_bench(scenario, notice, (role,))]
+    for place in places.values():
+        place.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    with ExitStack() as stack:
+        for place in places.values():
+            stack.enter_context(in_use(place))
+        stack.enter_context(cut_short(folder))
+        run_role(role, scenario, folder, dict(endpoints), notice, external)
+        wall_s = time.monotonic() - began
+        runs = {
+            name: finish(bench.scenario, place, bench.controller.labels, wall_s, report)
+            for bench, (name, place) in zip(benches, places.items(), strict=True)
+        }
+    if not scenario.parts:
+        return runs[""]
+    whole = NetworkRun(scenario, runs, folder)
+    whole.conclude(folder, report)
+    return whole
+
+
+def run_part(
+    role: Role,
+    scenario: Scenario,
+    folder: Path,
+    endpoints: Mapping[str, str],
+    external: ExternalController | PilController | None,
+) -> None:
+    """Run one side in the folder of a run that another process has started and completes."""
+    with ExitStack() as stack:
+        for place in _places(scenario, folder).values():
+            stack.enter_context(in_use(place))
+        run_role(role, scenario, folder, dict(endpoints), lambda text: None, external)
+
+
+def _places(scenario: Scenario, folder: Path) -> dict[str, Path]:
+    """The run folder of each converter, "" for the only one of a scenario without a network."""
+    return {name: folder / name for name in scenario.parts} or {"": folder}
 
 
 def _run_here(

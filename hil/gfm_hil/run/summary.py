@@ -18,10 +18,10 @@ from gfm_hil.recording.columns import INSTRUCTIONS, Columns, Rows, pieces
 from gfm_hil.recording.log import Outcome, cause
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.recording.timing import ROUND_TRIP, Spread, count_misses
-from gfm_hil.results.doctor import verdict
-from gfm_hil.results.metrics import event_metrics
-from gfm_hil.results.modes import acting, free_from
-from gfm_hil.results.ripple import remaining_ripple
+from gfm_hil.run.doctor import verdict
+from gfm_hil.run.metrics import event_metrics
+from gfm_hil.run.modes import acting, free_from
+from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.scenario.expectation import reason_name, unmet
 from gfm_hil.scenario.model import Scenario
 from gfm_runtime import law_titles, load_law

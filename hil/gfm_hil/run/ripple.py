@@ -21,7 +21,7 @@ from scipy.fft import next_fast_len
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.results.cycles import hann
+from gfm_hil.run.cycles import hann
 from gfm_hil.scenario.events import Fault, GridUnbalance
 from gfm_hil.scenario.model import Scenario
 

@@ -1,8 +1,8 @@
-"""A model in place of the kernel: the controller's ticks, with u from another program.
+"""The controller's ticks with u from an external program in place of the kernel.
 
 The protocol of a tick, the references, the checks of y and u and the recording are the controller's
-own. Only u comes from the model, by a call from Python. A model that runs the run's own laws also
-gets its changes of law.
+own. Only u comes from the external controller, by a call from Python. One that runs the run's own
+laws also gets its changes of law.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from numba import typeof, types
 from numpy.typing import NDArray
 
+from gfm_hil.controllers import ControllerError, ExternalController
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.engine.controller_ticks import receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
 from gfm_hil.engine.retune import Retuned, ready_gains
-from gfm_hil.models import Model, ModelError
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.scenario.events import Gains, LawChange
 from gfm_runtime.assembly import Controller
@@ -29,53 +29,55 @@ from gfm_runtime.signals import NY
 from gfm_runtime.states import READY, RUNNING, SAFE
 
 if TYPE_CHECKING:
+    from gfm_hil.controllers import PilController
     from gfm_hil.engine.timeline import Timeline
-    from gfm_hil.models import PilModel
 
 REFUSED, ACCEPTED, RESTARTED = range(3)
 _COUNT = kept_of("controller").index("instructions")
 _LAW, _X = NY, NY + 2  # columns of the controller's recording that only a law fills
 
 
-class SteppedModel:
-    """A model that is stepped tick by tick, and watched.
+class SteppedController:
+    """An external controller that is stepped tick by tick, and watched.
 
     Args:
-        model: not yet started.
-        controller: at rest; its laws are those of a model that runs ours.
+        external: not yet started.
+        controller: at rest; its laws are those of an external one that runs ours.
         u: where the outputs begin, p.u.
         changed: the laws with other gains that the scenario's events ask for, as ``retuned``
             gives them.
 
     Raises:
-        gfm_hil.models.ModelError: it refuses to start.
+        gfm_hil.controllers.ControllerError: it refuses to start.
         UserError: a program for the laws cannot be built, or does not start.
     """
 
     def __init__(
         self,
-        model: Model | PilModel,
+        external: ExternalController | PilController,
         controller: Controller,
         u: NDArray[np.float64],
         changed: Sequence[Retuned] = (),
     ) -> None:
-        from gfm_hil.models import PilModel  # brings the compilers in, which few runs need
+        from gfm_hil.controllers import (
+            PilController,  # brings the compilers in, which few runs need
+        )
 
-        self.name = model.name
+        self.name = external.name
         self.abandoned = False
         self.last_words: Callable[[], None] = lambda: None
         self._u, self._start = u.copy(), u.copy()
-        self._foreign: Model | None = None
-        self._ours: PilModel | None = None
-        if isinstance(model, PilModel):
-            self._ours = model
+        self._foreign: ExternalController | None = None
+        self._ours: PilController | None = None
+        if isinstance(external, PilController):
+            self._ours = external
         else:
-            self._foreign = model
+            self._foreign = external
         self._began, self._tick = 0, 0  # of the call in progress, ns; 0 if there is none
         self._calls: tuple[Any, ...] = ()
         if self._ours is not None:
             self._ours.begin(controller, changed)
-        self._start_model()
+        self._start_external()
 
     @property
     def has_laws(self) -> bool:
@@ -83,7 +85,7 @@ class SteppedModel:
         return self._ours is not None
 
     def check(self, event: object, controller: Controller) -> None:
-        """Refuse an event that the model cannot follow.
+        """Refuse an event that the external controller cannot follow.
 
         Raises:
             ValueError: why.
@@ -98,13 +100,13 @@ class SteppedModel:
             )
 
     def close(self) -> None:
-        """End the model: one that is not ours only if it still answers."""
+        """End the external controller: one that is not ours only if it still answers."""
         if self._ours is not None:
             self._ours.close()
         elif self._foreign is not None and not self.abandoned:
             self._foreign.close()
 
-    def _start_model(self) -> None:
+    def _start_external(self) -> None:
         if self._ours is not None:
             self._ours.start()
         elif self._foreign is not None:
@@ -115,16 +117,16 @@ class SteppedModel:
         went on.
 
         Raises:
-            gfm_hil.models.ModelError: it refuses, or runs our laws, which its program starts from
-                rest only.
+            gfm_hil.controllers.ControllerError: it refuses, or runs our laws, which its program
+                starts from rest only.
         """
         if ctl["joins"][0]:
             ctl["joins"] = 0
             if self._ours is not None:
-                raise ModelError(f"{self.name}: cannot join a network that goes on")
+                raise ControllerError(f"{self.name}: cannot join a network that goes on")
             self._start[:] = 0.0
             measured(y, self._start)
-        self._start_model()
+        self._start_external()
 
     def _find_u(self, changed: int, ref: NDArray[np.float64], records: Records) -> None:
         if self._ours is not None:
@@ -139,7 +141,7 @@ class SteppedModel:
         """As ``controller_ticks``.
 
         Raises:
-            gfm_hil.models.ModelError: the model fails.
+            gfm_hil.controllers.ControllerError: the external controller fails.
         """
         ctl, u, given = controller.ctl, self._u, (end, records, controller)
         if not self._calls:
@@ -171,7 +173,8 @@ class SteppedModel:
                 return ReturnReason(why)
 
     def watch(self, timeline: Timeline, patience_s: float) -> None:
-        """End the run if the model has not answered for that long; another thread calls this.
+        """End the run if the external controller has not answered for that long; another thread
+        calls this.
 
         Raises:
             PeerLost: it has not.
@@ -189,7 +192,7 @@ class SteppedModel:
 @compiled
 def receive_tick(end, records, controller, event, has_laws):
     """Wait for a tick and take its y: why to return, whether u is to be computed, and the law to
-    change to before, of a model that ``has_laws``; -1 for none."""
+    change to before, of an external controller that ``has_laws``; -1 for none."""
     ctl = controller.ctl
     why = receive(end, records, records.loop[0], ctl, event, 0)
     if why != ReturnReason.GO_ON:

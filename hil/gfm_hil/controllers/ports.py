@@ -1,4 +1,4 @@
-"""Which signal each port of a model is: by their names, or by a map in a TOML file."""
+"""Which signal each port of a controller is: by their names, or by a map in a TOML file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gfm_runtime.signals import carried, command_rows, names
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 #: the groups that an FMU of ours puts before its names
 _GROUP = re.compile(r"^(ref|y|u)\.")
-#: an output of our own models: 0, or why the bridge must be blocked
+#: an output of our own controllers: 0, or why the bridge must be blocked
 REASON = "reason"
 
 
@@ -47,9 +47,9 @@ class PortMap(_Strict):
         inputs: by port, a signal of the references or measurements, or a constant.
         outputs: by port, a signal of u.
         fixed: by signal of u that no port gives, its value, p.u.
-        parameters: by parameter of the model, its value.
+        parameters: by parameter of the controller, its value.
         blocks: an output that is not 0 when the bridge must be blocked.
-        step_s: time between two steps of the model, s; by default what it says itself.
+        step_s: time between two steps of the controller, s; by default what it says itself.
     """
 
     inputs: dict[str, str | _Number | Scaled] = {}
@@ -79,8 +79,8 @@ def read_map(file: Path | None) -> PortMap:
 
 
 @dataclass(frozen=True)
-class Wiring:
-    """The map of a model's ports, made for a run.
+class PortWiring:
+    """The map of a controller's ports, made for a run.
 
     Attributes:
         constants: shape (inputs,), what a port gets that has no signal.
@@ -122,8 +122,8 @@ class Wiring:
 
 def wire(
     where: str, ports: PortMap, inputs: Sequence[str], outputs: Sequence[str], inner: bool
-) -> Wiring:
-    """Map a model's ports, which are in its order, to the signals of a run.
+) -> PortWiring:
+    """Map a controller's ports, which are in its order, to the signals of a run.
 
     Raises:
         UserError: a port or a signal that is not there, a port without a signal, or a signal of u
@@ -165,7 +165,7 @@ def wire(
         )
     (ports_in, signals, scales), (sources, targets, units) = map(_columns, (into, out))
     place = -1 if blocks is None else list(outputs).index(blocks)
-    return Wiring(constants, ports_in, signals, scales, sources, targets, units, fixed, place)
+    return PortWiring(constants, ports_in, signals, scales, sources, targets, units, fixed, place)
 
 
 _Column = NDArray[np.int64]

@@ -1,8 +1,8 @@
 """A real-code model of the interface of IEEE and CIGRE (CIGRE TB 958) as a controller.
 
 The structures are those of the interface's header, version 2, with natural alignment. Ports may
-have any width and any type of number; models that leave out FirstCall, CheckParameters or Terminate
-are loaded too.
+have any width and any type of number; real-code models that leave out FirstCall, CheckParameters
+or Terminate are loaded too.
 """
 
 from __future__ import annotations
@@ -14,15 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers.external import (
+    BenchContext,
+    ControllerError,
+    MappedController,
+    run_name,
+    ticks_a_step,
+)
+from gfm_hil.controllers.ports import PortMap, wire
 from gfm_hil.core.errors import UserError
-from gfm_hil.models.model import BenchContext, ModelError, Wired, run_name, ticks_a_step
-from gfm_hil.models.ports import PortMap, wire
 
 _EMT, _ERROR = 1, 2
 #: DataType: numpy's type; 10 is text
 _TYPES = {1: "i1", 2: "i1", 3: "u1", 4: "i2", 5: "u2", 6: "i4", 7: "u4", 8: "f4", 9: "f8"}
 _TEXT = 10
-_MOST = 10_000  # ports, parameters or states of a model that is one
+_MOST = 10_000  # ports, parameters or states of a real-code model
 
 
 class _Signal(c.Structure):
@@ -44,7 +50,7 @@ class _Parameter(c.Structure):
     )  # fmt: skip
 
 
-class _ModelInfo(c.Structure):
+class _Info(c.Structure):
     _fields_ = (
         ("DLLInterfaceVersion", c.c_uint8 * 4),
         *((name, c.c_char_p) for name in (
@@ -101,12 +107,12 @@ class _Values:
         return self._views[self.names.index(name)]
 
 
-class DllModel(Wired):
-    """A model in a shared library of Linux.
+class DllController(MappedController):
+    """A controller in a shared library of Linux.
 
     Args:
         path: of the library.
-        ports, context: as for ``open_model``.
+        ports, context: as for ``open_controller``.
 
     Raises:
         UserError: it cannot be loaded, has not the interface, or its ports do not fit.
@@ -126,7 +132,7 @@ class DllModel(Wired):
                 raise UserError(
                     f"{path}: has no function {needed}, so it is no real-code model{other}"
                 )
-        self._of.Model_GetInfo.restype = c.POINTER(_ModelInfo)
+        self._of.Model_GetInfo.restype = c.POINTER(_Info)
         info = self._of.Model_GetInfo().contents
         if info.DLLInterfaceVersion[0] != 1:
             version = ".".join(map(str, info.DLLInterfaceVersion))
@@ -160,7 +166,7 @@ class DllModel(Wired):
         )  # fmt: skip
 
     def start(self, u: NDArray[np.float64]) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         self._ticks = 0
         for states in self._states:
             states[:] = 0
@@ -177,7 +183,7 @@ class DllModel(Wired):
         return self._out.read()
 
     def close(self) -> None:
-        """See ``Model``."""
+        """See ``ExternalController``."""
         if hasattr(self._of, "Model_Terminate"):
             self._of.Model_Terminate(c.byref(self._now))
 
@@ -185,7 +191,7 @@ class DllModel(Wired):
         self._now.LastErrorMessage = None
         if getattr(self._of, name)(c.byref(self._now)) == _ERROR:
             said = _text(self._now.LastErrorMessage) or "it does not say why"
-            raise ModelError(f"{self.name}: {name} failed: {said}")
+            raise ControllerError(f"{self.name}: {name} failed: {said}")
 
 
 def _text(said: bytes | None) -> str:
@@ -196,7 +202,7 @@ def _fields(ports: Any, count: int) -> list[tuple[str, int, int]]:
     return [(_text(ports[k].Name), ports[k].DataType, ports[k].Width) for k in range(count)]
 
 
-def _parameters(where: str, info: _ModelInfo, ports: PortMap) -> _Values:
+def _parameters(where: str, info: _Info, ports: PortMap) -> _Values:
     """The parameters at their defaults, or at the map's values."""
     rows = [info.ParametersInfo[k] for k in range(info.NumParameters)]
     values = _Values(where, [(_text(row.Name), row.DataType, 1) for row in rows])

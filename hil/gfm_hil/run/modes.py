@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.results.cycles import cycle_means, cycle_ticks, hann, whole_ticks
+from gfm_hil.run.cycles import cycle_means, cycle_ticks, hann, whole_ticks
 from gfm_hil.scenario.events import FaultClear, GridFrequency, GridVoltage, Reference
 from gfm_hil.scenario.model import Scenario
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
+from gfm_hil.controllers import BenchContext, open_controller, read_map
+from gfm_hil.controllers.ports import PortMap, wire
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
-from gfm_hil.models import BenchContext, open_model, read_map
-from gfm_hil.models.ports import PortMap, wire
-from gfm_hil.results import runner
-from gfm_hil.results.run import Run
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
 from gfm_hil.scenario.model import load_scenario
 from gfm_plant import plant_sample
 from gfm_runtime.inner import settle
@@ -309,7 +309,7 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
 def test_a_file_that_is_no_model_is_refused(model: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "text").write_text("no model")
     with pytest.raises(UserError, match=message):
-        open_model(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
+        open_controller(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
 
 
 @pytest.mark.attack(
@@ -337,7 +337,7 @@ def test_an_fmu_is_unpacked_within_limits(
         "description": "modelDescription.xml has 41943040 bytes, more than 33554432",
     }[kind]
     with pytest.raises(UserError, match=f"{file}: is no FMU that FMPy reads: {said}"):
-        open_model(f"fmu:{file}", PortMap(), BenchContext())
+        open_controller(f"fmu:{file}", PortMap(), BenchContext())
     assert not [path for path in scratch.rglob("*") if path.is_file()]
     attack_now("refused before it is unpacked")
 

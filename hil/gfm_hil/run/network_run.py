@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.recording.run import read_scenario
-from gfm_hil.results.run import Run
-from gfm_hil.results.run_folder import recover
+from gfm_hil.recording.columns import Columns
+from gfm_hil.recording.run import Run, read_scenario
+from gfm_hil.run.run_folder import Report, recover, save
 from gfm_hil.scenario.model import Scenario
 from gfm_hil.scenario.toml_out import write_scenario
 
@@ -33,6 +33,10 @@ class NetworkRun(Mapping[str, Run]):
     scenario: Scenario
     runs: dict[str, Run]
     folder: Path | None = None
+
+    if TYPE_CHECKING:  # functions of rooms further up, which ``gfm_hil.api.runs`` adds
+        plot: ClassVar[Callable[..., list[Axes]]]
+        save: ClassVar[Callable[..., Path]]
 
     def __getitem__(self, converter: str) -> Run:
         if converter not in self.runs:
@@ -68,62 +72,30 @@ class NetworkRun(Mapping[str, Run]):
         """The metrics of each run by converter, see ``Run.metrics``."""
         return {name: run.metrics for name, run in self.items()}
 
-    def plot(self) -> list[Axes]:
-        """p, frequency, q and v_dc of all converters in one figure."""
-        from matplotlib import pyplot
-
-        from gfm_hil.results import figures
-
-        figure = pyplot.figure(figsize=figures.SIZE_LAWS, layout="constrained")
-        return figures.draw_laws(figure, self.scenario, self._columns(), self._events())
-
-    def save(self, folder: str | Path) -> Path:
-        """Write a folder with the run folder of each converter, and a figure of all; returns it.
-
-        Raises:
-            UserError: the folder holds something already, or cannot be written.
-        """
-        folder = Path(folder)
-        if folder.exists() and any(folder.iterdir()):
-            raise UserError(f"{folder}: is not empty; choose another folder")
-        for name, run in self.items():
-            run.save(folder / name)
-        try:
-            write_scenario(folder, self.scenario)
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem.strerror}") from None
-        self.conclude(folder)
-        return folder
-
-    def conclude(self, folder: Path, figures: bool = True) -> None:
+    def conclude(self, folder: Path, report: Report | None = None) -> None:
         """Write what the runs share into a folder that has theirs and the scenario.
 
         Raises:
             UserError: the folder cannot be written.
         """
         try:
-            if figures and any(run.ticks for run in self.values()):
-                from gfm_hil.results.diagram import draw_diagram
-                from gfm_hil.results.figures import draw_comparison
-
-                path = folder / "converters.png"
-                draw_comparison(path, self.scenario, self._columns(), self._events())
-                draw_diagram(folder, self.scenario)
+            if report is not None and any(run.ticks for run in self.values()):
+                report(replace(self, folder=folder))
             write_text(folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
     @classmethod
-    def recover(cls, folder: Path) -> NetworkRun:
+    def recover(cls, folder: Path, report: Report | None = None) -> NetworkRun:
         """Complete the folder of a network whose run was cut off, converter by converter.
 
         Raises:
             UserError, Unfinished: as ``run_folder.recover``.
         """
         scenario = read_scenario(folder)
-        runs = {name: recover(place) for name, place in _places(folder, scenario).items()}
+        runs = {name: recover(place, report) for name, place in _places(folder, scenario).items()}
         found = cls(scenario, runs, folder)
-        found.conclude(folder)
+        found.conclude(folder, report)
         return found
 
     @classmethod
@@ -140,10 +112,13 @@ class NetworkRun(Mapping[str, Run]):
         runs = {name: Run.load(place) for name, place in _places(folder, scenario).items()}
         return cls(scenario, runs, folder)
 
-    def _columns(self) -> dict[str, Any]:
+    @property
+    def columns(self) -> dict[str, Columns]:
+        """The columns of each run."""
         return {name: run.columns for name, run in self.items()}
 
-    def _events(self) -> list[dict[str, Any]]:
+    @property
+    def events(self) -> list[dict[str, Any]]:
         """What happened, of each converter and once for what they all saw."""
         found: dict[tuple[int, str], dict[str, Any]] = {}
         for run in self.values():
@@ -167,3 +142,26 @@ def _places(folder: Path, scenario: Scenario) -> dict[str, Path]:
         if place.is_symlink() or place.parent != folder or name == "..":
             raise UserError(f"{place}: is not a folder in {folder}")
     return places
+
+
+def save_network(
+    run: NetworkRun,
+    folder: str | Path,
+    report: Report | None = None,
+) -> Path:
+    """Write a folder with the run folder of each converter, and a figure of all; returns it.
+
+    Raises:
+        UserError: the folder holds something already, or cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder}: is not empty; choose another folder")
+    for name, one in run.items():
+        save(one, folder / name, report)
+    try:
+        write_scenario(folder, run.scenario)
+    except OSError as problem:
+        raise UserError(f"{folder}: {problem.strerror}") from None
+    run.conclude(folder, report)
+    return folder

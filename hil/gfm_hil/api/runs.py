@@ -1,0 +1,244 @@
+"""Runs: of one converter, of a network, of several laws side by side; in memory or in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.compiling import compile_external
+from gfm_hil.engine.processes import Progress
+from gfm_hil.recording.run import Run, converters_of
+from gfm_hil.results.plots import plot, plot_laws, plot_network, plot_waveforms
+from gfm_hil.results.report import write_report
+from gfm_hil.run import run_folder, runner
+from gfm_hil.run.network_run import NetworkRun, save_network
+from gfm_hil.run.runner import Notice
+from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
+from gfm_hil.studies.law import Law, law_files
+
+__all__ = [
+    "Comparison", "NetworkRun", "Run", "compare", "load_run", "merge", "recover", "run",
+    "run_network", "save",
+]  # fmt: skip
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def save(run: Run | NetworkRun, folder: str | Path) -> Path:
+    """Write the run folder, with figures and report, or that of a network; returns it.
+
+    A law that was an object is there as ``law.toml``, which the scenario names.
+
+    Raises:
+        UserError: the folder holds something already, or cannot be written.
+    """
+    if isinstance(run, NetworkRun):
+        return save_network(run, folder, write_report)
+    return run_folder.save(run, folder, write_report)
+
+
+# what a run does by functions of rooms above its own
+Run.plot, Run.plot_waveforms, Run.save = plot, plot_waveforms, save
+NetworkRun.plot, NetworkRun.save = plot_network, save
+
+
+def _silent(*_: object) -> None:
+    """Neither progress nor notices."""
+
+
+def run(
+    scenario: str | Path | Scenario | dict[str, Any],
+    law: str | Path | Law | None = None,
+    folder: str | Path | None = None,
+    *,
+    controller: str | None = None,
+    ports: str | Path | None = None,
+    figures: bool = True,
+    progress: Progress = _silent,
+    notice: Notice = _silent,
+    **changes: Any,
+) -> Run:
+    """Run a scenario.
+
+    Without a folder it runs in this process, in lockstep, and the result stays in memory. With one
+    it runs as ``gfmhil run`` does: over the scenario's link and in its mode, and leaves a run
+    folder.
+
+    Args:
+        scenario: name of a shipped one, path of a file, content of a file, or a checked scenario.
+        law: name, law file or ``Law``; the scenario's own if None.
+        folder: run folder, new or empty; None for a run in memory.
+        controller: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, which computes u in place of the law;
+            or ``pil:TARGET``, the law on a processor in QEMU. It takes a folder and a link.
+        ports: file of the map of its ports.
+        figures: in the folder, figures and report.html.
+        progress: is called with the ticks done and the misses so far; with a folder.
+        notice: is called with a line for a person who waits; with a folder.
+        changes: keys of the scenario with ``__`` for the dot, e.g. ``duration=2.0`` [s],
+            ``plant__factors__L_g=2.0``.
+
+    Raises:
+        UserError: one line a mistake; or the scenario has no operating point.
+        LawError: the law is none.
+    """
+    if folder is not None:
+        if isinstance(law, Law):
+            raise UserError(f"law = {law!r}: save it first, as the folder names its file")
+        checked = _checked(scenario, {**changes, "law": law})
+        command = _external_command(checked, controller, ports, notice)
+        report = write_report if figures else None
+        return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
+    if controller is not None or ports is not None:
+        raise UserError("controller, ports: take a folder")
+    with law_files([] if law is None else [law]) as files:
+        for file in files.values():
+            changes = {**changes, "law": file}
+        made = runner.run_in_memory(_checked(scenario, changes, in_process=True))
+    return _named(made, law) if isinstance(law, Law) else made
+
+
+def run_network(
+    scenario: str | Path | Scenario | dict[str, Any],
+    folder: str | Path | None = None,
+    *,
+    figures: bool = True,
+    progress: Progress = _silent,
+    notice: Notice = _silent,
+    **changes: Any,
+) -> NetworkRun:
+    """Run a scenario with several converters; arguments as for ``run``.
+
+    Raises:
+        UserError: one line a mistake; it has no network; or no operating point.
+    """
+    checked = _checked(scenario, changes, in_process=folder is None)
+    if checked.network is None:
+        raise UserError("network: the scenario has none; use gfmhil.run")
+    if folder is None:
+        return runner.run_network_in_memory(checked)
+    report = write_report if figures else None
+    return runner.run_network(checked, Path(folder), progress, notice, report)
+
+
+def _checked(
+    scenario: str | Path | Scenario | dict[str, Any],
+    changes: dict[str, Any],
+    in_process: bool = False,
+) -> Scenario:
+    """The scenario with its changes; one that is checked and stays as it is takes no time."""
+    if (
+        isinstance(scenario, Scenario)
+        and not in_process
+        and all(value is None for value in changes.values())
+    ):
+        return scenario
+    return load_scenario(scenario, in_process=in_process, **changes)
+
+
+def _named(made: Run, law: Law) -> Run:
+    """The run of a ``Law``: its name in place of its temporary file, and its text."""
+    scenario = made.scenario.model_copy(update={"law": law.name})
+    return replace(made, scenario=scenario, law_text=law.to_toml())
+
+
+def _external_command(
+    scenario: Scenario, controller: str | None, ports: str | Path | None, notice: Notice
+) -> list[str]:
+    """The program that steps an external controller; empty without one.
+
+    Raises:
+        UserError: there is no such controller or map, or the run is in process, has no operating
+            point, or does not carry what it measures.
+    """
+    if controller is None:
+        if ports is not None:
+            raise UserError("ports: are of an external controller; name it as controller")
+        return []
+    if scenario.link.type == INPROC:
+        raise UserError("controller: is a process, and a run in process has none; choose a link")
+    real = precision(controller)
+    if not controller.startswith(PIL):
+        controller_file(controller, FORMS)
+    places = None if ports is None else Path(ports)
+    read_map(places)
+    check_currents(controller, scenario.has_inner)
+    compile_external(scenario, notice, real)
+    return runner.external_command(controller, places)
+
+
+def load_run(folder: str | Path) -> Run:
+    """A run from its folder, see ``Run.load``."""
+    return Run.load(folder)
+
+
+def recover(folder: str | Path) -> Run | NetworkRun:
+    """Complete the folder of a run that a kill, a power failure or a full disk cut off; leave one
+    that is complete as it is.
+
+    Raises:
+        UserError: it is no run folder, the run is still going on, its recording is gone, or a file
+            is none of a run.
+    """
+    folder = Path(folder)
+    if converters_of(folder):
+        return NetworkRun.recover(folder, write_report)
+    return run_folder.recover(folder, write_report)
+
+
+def merge(first: str | Path, second: str | Path, folder: str | Path) -> Run:
+    """One run folder of the two that the sides of a run leave if they were started apart.
+
+    Raises:
+        UserError: a folder is not that of one side, they are not of the same run or of the same
+            converter, or ``folder`` is in use or cannot be written.
+    """
+    return run_folder.merge_roles(Path(first), Path(second), Path(folder), write_report)
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Mapping[str, Run]):
+    """Runs of one scenario by the name of their law."""
+
+    runs: dict[str, Run]
+
+    def __getitem__(self, law: str) -> Run:
+        return self.runs[law]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.runs)
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    @property
+    def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """The metrics of each run by law, see ``Run.metrics``."""
+        return {law: one.metrics for law, one in self.runs.items()}
+
+    def plot(self) -> list[Axes]:
+        """p, frequency, q and v_dc of all laws in one figure."""
+        return plot_laws(self.runs)
+
+    def __repr__(self) -> str:
+        lines = [f"  {law}: {one.status}" for law, one in self.runs.items()]
+        return "\n".join(["<Comparison", *lines, ">"])
+
+
+def compare(
+    scenario: str | Path | Scenario | dict[str, Any],
+    laws: Sequence[str | Path | Law],
+    **changes: Any,
+) -> Comparison:
+    """Run a scenario under several laws; arguments and errors as for ``run``."""
+    if not laws:
+        raise UserError("laws: name some laws to compare")
+    with law_files(laws) as files:
+        names = [*files]
+    return Comparison(
+        {name: run(scenario, law, **changes) for name, law in zip(names, laws, strict=True)}
+    )
