@@ -16,7 +16,7 @@ import numpy as np
 
 from gfm_hil.engine.inproc import CHUNK, rows, run_ticks, stack
 from gfm_hil.engine.setup import make_benches
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 
 
 class Case:

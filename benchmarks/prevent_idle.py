@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 WAYS = ("never", "always")
 

@@ -15,7 +15,7 @@ import numpy as np
 from gfm_hil.controllers import PilController
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.realtime.priority import one_processor
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_runtime.firmware import TARGETS
 
 TICKS, ROUNDS = 5_000, 8

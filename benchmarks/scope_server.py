@@ -27,8 +27,7 @@ from gfm_hil.engine.inproc import compile_loop, run_inproc
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.model import check_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import check_scenario, scenario_toml
 
 TRACES = ("p", "q", "V", "omega_u", "v_dc")
 BINS = 900  # as a page on a desk asks for

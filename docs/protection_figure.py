@@ -16,7 +16,7 @@ import numpy as np
 from _figures.common import FIGURES, GREY
 
 from gfm_hil.run.runner import Run, run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 T_S = 1e-3  # s, so that the pause is what is late here and nothing else
 STEP, PAUSE_AT, PAUSE = 60, 64, 0.0125  # ticks, frames, s

@@ -18,8 +18,8 @@ from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE
 from gfm_hil.cli.main import parser
 from gfm_hil.links.can import CanOptions
 from gfm_hil.realtime.priority import PRIORITY
-from gfm_hil.scenario.model import PEER_TIMEOUT_S
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import toml_text
+from gfm_hil.scenario.schema import PEER_TIMEOUT_S
 
 pytestmark = pytest.mark.processes
 

@@ -24,7 +24,7 @@ from typing import Any
 import pytest
 import zmq
 
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import toml_text
 
 UNITS = Path(__file__).resolve().parents[1] / "deploy" / "systemd"
 ROLES = ("controller", "plant")

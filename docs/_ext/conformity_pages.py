@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 from _ext.scenario_pages import table
 
 from gfm_hil.core.terminal import markdown
 from gfm_hil.studies.conformity import model
+from gfm_hil.studies.conformity.criteria import BY_KIND
 from gfm_hil.studies.conformity.sets import load_cases
+from gfm_hil.studies.conformity.under_test import UnderTest
 
 
 def tests() -> str:
@@ -28,9 +28,9 @@ def keys() -> str:
     """The tables of a test file and of a converter under test."""
     tables = (
         ("top level", model.Test),
-        ("[source]", model.Source),
-        ("[[parts]]", model.Part),
-        ("the file of the converter under test", model.UnderTest),
+        ("[source]", model.Publication),
+        ("[[parts]]", model.TestPart),
+        ("the file of the converter under test", UnderTest),
     )
     return "\n".join(
         f"**{f'`{title}`' if title[0] == '[' else title}**\n\n{table(of)}\n" for title, of in tables
@@ -39,11 +39,9 @@ def keys() -> str:
 
 def criteria() -> str:
     """One table a kind of criterion; ``clause`` and ``at`` are common to all."""
-    kinds = get_args(get_args(model.Criterion)[0])
     common = ("kind", "clause", "at", "window")
     text = []
-    for kind in kinds:
-        (name,) = get_args(kind.model_fields["kind"].annotation)
+    for name, kind in BY_KIND.items():
         words = " ".join((kind.__doc__ or "").split())
         own = [key for key in kind.model_fields if key not in common]
         text.append(f"**`{name}`** — {words}\n")

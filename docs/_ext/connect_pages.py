@@ -16,7 +16,7 @@ from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links import ring
 from gfm_hil.links.frame import DATA_IDS, MAGIC, FrameWriter, frame_dtype
 from gfm_hil.links.shm import segment
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_runtime.signals import TABLE_VERSION, Vector, group, table_hash
 from gfm_runtime.states import REASONS, RUNNING, STATES
 

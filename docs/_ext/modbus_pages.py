@@ -8,7 +8,7 @@ from gfm_hil.ports.modbus.droops import LawDroops
 from gfm_hil.ports.modbus.image import SunSpecPoint, definition
 from gfm_hil.ports.modbus.run_state import RunState, Slack
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_runtime import law_names
 from gfm_runtime.states import RUNNING
 

@@ -12,7 +12,7 @@ from unittest import mock
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_runtime import LawError, discretise, get_law
 
 DOCS = Path(__file__).resolve().parents[1]

@@ -11,8 +11,10 @@ from pydantic.fields import FieldInfo
 
 from gfm_hil.core.terminal import markdown
 from gfm_hil.links.impaired import Impairment
-from gfm_hil.scenario import events
-from gfm_hil.scenario import model as scenario
+from gfm_hil.scenario import schema as scenario
+from gfm_hil.scenario.events import EVENTS
+from gfm_hil.scenario.events.base import Event
+from gfm_hil.scenario.events.breaker import SynchroCheck
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
 from gfm_runtime import inner_file, lawfile
@@ -40,8 +42,8 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[plant.protection]", options.Protection),
 )
 NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
-    ("[network]", scenario.Members),
-    ("[network.converters.NAME]", scenario.Member),
+    ("[network]", scenario.NetworkSettings),
+    ("[network.converters.NAME]", scenario.NetworkConverter),
     ("[network.lines.NAME]", options.Line),
     ("[network.transformers.NAME]", options.Transformer),
     ("[network.loads.NAME]", options.Load),
@@ -49,10 +51,9 @@ NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[network.capacitors.NAME]", options.CapacitorBank),
     ("[network.machines.NAME]", options.Machine),
 )
-CHECK = ("check", events.SynchroCheck)
+CHECK = ("check", SynchroCheck)
 OVERLOAD = ("[[plant.protection.overload]]", options.Overload)
 TRIP = ("one protection, e.g. [plant.protection.over_current]", options.Trip)
-EVENTS = get_args(get_args(events.Event)[0])
 LAW_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("top level", lawfile.LawFile),
     ("[error_map]", lawfile.ErrorMapSpec),
@@ -160,9 +161,8 @@ def end_reasons() -> str:
 
 def event_tables() -> str:
     """Every kind of event."""
-    lines = ["All events:", "", table(events._Event), ""]
-    for model in EVENTS:
-        kind = get_args(model.model_fields["type"].annotation)[0]
+    lines = ["All events:", "", table(Event), ""]
+    for kind, model in EVENTS.items():
         lines += [f'**`type = "{kind}"`** {inspect.cleandoc(model.__doc__ or "")}', ""]
         lines += [table(model, ("type", "t", "tick")), ""]
     return "\n".join(lines)

@@ -15,7 +15,7 @@ from gfm_design.model.linear import Mode
 from gfm_hil.core.terminal import markdown
 from gfm_hil.results.figures import dress as dress
 from gfm_hil.run.runner import run_in_memory as run  # noqa: F401
-from gfm_hil.scenario.model import Scenario, check_scenario, find_scenario
+from gfm_hil.scenario import Scenario, check_scenario, find_scenario
 from gfm_plant import Plant
 from gfm_runtime import get_law
 

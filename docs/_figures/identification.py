@@ -8,8 +8,8 @@ from matplotlib import pyplot
 from matplotlib.figure import Figure
 
 from gfm_hil.results.figures import COLOURS
-from gfm_hil.studies.envelopes import measure_unit, phase_jump
-from gfm_hil.studies.identification import identify
+from gfmhil import plot, scan
+from gfmhil.envelopes import measure_unit, phase_jump
 
 _LAWS, _STAGES = ("vsg-2", "droop-5", "mimo-gfm"), ("none", "virtual-stator", "cascaded")
 _SHOWN = ("vsg-2", "virtual-stator")
@@ -22,24 +22,24 @@ def identification() -> None:
     for law in _LAWS:
         cells = [law]
         for stage in _STAGES:
-            found = identify(law, inner=stage)
+            found = scan(law, inner=stage)
             dev = found.deviation
             assert dev is not None
             k = int(np.argmax(dev))
             cells.append(f"{number(100 * dev[k], 2)} % at {found.frequency[k]:.3g} Hz")
             if (law, stage) == _SHOWN:
                 for name, draw in (
-                    ("admittance", found.plot),
-                    ("passivity", found.plot_passivity),
-                    ("nfp", found.plot_nfp),
+                    ("admittance", plot.admittance),
+                    ("passivity", plot.passivity),
+                    ("nfp", plot.nfp),
                 ):
-                    draw()
+                    draw(found)
                     pyplot.savefig(FIGURES / f"identification_{name}.png", dpi=110)
                     pyplot.close()
         rows.append(cells)
     write_table("identification", ["law", *_STAGES], rows)
-    wide = identify(*_SHOWN[:1], inner=_SHOWN[1], start_hz=0.3, stop_hz=4500.0, points=80)
-    wide.plot_nyquist(1.5, 10.0)
+    wide = scan(*_SHOWN[:1], inner=_SHOWN[1], start_hz=0.3, stop_hz=4500.0, points=80)
+    plot.nyquist_on_grid(wide, 1.5, 10.0)
     pyplot.savefig(FIGURES / "identification_nyquist.png", dpi=110)
     pyplot.close()
 

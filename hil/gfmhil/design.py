@@ -1,12 +1,15 @@
 """The design of a law: its gamma, gains for the least gamma, its margins, and its network."""
 
 from gfm_design.margins.all_margins import Margins, UnstableLoop
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.network import NetworkLoop
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import Weight
-from gfm_hil.studies.design import Gamma, NotTuned, Tuning, gamma, margins, tune
-from gfm_hil.studies.network_loop import NetworkLoop, network_loop
+from gfm_hil.api.design import Gamma, NotTuned, Tuning, gamma, margins, tune
+from gfm_hil.studies.linear_loop import network_loop
 
 __all__ = [
+    "ClosedLoop",
     "Gamma",
     "Margins",
     "NetworkLoop",

@@ -1,5 +1,6 @@
 """Envelopes of a grid-forming unit's answer, and the unit that a law makes of a converter."""
 
+from gfm_hil.api.studies import measure_unit
 from gfm_hil.studies.envelopes import (
     Envelope,
     Tolerance,
@@ -7,7 +8,6 @@ from gfm_hil.studies.envelopes import (
     amplitude_step,
     fit_jump,
     fit_ramp,
-    measure_unit,
     phase_jump,
     rocof,
     rocof_response,

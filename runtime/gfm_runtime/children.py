@@ -17,14 +17,17 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # a guard starts quickly without it
+    import subprocess
 
 GRACE_S = 2.0
 """Time in which a program behind a guard may end by itself once its parent has ended, s."""
-END_NOW = signal.SIGUSR1
-"""Has a guard kill its program and all that it has started."""
 KEPT = 256 * 1024
 """Bytes that a guard keeps of the beginning and of the end of what its program prints."""
 
+_END_NOW = signal.SIGUSR1  # has a guard kill its program and all that it has started
 _SET_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36  # of prctl(2)
 _PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -55,6 +58,12 @@ def guarded(command: Sequence[str], bounded: bool = False) -> list[str]:
     return [*words, "bounded" if bounded else "", *command]
 
 
+def end_now(guard: subprocess.Popen[Any]) -> None:
+    """Have a guard kill its program and all that it has started, also while either is stopped."""
+    guard.send_signal(_END_NOW)
+    guard.send_signal(signal.SIGCONT)
+
+
 def _prctl(*arguments: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(*arguments)
@@ -65,7 +74,7 @@ def _guard(parent: int, bounded: bool, command: list[str]) -> int:
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-    for number in (signal.SIGCHLD, END_NOW, *_PASSED_ON):
+    for number in (signal.SIGCHLD, _END_NOW, *_PASSED_ON):
         if signal.getsignal(number) != signal.SIG_IGN or number != signal.SIGHUP:  # nohup set it
             signal.signal(number, lambda *_: None)
     _prctl(_SET_CHILD_SUBREAPER, 1)
@@ -86,7 +95,7 @@ def _guard(parent: int, bounded: bool, command: list[str]) -> int:
                 os.kill(program, came)
             if came == signal.SIGTERM:
                 kill_at = min(kill_at, time.monotonic() + GRACE_S)
-            elif came == END_NOW:
+            elif came == _END_NOW:
                 kill_at = 0.0
         if time.monotonic() >= kill_at:
             os.kill(program, signal.SIGKILL)

@@ -238,6 +238,8 @@ def control(ctl, laws, states, est, y, u):
                 _go_safe(c, BAD_U, i)
                 return
         advance_with_inner(laws[c.active], states[c.active])
+        for i in range(NU):
+            c.u[i] = states[c.active].u[i]  # the law's own
         for i in range(NU_INNER):
             u[i] = c.out[i]
         return

@@ -20,7 +20,7 @@ from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_plant import Plant
 from gfm_plant.model import f, g
 from gfm_runtime import discretise, get_law, law_file

@@ -17,7 +17,7 @@ from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_plant import Plant, make_plant, phase_jump
 from gfm_plant.model import DELTA, N_X, f, g
 from gfm_runtime import discretise, get_law

@@ -34,7 +34,7 @@ from gfm_hil.recording.columns import PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.run import Run
 from gfm_hil.run.loop_delay import loop_delay
-from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario
+from gfm_hil.scenario import Scenario, check_scenario, load_scenario
 from gfm_plant import load_converter, phase_jump
 from gfm_runtime import Law, load_law
 

@@ -17,8 +17,7 @@ from gfm_design.model.network import LINES, NetworkLoop
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.recording.columns import signals_of
-from gfm_hil.scenario.model import Scenario, check_scenario, plant_of
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import Scenario, check_scenario, plant_of, toml_text
 from gfm_plant import NoEquilibrium
 from gfm_runtime import discretise, load_law
 

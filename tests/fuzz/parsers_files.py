@@ -22,9 +22,8 @@ from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.recording.parts import Part
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import SCENARIO_FOLDERS, check_scenario, load_scenario
-from gfm_hil.scenario.profiles import read_profile
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario, scenario_toml
+from gfm_hil.scenario.events.grid_profile import read_profile
 from gfm_hil.studies.campaign import loading
 from gfm_hil.studies.conformity.diff import Results, compare_results, read_results
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test

@@ -24,7 +24,7 @@ from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import frame_dtype
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.links.serial.framing import Unstuffer, stuffed
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_runtime.signals import NU, NY
 
 from .conftest import Parser, Take

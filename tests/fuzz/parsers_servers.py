@@ -31,7 +31,7 @@ from gfm_hil.ports.scope import server as scope_server
 from gfm_hil.ports.scope.access import Access
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 from ..support.modbus_device import Bench as MadeUp
 from ..support.processes import free_port

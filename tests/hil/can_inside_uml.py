@@ -22,8 +22,7 @@ import pytest
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links.can.dbc import write_dbc
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.model import load_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import load_scenario, toml_text
 
 from ..support.can_reference import quantised_run
 

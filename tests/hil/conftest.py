@@ -15,7 +15,7 @@ import pytest
 
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import Scenario, check_scenario
+from gfm_hil.scenario import Scenario, check_scenario
 
 from ..support.uml import Kernel
 

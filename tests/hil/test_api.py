@@ -13,7 +13,8 @@ import pytest
 import gfmhil
 from gfm_design.model.closed_loop import REFERENCES
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
+from gfmhil import plot
 
 
 def test_a_run_in_memory_has_the_bits_of_one_in_a_folder(tmp_path, capsys):
@@ -90,26 +91,26 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
     assert np.array_equal(loop.A, law.closed_loop(rig).A)
     assert np.array_equal(loop.A, law.closed_loop(rig.plant, references=REFERENCES).A)
     assert loop.T_s == 1e-4 and law.closed_loop(ideal=True).T_s is None
-    for curve in loop.bode("E_u", "V")[0].lines[:2]:
+    for curve in plot.bode(loop, "E_u", "V")[0].lines[:2]:
         hz, gain = curve.get_data()
         expected = loop.loop_gain(curve.get_label(), 2 * np.pi * hz)
         assert np.allclose(gain, 20 * np.log10(np.abs(expected)))
-    hz, phase = loop.bode("E_u")[1].lines[0].get_data()
+    hz, phase = plot.bode(loop, "E_u")[1].lines[0].get_data()
     turned = phase / 360 - np.angle(loop.loop_gain("E_u", 2 * np.pi * hz)) / (2 * np.pi)
     assert np.allclose(turned, np.round(turned)) and np.abs(np.diff(phase)).max() < 180
-    labels = [line.get_label() for line in loop.nyquist().lines]
+    labels = [line.get_label() for line in plot.nyquist(loop).lines]
     assert labels[:2] == ["omega_u", "E_u"]  # the regulated source ignores i_u
     _, y = loop.step_response("grid.V_g", 0.1)
-    for axes, column in zip(loop.step("grid.V_g", 0.1), y.T, strict=True):
+    for axes, column in zip(plot.step(loop, "grid.V_g", 0.1), y.T, strict=True):
         assert np.array_equal(axes.lines[0].get_ydata(), column)
-    drawn = np.concatenate([line.get_xdata() for line in loop.pole_map().lines[:2]])
+    drawn = np.concatenate([line.get_xdata() for line in plot.pole_map(loop).lines[:2]])
     assert np.array_equal(np.sort(drawn), np.sort(loop.poles().real))
-    hz, size = loop.impedance()[0].lines[1].get_data()
+    hz, size = plot.impedance(loop)[0].lines[1].get_data()
     assert np.array_equal(size, np.abs(loop.output_impedance(2 * np.pi * hz)[:, 0, 1]))
     with pytest.raises(gfmhil.UserError, match="'i_u' is no channel of the loop"):
-        loop.bode("i_u")
+        plot.bode(loop, "i_u")
     with pytest.raises(gfmhil.UserError, match="'P' is no input of the loop"):
-        loop.step("P")
+        plot.step(loop, "P")
 
 
 def test_gamma_gains_and_margins_of_a_law():

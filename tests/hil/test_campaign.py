@@ -12,7 +12,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,14 @@ from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.studies.campaign import worker
 from gfm_hil.studies.campaign.axes import find_axes
-from gfm_hil.studies.campaign.execute import WorkerLost, execute, processes
+from gfm_hil.studies.campaign.execute import CHUNK
 from gfm_hil.studies.campaign.figure import fill_map
 from gfm_hil.studies.campaign.loading import load_campaign
 from gfm_hil.studies.campaign.result import summary, verdict
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.worker import Record, run_chunk
+from gfm_hil.studies.workers import WorkerLost, processes, run_tasks
 
 TEXT = """\
 title = "a small one"
@@ -250,7 +251,7 @@ def test_dask_without_the_package_says_so(
 @pytest.mark.full
 def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]) -> None:
     campaign = load_campaign(str(file(**{"runs = 10": "runs = 2000"})))
-    jobs = [(run, "mimo-gfm") for run in range(2000)]
+    jobs = [[(k + j, "mimo-gfm") for j in range(CHUNK)] for k in range(0, 2000, CHUNK)]
     kept: list[Record] = []
 
     def keep(records: list[Record]) -> None:
@@ -259,7 +260,7 @@ def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]
             os.kill(process.pid or 0, signal.SIGKILL)
 
     with processes(1) as pool, pytest.raises(WorkerLost, match="a worker process died"):
-        execute(campaign, jobs, pool, 1, keep, lambda: False)
+        run_tasks(partial(run_chunk, campaign), jobs, pool, 1, keep, lambda: False)
     assert [r["run"] for r in kept] == list(range(len(kept)))
     assert kept
 
@@ -271,12 +272,9 @@ def test_an_error_in_a_run_names_the_run(
         raise ZeroDivisionError("as if there were a mistake")
 
     monkeypatch.setattr(worker, "simulate", fail)
-    campaign = load_campaign(str(file()))
-    with (
-        ThreadPoolExecutor(1) as pool,
-        pytest.raises(WorkerLost, match="run 7, vsg-2: ZeroDivisionError: as if"),
-    ):
-        execute(campaign, [(7, "vsg-2")], pool, 1, lambda records: None, lambda: False)
+    with pytest.raises(WorkerLost, match="run 0, mimo-gfm: ZeroDivisionError: as if") as lost:
+        gfmhil.campaign(file())
+    assert lost.value.result.summary["missing"] == 20
 
 
 @pytest.mark.full
@@ -376,7 +374,7 @@ def test_wrong_files(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--workers", "0"], "--workers 0: must lie in"),
+        (["--workers", "0"], "workers = 0: must lie in"),
         (["--workers", "2", "--dask", "tcp://a:1"], "give one of them"),
         (["--resume"], "goes with --out"),
         (["--only", "10", "--out", "x"], "--only 10: must lie in [0, 9]"),
@@ -406,9 +404,9 @@ def test_checks_that_take_long_show_how_far_they_are(
     attack_now: Callable[[str], None],
 ) -> None:
     path, seen = str(file()), []
-    load_campaign(path, lambda done, of: seen.append((done, of)))
+    load_campaign(path, tell=lambda done, of: seen.append((done, of)))
     assert seen == [(k, 18) for k in range(18)]  # 4 times 2 ends, 10 runs
-    monkeypatch.setattr("gfm_hil.cli.campaign._PATIENCE_S", 0.0)
+    monkeypatch.setattr("gfm_hil.studies.campaign.execute._PATIENCE_S", 0.0)
     wrong = [path, "--only", "10"]
     main(["campaign", *wrong])
     assert capsys.readouterr().err.splitlines()[0] == "checking the runs: 0 of 18 done …"

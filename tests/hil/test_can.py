@@ -25,7 +25,7 @@ from gfm_hil.links.can.layout import load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.segments import SegmentSender
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import Group, names
 
 from ..support.can_reference import quantised_run

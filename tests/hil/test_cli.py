@@ -15,8 +15,7 @@ import pytest
 
 import gfmhil
 from gfm_hil.cli import main
-from gfm_hil.scenario.model import shipped_scenarios
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import shipped_scenarios, toml_text
 from gfm_runtime import law_names, law_titles
 from gfm_runtime.inner_file import inner_names
 

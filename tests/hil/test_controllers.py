@@ -18,7 +18,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
 from gfm_hil.recording.run import Run
 from gfm_hil.run import runner
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_plant import plant_sample
 from gfm_runtime.inner import settle
 from gfm_runtime.states import RUNNING, SAFE

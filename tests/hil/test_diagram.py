@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Rectangle
 
 import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram
-from gfm_hil.scenario.model import Scenario, load_scenario, shipped_scenarios
+from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
 
 Make = Callable[..., Scenario]
 FAULT = {"t": 0.02, "type": "fault", "position": 0.25, "R": 0.1}

@@ -11,7 +11,7 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.links.frame import FrameError, FrameReader, judge
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import names
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 

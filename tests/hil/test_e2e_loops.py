@@ -27,8 +27,7 @@ from gfm_hil.links.frame import FrameReader
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.parts import Part
 from gfm_hil.run.run_folder import finish
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import Scenario, scenario_toml
 from gfm_plant import NO_FRESH_U
 from gfm_runtime.signals import NU, Group, names
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED

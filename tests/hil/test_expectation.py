@@ -13,9 +13,8 @@ import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.runner import run_scenario
+from gfm_hil.scenario import check_scenario, load_scenario, scenario_toml
 from gfm_hil.scenario.expectation import END_REASONS
-from gfm_hil.scenario.model import check_scenario, load_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_controller"
 SENDS_NAN = f"""

@@ -21,7 +21,7 @@ from gfm_hil.recording.columns import CONTROLLER_INNER, INSTRUCTIONS, PLANT_INNE
 from gfm_hil.recording.run import Run
 from gfm_hil.results.export import FORMATS, export_run
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_plant.names import TRIP_REASONS
 from gfm_runtime.states import STATES
 

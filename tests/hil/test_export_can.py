@@ -16,7 +16,7 @@ from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.recording.run import Run
 from gfm_hil.results.export import export_run
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 BUS = "127.0.0.1:{port}"
 LAST = 4  # words of a side that end a run

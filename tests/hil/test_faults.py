@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import ROLES
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 from ..support.links import LINKS, PATIENT, Pair, run_pair
 

@@ -18,7 +18,7 @@ from gfm_hil.engine.handshake import Start, shake_hands
 from gfm_hil.links import Link, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import NY
 
 from ..support.links import PATIENT
@@ -66,7 +66,7 @@ NO_GREETINGS = {
     "[" * 400: "recursion limit",
     '{"kind": "hello", "si': "Invalid JSON: EOF",
     '{"kind": "hello", "role": "plant", "boot": 1}': "hello.boot: must be a valid string",
-    '{"kind": "\\u001b[2J"}': r"kind = '\x1b[2J': must be one of 'hello', 'start'",
+    '{"kind": "\\u001b[2J"}': r"kind = '\x1b[2J': must be one of ['hello', 'start']",
     "\x1b[2J\udcff": r"not b'\x1b[2J\xff'",
     start("1e999")[7:].decode(): "start.t0: must be a valid integer, not inf",
     start("1" + 40 * "0")[7:].decode(): "start.t0: must be less than 9223372036854775808",

@@ -19,7 +19,7 @@ from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.links.zeromq.link import ZmqLink
 from gfm_hil.run.summary import clock_drift
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import NU, NY
 
 from ..support.links import PATIENT, in_threads, run_pair

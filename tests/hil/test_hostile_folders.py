@@ -63,7 +63,7 @@ ODD = (
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """The folder of a finished run."""
-    from gfm_hil.scenario.model import check_scenario
+    from gfm_hil.scenario import check_scenario
 
     folder = tmp_path_factory.mktemp("good") / "whole"
     given = {"title": "test", "duration": 0.05, "link": {"type": "inproc"}, "events": EVENTS}
@@ -74,7 +74,7 @@ def whole(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def cut(whole) -> Path:
     """The folder of a run that was cut off while its files were made."""
-    from gfm_hil.scenario.model import load_scenario
+    from gfm_hil.scenario import load_scenario
 
     folder = whole.with_name("cut")
     with pytest.MonkeyPatch.context() as patch:

@@ -14,7 +14,7 @@ import pytest
 import gfmhil
 from gfm_design.margins.admittance import line_impedance
 from gfm_hil.cli.main import main
-from gfm_hil.studies.identification import _bands
+from gfm_hil.studies.scan import _bands
 from gfm_plant import Plant, load_converter
 
 OWN = Path(__file__).parents[2] / "examples/own_controller/controller.py"
@@ -32,18 +32,18 @@ REAL = {
 
 
 @pytest.fixture(scope="module")
-def measured() -> gfmhil.Identification:
+def measured() -> gfmhil.FrequencyScan:
     law = gfmhil.Law.load("droop-2")
-    return gfmhil.identify(law, "pref_step", start_hz=100, stop_hz=1000, points=7)
+    return gfmhil.scan(law, "pref_step", start_hz=100, stop_hz=1000, points=7)
 
 
-def test_agrees_with_the_linear_model(measured: gfmhil.Identification) -> None:
+def test_agrees_with_the_linear_model(measured: gfmhil.FrequencyScan) -> None:
     assert measured.name == "droop-2" and len(measured.frequency) == 7
     assert measured.deviation is not None and measured.deviation.max() < 0.01
     assert measured.nfp == pytest.approx(measured.nfp_model, rel=0.01)
 
 
-def test_is_the_filter_alone_where_the_law_is_slow(measured: gfmhil.Identification) -> None:
+def test_is_the_filter_alone_where_the_law_is_slow(measured: gfmhil.FrequencyScan) -> None:
     pu, hz = load_converter("paper").pu(), measured.frequency
     omega_b = 100 * math.pi
     choke = np.linalg.inv(line_impedance(hz, pu["R_f"], pu["L_f"], omega_b))
@@ -54,7 +54,7 @@ def test_is_the_filter_alone_where_the_law_is_slow(measured: gfmhil.Identificati
 
 
 def test_stage_delay_sensors_and_frequency() -> None:
-    found = gfmhil.identify(
+    found = gfmhil.scan(
         "droop-5", gfmhil.load_scenario(REAL), inner="virtual-stator",
         start_hz=100, stop_hz=900, points=6, settle_s=1.0,
     )  # fmt: skip
@@ -67,7 +67,7 @@ def test_stage_delay_sensors_and_frequency() -> None:
     [("vsg-2", "none"), ("droop-5", "cascaded"), ("mimo-gfm", "virtual-stator")],
 )
 def test_one_percent_from_1_hz_to_1_khz(law: str, inner: str) -> None:
-    found = gfmhil.identify(law, inner=inner)
+    found = gfmhil.scan(law, inner=inner)
     assert len(found.frequency) == 40
     assert found.frequency[[0, -1]] == pytest.approx([1.0, 1000.0], rel=0.01)
     assert found.deviation is not None and found.deviation.max() < 0.01
@@ -78,7 +78,7 @@ def test_one_percent_from_1_hz_to_1_khz(law: str, inner: str) -> None:
 def test_judges_other_grids_as_their_poles_do() -> None:
     law = gfmhil.Law.load("droop-5").with_inner("cascaded").with_gains("steep", D_p=0.3)
     plant = {"grid": {"scr": 2.0, "x_over_r": 10.0}}
-    found = gfmhil.identify(
+    found = gfmhil.scan(
         law, gfmhil.load_scenario("pref_step", plant=plant), start_hz=0.5, stop_hz=4500, points=60
     )
     for scr in (57.0, 15.0, 3.0, 1.5):
@@ -99,7 +99,7 @@ def test_measures_a_controller_that_is_a_program(tmp_path: Path) -> None:
         "[plant]\nfactors = { L_g = 3.0, R_g = 1.5 }\ndelay = { samples = 1 }\n"
         'sensors = { bandwidth_hz = 300.0 }\ndc_source = { mode = "regulated" }\n'
     )
-    assert main(["identify", str(weak), *options]) == 0
+    assert main(["scan", str(weak), *options]) == 0
     said = json.loads((tmp_path / "out/identification.json").read_text())
     assert said["name"] == "droop in Python" and "largest_deviation" not in said
     with (tmp_path / "out/admittance.csv").open() as file:
@@ -117,7 +117,7 @@ def test_measures_a_controller_that_is_a_program(tmp_path: Path) -> None:
 def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--from", "100", "--to", "800", "--points", "4", "--settle", "1", "--grid", "5:10"]
     folder = tmp_path / "out"
-    assert main(["identify", "droop-2", *options, "-o", str(folder), "--quiet"]) == 0
+    assert main(["scan", "droop-2", *options, "-o", str(folder), "--quiet"]) == 0
     said = capsys.readouterr().out
     assert "largest deviation from the linear model: 0." in said
     assert "SCR 5, X/R 10: cannot be judged: " in said
@@ -129,8 +129,9 @@ def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert len(rows) == 4 and float(rows[-1]["f_hz"]) == pytest.approx(800, rel=0.02)
     content = json.loads((folder / "identification.json").read_text())
     assert content["points"] == 4 and content["largest_deviation"] < 0.01
-    assert main(["identify", "droop-2", "-o", str(folder)]) == 2
-    assert "is not empty" in capsys.readouterr().err
+    assert main(["identify", "droop-2", "-o", str(folder)]) == 2  # its name up to version 0.2
+    said = capsys.readouterr().err
+    assert "is gfmhil scan now" in said and "is not empty" in said
 
 
 @pytest.mark.parametrize(
@@ -144,14 +145,14 @@ def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["vsg-2", "--amplitude", "-1"], "amplitude = -1.0: must be > 0"),
         (["vsg-2", "--settle", "-1"], "settle_s = -1.0: must be >= 0 s"),
         (["vsg-2", "--window", "99"], "window_s = 99.0: must lie in [0, 60] s"),
-        (["three_share_a_load"], "identify measures one converter"),
+        (["three_share_a_load"], "a scan measures one converter"),
         (["small_grid_load_step"], "plant.grid.finite: such a grid sets its own frequency"),
         (["pref_step", "--inner", "nothing"], "nothing"),
         (["pref_step", "--controller", "true", "--scenario", "x"], "goes with a law"),
     ],
 )
 def test_mistakes(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["identify", *arguments, "--quiet"]) == 2
+    assert main(["scan", *arguments, "--quiet"]) == 2
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
 
@@ -160,7 +161,7 @@ def test_a_limit_that_acts_is_found() -> None:
     limited = {**REAL["plant"], "i_peak": 0.31}
     scenario = gfmhil.load_scenario({**REAL, "law": "droop-5", "plant": limited})
     with pytest.raises(gfmhil.UserError, match=r"plant.i_peak or plant.modulation acts"):
-        gfmhil.identify(None, scenario, start_hz=100, stop_hz=300, points=3, settle_s=0.1,
+        gfmhil.scan(None, scenario, start_hz=100, stop_hz=300, points=3, settle_s=0.1,
                         amplitude=1e-2)  # fmt: skip
 
 
@@ -168,7 +169,7 @@ def test_an_unstable_loop_is_refused() -> None:
     plant = {"delay": {"samples": 2}}
     scenario = gfmhil.load_scenario("pref_step", law="droop-5", plant=plant)
     with pytest.raises(gfmhil.UserError, match="droop-5 is unstable on this grid: a mode at"):
-        gfmhil.identify(None, scenario, inner="cascaded")
+        gfmhil.scan(None, scenario, inner="cascaded")
 
 
 def test_tones_have_whole_periods_in_their_window() -> None:

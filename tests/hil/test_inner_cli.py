@@ -11,8 +11,7 @@ import pytest
 
 import gfmhil
 from gfm_hil.cli import main
-from gfm_hil.scenario.model import load_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import load_scenario, scenario_toml
 from gfm_runtime import law_file, load_law
 
 VSG_2 = files("gfm_runtime").joinpath("laws", "vsg-2.toml").read_text(encoding="utf-8")

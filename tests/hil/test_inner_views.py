@@ -19,7 +19,7 @@ from gfm_hil.results.export import export_run
 from gfm_hil.results.figures import draw_signals
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 COLUMNS = (*PLANT_INNER, *CONTROLLER_INNER)
 

@@ -11,14 +11,14 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.inproc import CHUNK, run_inproc
-from gfm_hil.engine.retune import ready_gains
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.recording.parts import Part
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
+from gfm_hil.scenario.events.gains import ready_gains
 from gfm_runtime import load_law
 from gfm_runtime.inner import INNER_CONSTANTS
 

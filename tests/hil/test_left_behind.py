@@ -11,6 +11,7 @@ import json
 import os
 import random
 import subprocess
+import sys
 import time
 import uuid
 from collections.abc import Callable
@@ -27,6 +28,7 @@ pytestmark = pytest.mark.systems
 
 ROUNDS = int(os.environ.get("GFMHIL_KILLS", "2"))
 SEED = int(os.environ.get("GFMHIL_KILLS_SEED", "4"))
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
 REPORT = os.environ.get("GFMHIL_KILLS_REPORT")
 LEFT_S = 5.0
 COMPILES_S = 600.0  # the first round may compile what it runs
@@ -57,28 +59,36 @@ def library(folder: Path) -> str:
 
 def campaign(folder: Path) -> list[str]:
     (folder / "killed.toml").write_text(CAMPAIGN)
-    return ["campaign", str(folder / "killed.toml"), "--workers", "2"]
+    return [*GFMHIL, "campaign", str(folder / "killed.toml"), "--workers", "2"]
 
 
-def compare(folder: Path) -> list[str]:
-    return ["design", "compare", "--laws", "droop-1,vsg-2,vsg-5", "--jobs", "2"]
+def paper(folder: Path) -> list[str]:
+    command = [sys.executable, "-m", "law_comparison", "--laws", "droop-1,vsg-2,vsg-5"]
+    return [*command, "--jobs", "2"]
 
 
 def conform(folder: Path) -> list[str]:
-    return ["conform", "--law", "all", "--against", "miso", "--workers", "2"]
+    return [*GFMHIL, "conform", "--law", "all", "--against", "miso", "--workers", "2"]
 
 
 def conform_c(folder: Path) -> list[str]:
-    command = ["conform", "--controller", library(folder), "--inner", "virtual-stator"]
+    command = [*GFMHIL, "conform", "--controller", library(folder), "--inner", "virtual-stator"]
     return [*command, "--workers", "2"]
 
 
 def pil(folder: Path) -> list[str]:
-    return ["run", write(folder, **LONG), "--controller", "pil:m4f", "--no-figures"]
+    return [*GFMHIL, "run", write(folder, **LONG), "--controller", "pil:m4f", "--no-figures"]
 
 
 def run_c(folder: Path) -> list[str]:
-    command = ["run", write(folder, **LONG), "--controller", library(folder), "--no-figures"]
+    command = [
+        *GFMHIL,
+        "run",
+        write(folder, **LONG),
+        "--controller",
+        library(folder),
+        "--no-figures",
+    ]
     return [*command, "--inner", "virtual-stator"]
 
 
@@ -102,7 +112,7 @@ def marked(mark: str) -> set[int]:
     ("words", "least"),
     [
         (campaign, 5),  # with fork server, resource tracker and two workers
-        (compare, 6),  # and the manager
+        (paper, 6),  # and the manager
         (conform, 5),
         pytest.param(conform_c, 9, marks=pytest.mark.apt),  # and guard, controller, its fork
         pytest.param(pil, 7, marks=pytest.mark.compilers),  # three guards, plant, controller, QEMU
@@ -120,8 +130,9 @@ def test_a_killed_command_leaves_no_process(
     for k in range(ROUNDS):
         mark = f"GFMHIL_ROUND={uuid.uuid4()}"
         process = subprocess.Popen(
-            [*GFMHIL, *command, "--quiet", "--out", str(tmp_path / f"out{k}")],
-            env={**os.environ, **dict([mark.split("=")]), "FOREIGN_WHAT": "fork"},
+            [*command, "--quiet", "--out", str(tmp_path / f"out{k}")],
+            env={**os.environ, **dict([mark.split("=")]), "FOREIGN_WHAT": "fork",
+                 "PYTHONPATH": str(PAPER)},
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
         )  # fmt: skip
         try:

@@ -19,8 +19,7 @@ from gfm_design.norms.weights import read_weights
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.scenario.model import SCENARIO_FOLDERS, load_scenario
-from gfm_hil.scenario.toml_out import scenario_toml, toml_text
+from gfm_hil.scenario import SCENARIO_FOLDERS, load_scenario, scenario_toml, toml_text
 from gfm_hil.studies.campaign.loading import load_campaign
 from gfm_plant import NoEquilibrium
 from gfm_runtime import LawError, discretise, load_law

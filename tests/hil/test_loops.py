@@ -26,7 +26,7 @@ from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import carried
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
 

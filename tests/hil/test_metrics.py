@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gfmhil
+from gfm_hil.api.law import as_law
 from gfm_hil.run.cycles import cycle_means
 from gfm_hil.run.metrics import METRICS, event_metrics
 from gfm_hil.run.modes import Acting, acting, fast_mode, free_from, swing
-from gfm_hil.scenario.model import check_scenario
-from gfm_hil.studies.law import as_law
+from gfm_hil.scenario import check_scenario
 
 T_s, F_N = 1e-3, 50.0
 COLUMNS = ("true_p", "true_omega_u", "true_V", "true_i")
@@ -158,7 +158,7 @@ def test_means_over_a_cycle_are_those_worked_out_one_by_one(width, monkeypatch):
         weights[-1] = part
     expected = [np.dot(x[k : k + n], weights) / width for k in range(50, 650 - n + 1)]
     for piece in (1, 100, 1 << 18):
-        monkeypatch.setattr("gfm_hil.run.cycles.PIECE", piece)
+        monkeypatch.setattr("gfm_hil.results.cycles.PIECE", piece)
         found = np.concatenate(list(cycle_means(x, 50, 650, width)))
         assert found == pytest.approx(np.array(expected), abs=1e-14)
     assert not list(cycle_means(x, 0, n - 1, width))

@@ -20,8 +20,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.log import read_log
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import run_network
-from gfm_hil.scenario.model import find_scenario, load_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import find_scenario, load_scenario, scenario_toml
 
 pytestmark = pytest.mark.full  # compiles the loop of several converters
 

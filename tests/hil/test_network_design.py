@@ -15,7 +15,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PaperProblem
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import write_scenario
 from gfm_runtime.inner_file import named_inner
 
 pytestmark = pytest.mark.full  # compiles the start of several converters
@@ -237,8 +237,8 @@ def test_python_refuses_in_one_line() -> None:
         (lambda: law.closed_loop(THREE, converter="A", ideal=True), "ideal: not of a converter"),
         (lambda: gfmhil.design.margins(law, THREE, converter="A"), "ranges of elements"),
         (lambda: gfmhil.design.network_loop("pref_step"), "network: the scenario has none"),
-        (lambda: gfmhil.design.network_loop(THREE).converter("D"), "'D' is no converter"),
-        (lambda: gfmhil.design.network_loop(THREE).step("P"), "'P' is no input"),
+        (lambda: gfmhil.Law.load("vsg-2").closed_loop(THREE, converter="D"), "must be one of"),
+        (lambda: gfmhil.plot.step(gfmhil.design.network_loop(THREE), "P"), "'P' is no input"),
     ):
         with pytest.raises(UserError, match=words):
             call()

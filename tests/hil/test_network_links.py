@@ -21,8 +21,7 @@ from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
 from gfm_hil.run.run_folder import merge_roles
 from gfm_hil.run.runner import run_network
-from gfm_hil.scenario.model import load_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import load_scenario, toml_text
 
 from ..support.processes import (
     GFMHIL,

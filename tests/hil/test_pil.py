@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -23,7 +24,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
 from gfm_hil.recording.run import Run
 from gfm_hil.run import runner
-from gfm_hil.scenario.model import find_scenario, load_scenario
+from gfm_hil.scenario import find_scenario, load_scenario
 from gfm_runtime.firmware import TARGETS
 
 from ..support.processes import write
@@ -151,7 +152,7 @@ def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(
     assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
     assert found.summary["ticks"] > 100
     assert np.isfinite(found.columns["u_omega_u"][:100]).all()
-    assert not Path(f"/proc/{machines[0]}").exists()
+    assert machines and not any(Path(f"/proc/{process}").exists() for process in machines)
     scratch.rmdir()  # nothing is left there
 
 
@@ -170,18 +171,22 @@ def test_a_machine_that_answers_after_seconds_completes_the_run(
     thread.join()
     assert (found.summary["status"], found.summary["ticks"]) == ("completed", 40_000)
     assert found.summary["wall_s"] > PAUSE_S
-    assert not Path(f"/proc/{machines[0]}").exists()
+    assert machines and not any(Path(f"/proc/{process}").exists() for process in machines)
     scratch.rmdir()
 
 
 def hit(tmp_path: Path, scratch: Path, machines: list[int], *numbers: signal.Signals) -> None:
-    """Send the machine, which works below ``scratch``, signals in the middle of the run."""
-    parts = tmp_path / "run" / "parts" / "plant_progress.npy"
-    while not (parts.exists() and np.load(parts)[0] > 100):
+    """Send the machine and its guard, which work below ``scratch``, signals in mid run."""
+    parts, ticks = tmp_path / "run" / "parts" / "plant_progress.npy", 0
+    while ticks <= 100:
         time.sleep(0.01)
+        with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or not whole, yet
+            ticks = np.load(parts)[0]
     machines.extend(processes_in(scratch))
     for number in numbers:
-        os.kill(machines[0], number)
+        for process in machines:
+            with contextlib.suppress(ProcessLookupError):  # it has ended with its guard
+                os.kill(process, number)
         time.sleep(PAUSE_S if number == signal.SIGSTOP else 0.0)
 
 

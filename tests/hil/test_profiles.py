@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.api.runs import load_run
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.run import load_run
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.events import GridProfile
-from gfm_hil.scenario.model import check_scenario, load_scenario
+from gfm_hil.scenario import check_scenario, load_scenario
+from gfm_hil.scenario.events.grid_profile import GridProfile
 
 TEXT = """# a fall of the frequency and of the voltage
 t, f_hz, V_g

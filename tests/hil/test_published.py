@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import gfmhil
-from gfm_hil.scenario.model import find_scenario, load_scenario
+from gfm_hil.scenario import find_scenario, load_scenario
 
 FOLDER = find_scenario("psid_droop_inverter").parent
 BEFORE_S = 9.0  # the CSV files' time at the scenario's start

@@ -35,7 +35,7 @@ from gfm_hil.results.export import export_run
 from gfm_hil.results.report import write_report
 from gfm_hil.run.run_folder import finish
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import scenario_toml
 
 from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
 
@@ -292,7 +292,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now
             filled.append(fill(small_disk))
 
     with pytest.raises(Unfinished, match="No space left on device"):
-        run_scenario(make(duration=0.4, events=events), folder, progress)
+        run_scenario(make(duration=0.4, events=events), folder, progress, report=write_report)
     with pytest.raises(Unfinished, match="No space left on device"):
         recover(folder)
     filled[0].unlink()

@@ -14,7 +14,7 @@ from gfm_hil.links import Link
 from gfm_hil.links.frame import frame_dtype
 from gfm_hil.recording.log import read_log
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import CONTROLLER_SAFE
 from gfm_runtime.states import READY, RUNNING, SAFE
 

@@ -11,7 +11,7 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 CYCLE = 200  # ticks
 LIMITED = ("virtual-stator", "cascaded", "threshold-impedance")

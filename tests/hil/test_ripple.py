@@ -11,8 +11,7 @@ import pytest
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.ripple import remaining_ripple
-from gfm_hil.scenario.model import check_scenario, load_scenario
-from gfm_hil.scenario.toml_out import scenario_toml
+from gfm_hil.scenario import check_scenario, load_scenario, scenario_toml
 
 T_s, TICKS = 1e-4, 40_000
 t = np.arange(TICKS) * T_s

@@ -13,8 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.model import Scenario, check_scenario, load_scenario, shipped_scenarios
-from gfm_hil.scenario.toml_out import scenario_toml, toml_text
+from gfm_hil.scenario import (
+    Scenario,
+    check_scenario,
+    load_scenario,
+    scenario_toml,
+    shipped_scenarios,
+    toml_text,
+)
 
 LAW = """
 name = "broken"
@@ -322,12 +328,12 @@ def test_the_digest_is_of_contents_not_of_places(make, tmp_path):
 
 
 def test_a_step_of_the_short_circuit_ratio_gives_the_line_of_that_ratio() -> None:
-    from gfm_hil.scenario.events import GridImpedance, apply_grid_event
+    from gfm_hil.scenario.events.grid_impedance import GridImpedance
     from gfm_plant import Plant, make_plant
 
     found = make_plant(Plant(), 1e-4)
     event = GridImpedance(type="grid-impedance", t=0.1, scr=3.0, x_over_r=10.0)
-    apply_grid_event(event, found)
+    event.apply(found)
     wanted = make_plant(Plant.model_validate({"grid": {"scr": 3.0, "x_over_r": 10.0}}), 1e-4)
     for name in ("L_g", "R_g"):
         assert found.par[name][0] == pytest.approx(wanted.par[name][0], rel=1e-14)

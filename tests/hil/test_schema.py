@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.scenario.model import SCENARIO_FOLDERS
+from gfm_hil.scenario import SCENARIO_FOLDERS
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 SCENARIOS = SCENARIO_FOLDERS[1]

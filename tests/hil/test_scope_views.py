@@ -12,7 +12,7 @@ from gfm_hil.ports.scope.picture import HEAD, Picture, PictureRequest
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
 from gfm_hil.ports.scope.trigger import ARMED, AUTO, FILLING, HELD, Acquisition, Trigger, edges
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 T_S = 1e-4
 SCENARIO = Scenario(title="growing", duration=2.0, T_s=T_S)

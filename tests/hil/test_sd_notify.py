@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.engine.sd_notify import Watched, notify
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import toml_text
 
 pytestmark = pytest.mark.processes
 

@@ -24,7 +24,7 @@ from gfm_hil.ports.modbus.image import Image
 from gfm_hil.ports.modbus.measures import Measures
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.recording import open_recording
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 
 from ..support.modbus import GFMHIL
 from ..support.processes import PATIENCE_S, has_run, places, roles_of, signals, summary, wait_for

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 
 CHAIN = ["mimo-gfm", "vsg-2", "droop-1", "matching-1", "dvoc", "mimo-gfm"]
 COMMANDS = ("u_i_u", "u_omega_u", "u_E_u")

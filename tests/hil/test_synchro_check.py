@@ -13,7 +13,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_network, run_scenario
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_plant import load_converter
 
 CHECK = {"V": 0.1, "f_hz": 0.5, "degrees": 5.0, "lasting_s": 0.02, "within_s": 5.0}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gfm_runtime.children import END_NOW, KEPT, guarded
+from gfm_runtime.children import GRACE_S, KEPT, end_now, guarded
 
 pytestmark = pytest.mark.processes
 
@@ -63,7 +63,7 @@ def test_of_much_it_keeps_the_beginning_and_the_end() -> None:
     assert len(said) == 2 * KEPT + len(note) and note in said
 
 
-@pytest.mark.parametrize("how", ["program ends", "parent is killed", "SIGTERM", "END_NOW"])
+@pytest.mark.parametrize("how", ["program ends", "parent is killed", "SIGTERM"])
 def test_nothing_is_left_of_a_stubborn_program(how: str) -> None:
     script = (
         "import os, subprocess, sys; from gfm_runtime.children import guarded\n"
@@ -75,9 +75,21 @@ def test_nothing_is_left_of_a_stubborn_program(how: str) -> None:
         lines = (parent.stdout.readline().split() for _ in range(3))
         number = {name.decode(): int(text) for name, text in lines}
         victim = {"program ends": number["program"], "parent is killed": parent.pid}
-        by = {"SIGTERM": signal.SIGTERM, "END_NOW": END_NOW}.get(how, signal.SIGKILL)
+        by = signal.SIGTERM if how == "SIGTERM" else signal.SIGKILL
         os.kill(victim.get(how, number["guard"]), by)
         assert gone([*number.values()])
+
+
+def test_a_guard_and_a_program_that_are_stopped_end_now() -> None:
+    command = guarded([sys.executable, "-c", STUBBORN])
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as guard:
+        assert guard.stdout is not None
+        numbers = [guard.pid, *(int(guard.stdout.readline().split()[1]) for _ in range(2))]
+        for number in numbers:
+            os.kill(number, signal.SIGSTOP)
+        end_now(guard)
+        guard.wait(GRACE_S + 8)
+        assert gone(numbers[1:])
 
 
 def test_a_program_gets_the_signals_of_its_guard() -> None:

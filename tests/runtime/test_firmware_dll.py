@@ -18,7 +18,7 @@ from numba import typeof
 
 from gfm_hil.cli import main
 from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_runtime import load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control

@@ -12,7 +12,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.recorder import record_command, record_sample
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.signals import Vector, carried
 

@@ -24,7 +24,7 @@ from gfm_hil.recording.log import read_log
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.run import read_recording
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 PATIENT = {"type": "inproc", "peer_timeout_s": 30.0, "start_timeout_s": 60.0}
 

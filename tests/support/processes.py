@@ -17,7 +17,7 @@ import numpy as np
 
 from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import toml_text
 
 
 def places(folder: Path) -> set[Path]:

@@ -12,12 +12,12 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.ports.xcp.memory import Memory
 from gfm_hil.ports.xcp.slave import Slave
 from gfm_hil.recording.columns import signals_of
-from gfm_hil.scenario.events import Event
+from gfm_hil.scenario.events import AnyEvent
 
 LAWS = ("mimo-gfm", "vsg-5", "vsg-2")
 MASTER = ("127.0.0.1", 40000)
 CONNECT = b"\xff\x00"
-_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+_EVENT: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 
 
 class MadeUpRun:

@@ -10,7 +10,7 @@ import numpy as np
 from deployable.box import Point
 from gfm_design.model.closed_loop import T_S
 from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 
 #: what the rig adds to a point: its boards, and the noise of its sensors in p.u.
 RIG: dict[str, Any] = {

@@ -15,6 +15,7 @@ from gfm_design.margins.delays import overall_delay
 from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.synthesis import NotStabilised
+from gfm_hil.api.tuned_law import law_text, problem_name
 from gfm_hil.cli.design.common import (
     add_law_options,
     channels_as_json,
@@ -25,7 +26,6 @@ from gfm_hil.cli.design.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.studies.tuned_law import law_text, problem_name
 from gfm_runtime import build_law, discretise, parse_law
 from gfm_runtime.lawfile import LawFile, tied
 

@@ -26,7 +26,7 @@ from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, pro
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
-from gfm_hil.studies.campaign.execute import WorkerLost
+from gfm_hil.studies.workers import WorkerLost
 from gfm_runtime import LawError, law_names
 from law_comparison.execute import kept, run
 from law_comparison.figures import draw

@@ -13,7 +13,7 @@ from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.studies.campaign.execute import WorkerLost, processes
+from gfm_hil.studies.workers import WorkerLost, processes
 from gfm_runtime.children import end_with_parent
 from law_comparison.row import Job, Row, make_row
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.scenario.model import check_scenario
+from gfm_hil.scenario import check_scenario
 from gfm_hil.studies.campaign.worker import kept, simulate
 
 START = "mimo-gfm"  # the law that the switchover comes from

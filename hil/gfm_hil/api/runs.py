@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gfm_hil.api.law import Law, law_files
 from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
 from gfm_hil.engine.compiling import compile_external
 from gfm_hil.engine.processes import Progress
 from gfm_hil.recording.run import Run, converters_of
+from gfm_hil.results.figures import draw_comparison
 from gfm_hil.results.plots import plot, plot_laws, plot_network, plot_waveforms
 from gfm_hil.results.report import write_report
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.network_run import NetworkRun, save_network
 from gfm_hil.run.runner import Notice
-from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
-from gfm_hil.studies.law import Law, law_files
+from gfm_hil.scenario import INPROC, Scenario, load_scenario
+from gfm_hil.studies.workers import SILENT, Watch
 
 __all__ = [
     "Comparison", "NetworkRun", "Run", "compare", "load_run", "merge", "recover", "run",
@@ -200,45 +204,88 @@ def merge(first: str | Path, second: str | Path, folder: str | Path) -> Run:
     return run_folder.merge_roles(Path(first), Path(second), Path(folder), write_report)
 
 
-@dataclass(frozen=True, repr=False)
-class Comparison(Mapping[str, Run]):
+class Comparison(dict[str, Run]):
     """Runs of one scenario by the name of their law."""
-
-    runs: dict[str, Run]
-
-    def __getitem__(self, law: str) -> Run:
-        return self.runs[law]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.runs)
-
-    def __len__(self) -> int:
-        return len(self.runs)
 
     @property
     def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
         """The metrics of each run by law, see ``Run.metrics``."""
-        return {law: one.metrics for law, one in self.runs.items()}
+        return {law: one.metrics for law, one in self.items()}
+
+    @property
+    def summaries(self) -> dict[str, dict[str, Any]]:
+        """The summary of each run by law: the content of comparison.json."""
+        return {law: one.summary for law, one in self.items()}
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """Those of the summary of the run that came furthest."""
+        return max((one.summary["events"] for one in self.values()), key=len)
 
     def plot(self) -> list[Axes]:
         """p, frequency, q and v_dc of all laws in one figure."""
-        return plot_laws(self.runs)
+        return plot_laws(self)
+
+    def write(self, folder: Path) -> None:
+        """Write comparison.json, and comparison.png of the runs that recorded anything."""
+        first = next(iter(self.values()))
+        signals = {law: one.columns for law, one in self.items() if "true_p" in one.columns}
+        if signals:
+            draw_comparison(folder / "comparison.png", first.scenario, signals, self.events)
+        write_text(folder / "comparison.json", json.dumps(self.summaries, indent=2) + "\n")
 
     def __repr__(self) -> str:
-        lines = [f"  {law}: {one.status}" for law, one in self.runs.items()]
+        lines = [f"  {law}: {one.status}" for law, one in self.items()]
         return "\n".join(["<Comparison", *lines, ">"])
 
 
 def compare(
     scenario: str | Path | Scenario | dict[str, Any],
     laws: Sequence[str | Path | Law],
+    folder: str | Path | None = None,
+    *,
+    watch: Watch = SILENT,
     **changes: Any,
 ) -> Comparison:
-    """Run a scenario under several laws; arguments and errors as for ``run``."""
+    """Run a scenario under several laws.
+
+    Args:
+        scenario, changes: as for ``run``.
+        laws: names, law files or ``Law``.
+        folder: where to write a run folder for each law, comparison.png and comparison.json; the
+            link and the mode are then those of the scenario. None keeps the runs in memory.
+        watch: of the runs with a folder.
+
+    Raises:
+        UserError: one line a mistake; the folder is in use; or the scenario has no operating point.
+        LawError: a law is none.
+    """
     if not laws:
         raise UserError("laws: name some laws to compare")
     with law_files(laws) as files:
-        names = [*files]
-    return Comparison(
-        {name: run(scenario, law, **changes) for name, law in zip(names, laws, strict=True)}
-    )
+        if folder is None:
+            names = [*files]
+            each = zip(names, laws, strict=True)
+            return Comparison({name: run(scenario, law, **changes) for name, law in each})
+        scenarios = {n: load_scenario(scenario, law=file, **changes) for n, file in files.items()}
+        return _compare_in(Path(folder), scenarios, watch)
+
+
+def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -> Comparison:
+    """Run scenarios of different laws, each in a folder; an interruption ends all."""
+    first = next(iter(scenarios.values()))
+    run_folder.check_free(folder, first.ticks * len(scenarios), first.has_inner)
+    runs: dict[str, Run] = {}
+    for name, one in scenarios.items():
+
+        def tell(ticks: int, misses: int, name: str = name, one: Scenario = one) -> None:
+            late = f", {misses} misses" if misses else ""
+            said = f"{name}: {ticks * one.T_s:.2f} s simulated{late}"
+            watch.progress(len(runs) * one.ticks + ticks, len(scenarios) * one.ticks, said)
+
+        runs[name] = runner.run_scenario(one, folder / name, tell, watch.notice, write_report)
+        if runs[name].status == "interrupted":
+            break
+    made = Comparison(runs)
+    made.write(folder)
+    return made

@@ -35,7 +35,7 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.processes import Progress
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.model import INPROC, Scenario, check_scenario
+from gfm_hil.scenario import INPROC, Scenario, check_scenario
 
 LAW = "mimo-gfm"
 T_S = 1e-4  # s

@@ -23,7 +23,7 @@ from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.parts import Part
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import control

@@ -7,8 +7,8 @@ import re
 import shlex
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,19 @@ from rich.progress import (
     TaskProgressColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import target_of
-from gfm_hil.core.terminal import fitting, numbers, terminal
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.processes import Progress as TellProgress
 from gfm_hil.recording.run import Run, controlled_by
-from gfm_hil.results.report import as_expected, cell, event_rows, inner_stages, staged
+from gfm_hil.results.report import as_expected, events_table, inner_stages, staged
+from gfm_hil.results.table import shown
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
-from gfm_hil.scenario.model import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.studies.workers import Watch
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run
@@ -177,6 +179,29 @@ def above(bar: Progress) -> Notice:
 
 
 @contextmanager
+def watching(label: str, quiet: bool = False, stoppable: bool = False) -> Iterator[Watch]:
+    """A bar on stderr that watches a study; Ctrl-C then ends a ``stoppable`` one in good order."""
+    columns = BarColumn(), TaskProgressColumn(), "{task.fields[words]}", TimeRemainingColumn()
+    interrupt = Interrupt()
+    with ExitStack() as stack:
+        if stoppable:
+            stack.enter_context(interrupt)
+        bar = stack.enter_context(progress("{task.description}", *columns, quiet=quiet))
+        task = bar.add_task(escape(label), total=None, words="starting …")
+
+        def tell(done: int, of: int, words: str) -> None:
+            bar.update(task, completed=done, total=of, words=escape(words))
+
+        yield Watch(tell, above(bar), lambda: interrupt.came)
+
+
+def add_study_options(command: argparse.ArgumentParser, printed: str) -> None:
+    """--json and --quiet; ``printed`` is what --json prints."""
+    command.add_argument("--json", action="store_true", help=f"print {printed}, nothing else")
+    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+@contextmanager
 def progress_bar(
     scenario: Scenario, label: str, quiet: bool
 ) -> Iterator[tuple[TellProgress, Notice]]:
@@ -200,7 +225,7 @@ def why_unstable(scenario: Scenario, named: str | Path) -> str:
         scenario: whose loop it is.
         named: what that command calls the scenario.
     """
-    from gfm_hil.studies.loop import unstable_mode  # a second of imports
+    from gfm_hil.studies.linear_loop import unstable_mode  # a second of imports
 
     found = unstable_mode(scenario)
     if found is None:
@@ -235,7 +260,7 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
     console.print(escape(controlled_by(summary) + stage), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
-        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {cell(summary['misses'])} misses",
+        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {shown(summary['misses'])} misses",
         highlight=False,
     )
     if summary["round_trip_us"]:
@@ -245,12 +270,12 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
         text = ", ".join(f"{k} {v}" for k, v in summary["instructions"].items())
         console.print(f"instructions of a step: {text}", highlight=False)
     events = summary["events"]
-    shown = events if len(events) <= 2 * _ENDS else [*events[:_ENDS], *events[-_ENDS:]]
-    for table in fitting(console, shown, events_table):
+    short = events if len(events) <= 2 * _ENDS else [*events[:_ENDS], *events[-_ENDS:]]
+    for table in events_table(short).fitting(console):
         console.print(table)
-    if left_out := len(events) - len(shown):
+    if left_out := len(events) - len(short):
         console.print(
-            f"{left_out} events between {shown[_ENDS - 1]['t']:g} s and {shown[_ENDS]['t']:g} s "
+            f"{left_out} events between {short[_ENDS - 1]['t']:g} s and {short[_ENDS]['t']:g} s "
             "are not shown; summary.json has all of them",
             highlight=False, soft_wrap=True,
         )  # fmt: skip
@@ -268,16 +293,6 @@ def print_run(run: Run | NetworkRun, folder: Path, why: bool = False) -> None:
         print_summary(one.summary, folder / name)
     if reason:
         print(f"\n{reason}")
-
-
-def events_table(events: Sequence[dict[str, Any]]) -> Table:
-    """A table with one row a quantity and one column an event."""
-    table = numbers("", *(escape(f"{event['label']} @ {event['t']:g} s") for event in events))
-    table.columns[0].no_wrap = True
-    for name, title in event_rows(events):
-        if name not in ("label", "t"):
-            table.add_row(escape(title), *[cell(e.get(name)) for e in events])
-    return table
 
 
 def exit_code(run: Run | NetworkRun) -> int:

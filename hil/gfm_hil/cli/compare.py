@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
-from gfm_hil.api.runs import run
+from gfm_hil.api.runs import compare
 from gfm_hil.cli.common import (
     add_scenario_options,
+    add_study_options,
     exit_code,
     new_folder,
-    progress_bar,
     resolve,
     split_laws,
+    watching,
     why_it_ended,
 )
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
-from gfm_hil.core.terminal import fitting, numbers, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.setup import ONE_CONVERTER
-from gfm_hil.recording.run import Run
-from gfm_hil.results.figures import draw_comparison
-from gfm_hil.results.report import cell, event_rows
-from gfm_hil.run.run_folder import check_free
-from gfm_hil.scenario.model import find_scenario
-from gfm_runtime import law_titles
+from gfm_hil.results.report import event_rows
+from gfm_hil.results.table import Cell, Table
+from gfm_hil.scenario import find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -40,8 +35,7 @@ def add(command: argparse.ArgumentParser) -> None:
     add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
     command.add_argument("-o", "--out", help="folder; runs/<scenario>-compare-<time> by default")
-    command.add_argument("--json", action="store_true", help="print the summaries as JSON")
-    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_study_options(command, "comparison.json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -53,47 +47,27 @@ def call(options: argparse.Namespace) -> int:
     laws = split_laws(options.laws) if options.laws else base.compare
     if not laws:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
-    scenarios = {
-        name: resolve(options, in_process=not asked, law=law)
-        for law, name in law_titles(laws).items()
-    }
     folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
-    check_free(folder, base.ticks * len(scenarios), base.has_inner)
-    runs: dict[str, Run] = {}
-    for name, scenario in scenarios.items():
-        with progress_bar(scenario, name, options.quiet) as (progress, notice):
-            runs[name] = run(scenario, folder=folder / name, progress=progress, notice=notice)
-        if runs[name].summary["status"] == "interrupted":
-            break
-    events = max((one.summary["events"] for one in runs.values()), key=len)
-    signals = {name: one.columns for name, one in runs.items() if "true_p" in one.columns}
-    if signals:
-        draw_comparison(folder / "comparison.png", base, signals, events)
-    summaries = {name: one.summary for name, one in runs.items()}
-    write_text(folder / "comparison.json", json.dumps(summaries, indent=2) + "\n")
+    with watching("compare", options.quiet) as watch:
+        found = compare(base, laws, folder, watch=watch)
     if options.json:
-        print(json.dumps(summaries, indent=2))
+        print(json.dumps(found.summaries, indent=2))
     else:
-        _print(summaries, events)
-        for why in filter(None, map(why_it_ended, runs.values())):
+        _print(found.summaries, found.events)
+        for why in filter(None, map(why_it_ended, found.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
         terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
-    return max(exit_code(one) for one in runs.values())
+    return max(exit_code(run) for run in found.values())
 
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
-    def table_of(names: Sequence[str]) -> Table:
-        table = numbers("", *map(escape, names))
-        some = [summaries[name] for name in names]
-        table.add_row("status", *[s["status"] for s in some])
-        for k, event in enumerate(events):
-            table.add_row(f"[bold]{escape(event['label'])} @ {event['t']:g} s[/]")
-            same = [s["events"][k] if k < len(s["events"]) else {} for s in some]
-            for key, title in event_rows(same):
-                if key not in ("label", "t"):
-                    table.add_row("  " + escape(title), *[cell(e.get(key)) for e in same])
-        return table
-
+    rows: list[list[Any]] = [["status", *(s["status"] for s in summaries.values())]]
+    for k, event in enumerate(events):
+        rows.append([Cell(f"{event['label']} @ {event['t']:g} s", "head")])
+        same = [s["events"][k] if k < len(s["events"]) else {} for s in summaries.values()]
+        for key, title in event_rows(same):
+            if key not in ("label", "t"):
+                rows.append(["  " + title, *(e.get(key) for e in same)])
     console = terminal()
-    for table in fitting(console, list(summaries), table_of):
+    for table in Table(["", *summaries], rows).fitting(console):
         console.print(table)

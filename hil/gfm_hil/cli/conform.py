@@ -4,37 +4,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.progress import BarColumn, TaskProgressColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gfm_hil.cli.common import (
-    EXIT_INTERRUPTED,
-    EXIT_OTHERWISE,
-    above,
-    add_map,
-    new_folder,
-    progress,
-)
+from gfm_hil.api.studies import conform
+from gfm_hil.cli.common import add_map, add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import fitting, terminal
 from gfm_hil.realtime.priority import processors
-from gfm_hil.studies.campaign.execute import WorkerLost
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
-from gfm_hil.studies.conformity.execute import Found, execute, foreign_controller, make_jobs
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, load_under_test, shipped_sets
-from gfm_runtime import law_file, law_names, law_titles
-from gfm_runtime.inner_file import named_inner
+from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, shipped_sets
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS
+from gfm_runtime import law_names
 
 EXIT_FAILED = 1
 _EXIT = {PASS: 0, FAIL: EXIT_FAILED, CANNOT: 4, INFORMATIVE: 4}
@@ -89,17 +77,20 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "-o", "--out", metavar="DIR", help="folder; runs/conform-<time> by default"
     )
-    command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
+    command.add_argument(
+        "--workers", type=int, default=processors(), metavar="N",
+        help="processes; all cores by default",
+    )  # fmt: skip
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
     command.add_argument("--list", action="store_true", help="list the tests, and run nothing")
-    command.add_argument("--json", action="store_true", help="print results.json, nothing else")
-    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_study_options(command, "results.json")
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the exit code."""
-    cases = load_cases(options.against or [ALL])
+    against = options.against or [ALL]
     if options.list:
+        cases = load_cases(against)
         if options.json:
             print(json.dumps([_plain(case) for case in cases], indent=2))
         else:
@@ -107,62 +98,20 @@ def call(options: argparse.Namespace) -> int:
         return 0
     if not options.law and options.controller is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
-    if options.workers is not None and not 1 <= options.workers <= 1024:
-        raise UserError(f"--workers {options.workers}: must lie in [1, 1024]")
-    foreign = foreign_controller(options.controller, options.map)
-    given = [n for law in options.law or [] for n in _names(law)]
-    for name in given:
-        law_file(name)
-    titles = law_titles(given)
-    laws = [*titles.values()]
-    if options.inner is not None:
-        named_inner(options.inner)
-    under = load_under_test(options.converter)
+    laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
     folder = new_folder(options.out, "conform")
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder}: is not empty; choose another --out")
-    files = {
-        title: str(Path(name).absolute()) if name.endswith(".toml") else name
-        for name, title in titles.items()
-    }
-    jobs = make_jobs(
-        files, cases, options.inner, under, folder / "converters", folder, not options.no_figures,
-        foreign,
-    )  # fmt: skip
-    found: list[Found] = []
-    lost = None
-    workers = options.workers or processors()
-    columns = BarColumn(), TaskProgressColumn(), "{task.fields[at]}", TimeRemainingColumn()
     began = time.monotonic()
-    with Interrupt() as interrupt, progress("{task.description}", *columns,
-                                            quiet=options.quiet) as bar:  # fmt: skip
-        task = bar.add_task("conform", total=len(jobs), at="starting …")
-
-        def keep(one: Found) -> None:
-            found.append(one)
-            bad = sum(f.verdict in (FAIL, CANNOT) for f in found)
-            at = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
-            bar.update(task, advance=1, at=escape(at))
-
-        try:
-            execute(jobs, workers, keep, lambda: interrupt.came, above(bar))
-        except WorkerLost as problem:
-            lost = problem
-        except KeyboardInterrupt:  # a second signal: the runs under way are lost
-            interrupt.ask()
-    if len(found) < len(jobs):
-        why = str(lost) if lost else "interrupted"
-        done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
-        print(f"gfmhil: {why}; {done}", file=sys.stderr)
-        return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
-    names = [*laws, *([foreign.name] if foreign else [])]
-    result = Conformity(names, options.inner, under, cases, found, folder)
-    result.write(folder)
+    with watching("conform", options.quiet, stoppable=True) as watch:
+        found = conform(
+            laws, against, folder, inner=options.inner, converter=options.converter,
+            controller=options.controller, ports=options.map,
+            workers=options.workers, figures=not options.no_figures, watch=watch,
+        )  # fmt: skip
     if options.json:
-        print(json.dumps(result.plain(), indent=1))
+        print(json.dumps(found.plain(), indent=1))
     else:
-        _print(result, time.monotonic() - began)
-    return _EXIT[result.verdict]
+        _print(found, time.monotonic() - began)
+    return _EXIT[found.verdict]
 
 
 def _diff(options: argparse.Namespace) -> int:
@@ -186,10 +135,6 @@ def _diff(options: argparse.Namespace) -> int:
             console.print(table)
         console.print(found.words, highlight=False)
     return EXIT_FAILED if found.worse else 0
-
-
-def _names(law: str) -> Sequence[str]:
-    return law_names() if law == ALL else [law]
 
 
 def _plain(case: Case) -> dict[str, Any]:
@@ -225,7 +170,7 @@ def _print(result: Conformity, wall_s: float) -> None:
             console.print(table)
     verdicts = list(result.matrix.values())
     told = ", ".join(f"{verdicts.count(v)} {v}" for v in SIGNS if v in verdicts)
-    count = len(result.found)
+    count = len(result.parts)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)
     report = Path(result.folder or ".") / "report.html"

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.table import Table
-
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import numbers, terminal
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.table import Table
 
 _RATES = {
     False: [(500_000, 0), (1_000_000, 0)],
@@ -55,23 +54,15 @@ def _budgets(T_s: float, inner: bool) -> Table:
     from gfm_hil.links.can.layout import load_plan
 
     heads = ("bytes", "y [µs]", "u [µs]", "both [µs]", "at most [Hz]", "every", "load")
-    table = numbers("bus [Mbit/s]", *heads)
-    table.caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"
-    table.caption_justify = "left"
-    for column in table.columns:
-        column.no_wrap = True
+    rows = []
     for fd, rates in _RATES.items():
         plan = load_plan(CanOptions(fd=fd).of_run(inner))
         for bitrate, data in rates:
             need = budget(plan, bitrate, data)
             every = need.every(T_s)
             name = f"FD {bitrate / 1e6:g}/{data / 1e6:g}" if fd else f"classic {bitrate / 1e6:g}"
-            table.add_row(
-                name,
-                "+".join(map(str, need.lengths)),
-                *(f"{time * 1e6:.1f}" for time in (need.y, need.u, need.exchange)),
-                f"{1 / need.exchange:.0f}",
-                f"{every}",
-                f"{need.load(every * T_s):.0%}",
-            )
-    return table
+            times = (f"{time * 1e6:.1f}" for time in (need.y, need.u, need.exchange))
+            fits = f"{1 / need.exchange:.0f}", every, f"{need.load(every * T_s):.0%}"
+            rows.append((name, "+".join(map(str, need.lengths)), *times, *fits))
+    caption = f"longest frames; every: ticks of {T_s * 1e6:g} µs to an exchange of both"
+    return Table(("bus [Mbit/s]", *heads), rows, caption=caption)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-
-from rich.markup import escape
-from rich.table import Table
+from typing import Any
 
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.terminal import terminal
+from gfm_hil.results.table import Cell, Table
 from gfm_hil.run.doctor import examine, worst
+
+_STYLES = {"green": "good", "yellow": "warn", "red": "bad"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -26,13 +27,10 @@ def call(options: argparse.Namespace) -> int:
         said = [finding._asdict() for finding in findings]
         print(json.dumps({"worst": level, "findings": said, "facts": facts}, indent=2))
     else:
-        table = Table(box=None, pad_edge=False, show_header=False)
-        for _ in ("level", "what", "found and what to do"):
-            table.add_column(overflow="fold")
+        rows: list[tuple[Any, ...]] = []
         for f in findings:
-            mark = f"[bold {f.level}]{f.level}[/]"
-            table.add_row(mark, f.what, escape(f.found))
+            rows.append((Cell(f.level, _STYLES[f.level]), f.what, f.found))
             if f.advice:
-                table.add_row("", "", escape(f"→ {f.advice}"))
-        terminal().print(table, highlight=False)
+                rows.append(("", "", f"→ {f.advice}"))
+        terminal().print(Table((), rows, text=None, fold=2), highlight=False)
     return EXIT_OTHERWISE if options.strict and level == "red" else 0

@@ -14,7 +14,8 @@ from pathlib import Path
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
-from gfm_hil.core.terminal import numbers, terminal
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.table import Table
 from gfm_runtime import Law, LawSet, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
@@ -259,21 +260,20 @@ def _ticks(ticks: int) -> int:
 
 
 def _print_proofs(proofs: Sequence[Proved]) -> None:
-    table = numbers("law", "functions", "alarms", "seconds")
-    for p in proofs:
-        table.add_row(p.name, str(p.functions), str(p.alarms), f"{p.seconds:g}")
+    rows = [(p.name, p.functions, p.alarms, f"{p.seconds:g}") for p in proofs]
+    table = Table(("law", "functions", "alarms", "seconds"), rows)
     terminal().print(table, highlight=False)
 
 
 def _print(results: Sequence[Checked]) -> None:
-    heads = ("rows", "words that differ", "instructions", "of these checks", "code [B]",
+    heads = ("law", "rows", "words that differ", "instructions", "of these checks", "code [B]",
              "constants [B]", "state [B]", "stack [B]")  # fmt: skip
-    table = numbers("law", *heads)
-    for r in results:
-        counted = "–" if r.instructions is None else f"{r.instructions[0]}…{r.instructions[1]}"
-        checks, stack = ("–" if n is None else str(n) for n in (r.checks, r.stack))
-        table.add_row(
-            r.name, str(r.rows), str(r.differ), counted, checks, str(r.code), str(r.constants),
-            str(r.state), stack,
-        )  # fmt: skip
-    terminal().print(table, highlight=False)
+    rows = [
+        (
+            r.name, r.rows, r.differ,
+            None if r.instructions is None else f"{r.instructions[0]}…{r.instructions[1]}",
+            r.checks, r.code, r.constants, r.state, r.stack,
+        )
+        for r in results
+    ]  # fmt: skip
+    terminal().print(Table(heads, rows), highlight=False)

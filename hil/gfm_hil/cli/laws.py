@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from rich.markup import escape
-from rich.table import Column, Table
 
+from gfm_hil.api.law import cell_text
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import load_scenario
-from gfm_hil.studies.law import cell_text
+from gfm_hil.results.table import Table
+from gfm_hil.scenario import load_scenario
 from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
 from gfm_runtime.inner_file import acting, inner_names, named_inner
 from gfm_runtime.law import HomeGrid
@@ -61,21 +61,21 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
         return 0
-    columns = (Column("law", no_wrap=True), "states", "elements of Φ(s)", "title")
-    table = Table(*columns, box=None, pad_edge=False)
+    lines = []
     for row in rows:
         cells = "  ".join(f"φ{k} {v}" for k, v in row["elements"].items())  # type: ignore[attr-defined]
-        weak = "" if row["home_grid"]["L_g"] == 1 else " [dim](weak grid)[/]"  # type: ignore[index]
-        table.add_row(str(row["name"]), str(row["order"]), cells, f"{row['title']}{weak}")
+        weak = "" if row["home_grid"]["L_g"] == 1 else " (weak grid)"  # type: ignore[index]
+        lines.append((row["name"], row["order"], cells, f"{row['title']}{weak}"))
     console = terminal()
-    console.print(table)
-    stages = Table(Column("inner stage", no_wrap=True), "what it is", box=None, pad_edge=False)
-    for name in inner_names():
-        spec = named_inner(name)
-        about = "the bridge produces E_u itself" if spec is None else inspect.getdoc(type(spec))
-        stages.add_row(name, about)
+    heads = ("law", "states", "elements of Φ(s)", "title")
+    console.print(Table(heads, lines, text=None))
+    specs = {name: named_inner(name) for name in inner_names()}
+    stages = [
+        (name, "the bridge produces E_u itself" if spec is None else inspect.getdoc(type(spec)))
+        for name, spec in specs.items()
+    ]
     console.print()
-    console.print(stages)
+    console.print(Table(("inner stage", "what it is"), stages, text=None))
     return 0
 
 
@@ -93,17 +93,15 @@ def call_show(options: argparse.Namespace) -> int:
     console.print(f"errors: {first.error_map} · grid: {first.home_grid.note}")
     if why := _unstable(options, first.home_grid):
         console.print(f"[red]on this grid {escape(why)}[/]", soft_wrap=True)
-    table = Table("Φ(s)", *Y_NAMES, box=None, pad_edge=False)
-    for i, u in enumerate(U_NAMES):
-        table.add_row(u, *[cell_text(file, f"{i + 1}{j + 1}") for j in range(5)])
-    console.print(table)
-    names = Table("parameter", "value", "unit", "source", box=None, pad_edge=False)
-    for name, p in first.parameters.items():
-        names.add_row(name, f"{p.value:g}", p.unit, p.source)
-    console.print(names)
+    elements = [
+        (u, *(cell_text(file, f"{i + 1}{j + 1}") for j in range(5))) for i, u in enumerate(U_NAMES)
+    ]
+    console.print(Table(("Φ(s)", *Y_NAMES), elements, text=None))
+    values = [(n, f"{p.value:g}", p.unit, p.source) for n, p in first.parameters.items()]
+    console.print(Table(("parameter", "value", "unit", "source"), values, text=None))
     if first.inner is not None:
-        values = ", ".join(f"{k} = {_value(v)}" for k, v in acting(first.inner).items())
-        console.print(f"inner stage: {first.inner.kind} ({values})")
+        keys = ", ".join(f"{k} = {_value(v)}" for k, v in acting(first.inner).items())
+        console.print(f"inner stage: {first.inner.kind} ({keys})")
     for k, d in enumerate(discrete):
         stage = f", stage {k}" if len(discrete) > 1 else ""
         console.print(f"[bold]discrete, T_s = {d.T_s:g} s{stage}[/]: {d.order} states")

@@ -37,7 +37,7 @@ COMMANDS = {
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
-    "identify": ("identify", "measure a converter's dq admittance, and judge grids by it"),
+    "scan": ("scan", "measure a converter's dq admittance, and judge grids by it"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
     "firmware": (
@@ -56,8 +56,8 @@ COMMANDS = {
     "plant": ("roles", "start the plant emulator alone; it connects to the endpoint"),
 }
 
-#: names that go on working for one version
-_FORMER = {"tell": "command"}
+#: names of earlier versions, which go on working for one version
+_EARLIER = {"identify": "scan", "tell": "command"}
 
 
 class _Version(argparse.Action):
@@ -98,9 +98,11 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given and given[0] in _FORMER:
-        print(f"gfmhil {given[0]} is now gfmhil {_FORMER[given[0]]}", file=sys.stderr)
-        given[0] = _FORMER[given[0]]
+    if given and given[0] in _EARLIER:
+        now = _EARLIER[given[0]]
+        note = f"is gfmhil {now} now; this name goes with version 0.3"
+        print(f"gfmhil {given[0]}: {note}", file=sys.stderr)
+        given[0] = now
     for text in given:
         if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
             why = "-- cannot be a value; for a file of that name write ./--"

@@ -21,7 +21,7 @@ from gfm_hil.links import link_names
 from gfm_hil.realtime.priority import one_processor
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_part, run_side
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
 from gfm_runtime.errors import meant
 

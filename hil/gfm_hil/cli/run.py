@@ -26,7 +26,7 @@ from gfm_hil.ports import PORTS
 from gfm_hil.ports.companion import OWN_NUMBER, companion
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
-from gfm_hil.scenario.model import INPROC, find_scenario
+from gfm_hil.scenario import INPROC, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:

@@ -6,10 +6,9 @@ import argparse
 import json
 from pathlib import Path
 
-from rich.table import Column, Table
-
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import load_scenario, shipped_scenarios
+from gfm_hil.results.table import Table
+from gfm_hil.scenario import load_scenario, shipped_scenarios
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -23,16 +22,10 @@ def call(options: argparse.Namespace) -> int:
                 for n, s in found.items()]  # fmt: skip
         print(json.dumps(rows, indent=2))
         return 0
-    columns = (
-        Column("scenario", no_wrap=True),
-        "mode",
-        Column("laws", overflow="fold"),
-        "s",
-        "title",
-    )
-    table = Table(*columns, box=None, pad_edge=False)
-    for name, s in found.items():
-        laws = ", ".join(Path(law).name for law in s.laws())
-        table.add_row(name, s.mode, laws, f"{s.duration:g}", s.title)
-    terminal().print(table)
+    lines = [
+        (name, s.mode, ", ".join(Path(law).name for law in s.laws()), f"{s.duration:g}", s.title)
+        for name, s in found.items()
+    ]
+    heads = ("scenario", "mode", "laws", "s", "title")
+    terminal().print(Table(heads, lines, text=None, fold=2))
     return 0

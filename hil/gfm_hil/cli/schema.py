@@ -11,9 +11,10 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from gfm_hil.core.files import write_text
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
-from gfm_hil.studies.conformity.model import Test, UnderTest
+from gfm_hil.studies.conformity.model import Test
+from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_runtime.inner_file import InnerSpec
 from gfm_runtime.lawfile import LawFile
 

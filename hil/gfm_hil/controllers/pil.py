@@ -26,7 +26,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import our_controller_on
 from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
-from gfm_runtime.children import END_NOW, guarded
+from gfm_runtime.children import end_now, guarded
 from gfm_runtime.firmware.check import TARGETS, need_tools
 from gfm_runtime.firmware.golden import SHIPPED, Golden, golden
 from gfm_runtime.firmware.loop import CHANGE, CHECK, FROM, START, TICK, TO, LoopProgram, build_loop
@@ -274,7 +274,7 @@ class PilController:
             raise ControllerError(f"{self.name}: refuses: {_SAID[result]}: {names[channel]}")
 
     def _end(self) -> None:
-        self._process.send_signal(END_NOW)
+        end_now(self._process)
         self._process.wait()
 
 

@@ -29,6 +29,12 @@ _ENTRY = b"PK\x01\x02"  # begins each entry of a zip file's directory
 _LONGEST = 1 << 17  # bytes of an entry, at most: a name and an extra field of 64 KiB each
 
 
+def check_empty(folder: Path) -> None:
+    """Raise UserError if a folder to write to holds something already, or is none."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UserError(f"{folder}: is not empty; choose another folder (--out)")
+
+
 def open_file(path: Path, most: int | None = None) -> io.BufferedReader:
     """Open a file of a run folder for reading: regular, no link, at most so many bytes.
 

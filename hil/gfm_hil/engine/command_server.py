@@ -27,25 +27,17 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.rate import Rate
 from gfm_hil.core.roles import Role
 from gfm_hil.engine.announcement import LARGEST, SCHEME, announcement
-from gfm_hil.engine.retune import ready_gains
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.scenario.events import (
-    CONTROLLER_EVENTS,
-    Event,
-    Gains,
-    LawChange,
-    Reset,
-    apply_grid_event,
-)
-from gfm_runtime.errors import meant
+from gfm_hil.scenario.events import AnyEvent
+from gfm_hil.scenario.events.base import Event
 
 _LOOK_MS = 100
 _TAKEN_OVER_S = 5.0  # in lockstep a tick lasts until the other side answers
 _ROOM = 16  # commands that wait, of one operator
 _PER_S, _BURST = 100.0, 200  # commands to one side, of all operators together
 
-_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+_EVENT: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 _UNKNOWN = {"through": "socket"}  # for a program that does not identify itself
 _LOG = logging.getLogger(__name__)
 
@@ -142,37 +134,26 @@ class CommandServer:
                     raise ValueError(f"{key} = {content[key]}: a command is carried out at once")
             return self._carry_out(self._checked({**content, "tick": 0}), by)
         except ValidationError as problem:
-            return {"ok": False, "error": "; ".join(lines(problem, Event))}
+            return {"ok": False, "error": "; ".join(lines(problem, AnyEvent))}
         except (UserError, ValueError, RecursionError) as problem:
             return {"ok": False, "error": str(problem)}
         except Exception as problem:  # our own mistake must not end the server
             _LOG.exception("the %s's command server: %r", self._role, message[:200])
             return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
 
-    def _checked(self, content: Any) -> Any:
+    def _checked(self, content: Any) -> Event:
         """The checked event; whatever could fail in the loop is tried here first.
 
         Raises:
             ValueError: it is no event, belongs to the other role, or cannot be carried out.
         """
-        event = _EVENT.validate_python(content)
-        ours = "controller" if isinstance(event, CONTROLLER_EVENTS) else "plant"
-        if ours != self._role:
-            raise ValueError(f"type = {event.type!r}: for the {ours}, not the {self._role}")
-        if isinstance(event, LawChange) and event.law not in self._bench.controller.sets:
-            ready = sorted(self._bench.controller.sets)
-            known = f"ready are {ready}{meant(event.law, ready)}"
-            raise ValueError(f"law = {event.law!r}: not made ready for this run; {known}")
-        c = self._bench.controller
-        if isinstance(event, Gains):
-            ready_gains(c, event.values)
-        if isinstance(event, Reset) and self._bench.scenario.after_trip == "end":
-            raise ValueError("reset: this run ends at a trip; after_trip = 'wait' in its scenario")
-        if ours == "plant":
-            apply_grid_event(event, self._bench.plant.copy())
+        event: Event = _EVENT.validate_python(content)
+        if event.side != self._role:
+            raise ValueError(f"type = {event.type!r}: for the {event.side}, not the {self._role}")
+        event.check_now(self._bench)
         return event
 
-    def _carry_out(self, event: Any, by: Identity) -> dict[str, Any]:
+    def _carry_out(self, event: Event, by: Identity) -> dict[str, Any]:
         ticket = self._timeline.insert(event, by.plain(), self._timelines[1:])
         self._wake()
         until = time.monotonic() + _TAKEN_OVER_S
@@ -183,6 +164,6 @@ class CommandServer:
                 return {"ok": False, "error": "the run is over" if over else late}
         if ticket.error:
             return {"ok": False, "error": ticket.error}
-        if isinstance(event, Gains):
+        if event.changes_law:  # its new gains may have an index of their own
             self._announce()
         return {"ok": True, "tick": ticket.tick, "label": self._timeline.label(event)}

@@ -24,7 +24,7 @@ from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.parts import Part
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 #: a name for people, and what compiles the functions, or loads them from the cache
 Set = tuple[str, Callable[[], object]]

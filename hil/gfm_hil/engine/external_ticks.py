@@ -19,9 +19,9 @@ from gfm_hil.controllers import ControllerError, ExternalController
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.engine.controller_ticks import receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
-from gfm_hil.engine.retune import Retuned, ready_gains
 from gfm_hil.recording.columns import kept_of
-from gfm_hil.scenario.events import Gains, LawChange
+from gfm_hil.scenario.events.base import Event
+from gfm_hil.scenario.events.gains import Gains, Retuned, ready_gains
 from gfm_runtime.assembly import Controller
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import accept, bad_output, follow_plant, measured, next_law
@@ -84,13 +84,13 @@ class SteppedController:
         """Whether it runs the run's own laws, between which events may change."""
         return self._ours is not None
 
-    def check(self, event: object, controller: Controller) -> None:
+    def check(self, event: Event, controller: Controller) -> None:
         """Refuse an event that the external controller cannot follow.
 
         Raises:
             ValueError: why.
         """
-        if not isinstance(event, (LawChange, Gains)):
+        if not event.changes_law:
             return
         if self._ours is None:
             raise ValueError(f"{self.name} has a law of its own")

@@ -33,7 +33,7 @@ from gfm_hil.engine.waiting import await_message
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError, FrameReader
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import TABLE_VERSION, carried, table_hash
 
 _PREFIX = b"GFMHIL "

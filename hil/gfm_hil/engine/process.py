@@ -26,7 +26,7 @@ from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.sd_notify import Watched, notify
-from gfm_hil.engine.setup import Bench, gains_of, make_bench, make_benches
+from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
@@ -42,9 +42,8 @@ from gfm_hil.realtime.priority import (
 from gfm_hil.recording.log import SEVERITY, Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
-from gfm_hil.scenario.events import Gains, LawChange
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import Scenario, write_scenario
+from gfm_hil.scenario.events.gains import gains_of
 from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import carried
@@ -107,7 +106,7 @@ def _stepped(external: ExternalController | PilController, bench: Bench) -> Step
     scenario = bench.scenario
     if not isinstance(external, PilController):
         for event in scenario.events:
-            if isinstance(event, (LawChange, Gains)):
+            if event.changes_law:
                 raise UserError(f"events, {event.label()}: {external.name} has a law of its own")
     elif scenario.mode == "realtime":
         raise UserError(f"mode = 'realtime': {external.name} keeps no time; choose --mode lockstep")

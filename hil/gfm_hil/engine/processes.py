@@ -19,8 +19,8 @@ from gfm_hil.links import link_kind
 from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.parts import Part, keep_in_memory
-from gfm_hil.scenario.model import Scenario
-from gfm_runtime.children import END_NOW, guarded
+from gfm_hil.scenario import Scenario
+from gfm_runtime.children import end_now, guarded
 
 #: told (ticks done, misses so far); may be called a few times a second
 Progress = Callable[[int, int], None]
@@ -137,7 +137,7 @@ class Processes:
             finally:
                 for process in started:
                     if process.popen.poll() is None:
-                        process.send(END_NOW)
+                        end_now(process.popen)
                         process.popen.wait()
         return began, self._judge()
 
@@ -209,7 +209,8 @@ class Processes:
                 self._send(signal.SIGINT)
                 told, kill_at = True, now + _GRACE_S
             if now >= kill_at:
-                self._send(END_NOW)
+                for process in self._all:
+                    end_now(process.popen)
         return began
 
     def _ends_all(self, ended: _Process, part: Part | None) -> tuple[bool, bool]:

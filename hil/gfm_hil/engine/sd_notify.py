@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.realtime.priority import stand_back
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 _PATIENCE_S = 1.0  # the service manager does not read; the next message says it again
 _STATUS_S = 1.0

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from gfm_design.model.operating_point import OperatingPoint, operating_point, operating_points
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.external_ticks import SteppedController
-from gfm_hil.engine.retune import Retuned, retuned
-from gfm_hil.scenario.events import Gains, LawChange, Reset
-from gfm_hil.scenario.model import Scenario, plant_of
+from gfm_hil.scenario import Scenario, plant_of
+from gfm_hil.scenario.events.gains import gains_of
 from gfm_plant import Network, NoEquilibrium, start_again, take_out
 from gfm_plant.names import MAY_START
 from gfm_runtime import law_titles, load_law
@@ -197,26 +196,3 @@ def _text(file: str) -> str:
         return Path(file).read_text(encoding="utf-8")
     except (OSError, ValueError):
         return ""  # load_law says what is wrong with it
-
-
-def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
-    """Every change of gains that the scenario names, prepared before it runs; ``omega_b`` as for
-    ``retuned``.
-
-    Raises:
-        UserError: a change that is not possible.
-    """
-    found, name, gains = list[Retuned](), scenario.law, dict[str, float]()
-    for event in scenario.sorted_events():
-        if isinstance(event, LawChange):
-            name, gains = event.law, {}
-        elif isinstance(event, Reset):
-            name, gains = scenario.law, {}
-        elif isinstance(event, Gains):
-            gains.update(event.values)
-            try:
-                given = tuple(sorted(gains.items()))
-                found.append(retuned(name, given, scenario.T_s, omega_b, scenario.inner))
-            except ValueError as problem:
-                raise UserError(f"events, {event.label()}: {problem}") from None
-    return found

@@ -18,20 +18,9 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.engine.retune import change_gains
 from gfm_hil.engine.setup import Bench
 from gfm_hil.recording.log import Outcome, Status
-from gfm_hil.scenario.events import (
-    CONTROLLER_EVENTS,
-    Gains,
-    GridProfile,
-    LawChange,
-    Reference,
-    Reset,
-    apply_grid_event,
-    nominal_hz,
-)
-from gfm_hil.scenario.profiles import Point, read_profile
+from gfm_hil.scenario.events.base import Event, PlantEvent, nominal_hz
 from gfm_plant import Checked, Network, finish_check, trip_reason, wait_reason
 from gfm_plant.names import CONTROLLER, NOT_ASKED
 from gfm_runtime.signals import carried
@@ -86,13 +75,10 @@ class Timeline:
         self.failed = ""  # why the log cannot be written; empty if it can
         scenario = bench.scenario
         ours: list[tuple[int, Any]] = [
-            (e.at(scenario.T_s), e)
-            for e in scenario.sorted_events()
-            if ("controller" if isinstance(e, CONTROLLER_EVENTS) else "plant") in roles
+            (e.at(scenario.T_s), e) for e in scenario.sorted_events() if e.side in roles
         ]
-        for begin, e in [(k, e) for k, e in ours if isinstance(e, GridProfile)]:
-            profile = read_profile(e.file, nominal_hz(bench.plant))
-            ours += [(begin + k, point) for k, point in profile.points(scenario.T_s)]
+        for begin, e in [(k, e) for k, e in ours if isinstance(e, PlantEvent)]:
+            ours += [(begin + k, point) for k, point in e.course(bench.plant)]
         self._todo = deque[tuple[int, Any]](sorted(ours, key=lambda entry: entry[0]))
         self._inbox: deque[tuple[Any, Ticket]] = deque()
         self._changes = 0
@@ -113,7 +99,7 @@ class Timeline:
         return self._todo[0][0] if self._todo else 2**62
 
     def insert(
-        self, event: Any, operator: dict[str, Any], others: Sequence[Timeline] = ()
+        self, event: Event, operator: dict[str, Any], others: Sequence[Timeline] = ()
     ) -> Ticket:
         """Queue an event for the next tick; any thread may call this.
 
@@ -130,7 +116,7 @@ class Timeline:
         """Carry out every event due at this tick, and the queued ones."""
         while self._todo and self._todo[0][0] <= tick:
             event = self._todo.popleft()[1]
-            if isinstance(event, Point):
+            if not isinstance(event, Event):  # a point of an event's course
                 if self._bench.place == 0:
                     event.apply(self._bench.plant)
                 continue
@@ -152,32 +138,15 @@ class Timeline:
                 ticket.error = str(problem)
             ticket.done.set()
 
-    def _carry_out(self, event: Any, tick: int, **more: Any) -> None:
+    def _carry_out(self, event: Event, tick: int, **more: Any) -> None:
         if self._bench.external is not None:
             self._bench.external.check(event, self._bench.controller)
-        match event:
-            case Reference():
-                for name, value in event.values().items():
-                    self._bench.controller.set(name, value, event.ramp_s)
-            case LawChange():
-                self._bench.controller.select(event.law)
-            case Gains():
-                change_gains(self._bench.controller, event.values)
-            case Reset():
-                self._bench.reset_controller()
-            case GridProfile() if "operator" not in more:
-                pass  # its points follow
-            case _ if self._bench.place > 0:
-                pass  # what happens to a network, the timeline of its first converter carries out
-            case _:
-                apply_grid_event(event, self._bench.plant)
+        event.carry_out(self._bench)
         self.write(tick, event.type, label=self.label(event), **more)
 
-    def label(self, event: Any) -> str:
-        """What results call an event; no law file is read for it while the loop runs."""
-        if isinstance(event, LawChange):
-            return f"law {self._bench.controller.titles[event.law]}"
-        return str(event.label())
+    def label(self, event: Event) -> str:
+        """What results call an event; no file is read for it while the loop runs."""
+        return event.label_in(self._bench)
 
     def look(self, tick: int) -> None:
         """Log what the last tick brought: a change of law, a safe state, a trip."""
@@ -239,8 +208,9 @@ class Timeline:
         self.end(*(self._fault or ("completed", "")), tick)
 
     def end(self, status: Status, reason: str, tick: int) -> None:
-        """End the run; the first reason stays."""
+        """End the run, with tick -1 before its tick 0; the first reason stays."""
         if self.outcome is None:
+            tick = max(tick, 0)
             if self.failed and status == "interrupted":
                 status, reason = "safe", self.failed
             self.outcome = Outcome(status, reason, tick)

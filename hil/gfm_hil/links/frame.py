@@ -211,7 +211,7 @@ def judge(reader, overdue, latched):
 
 if TYPE_CHECKING:
     from gfm_hil.core.roles import Role
-    from gfm_hil.scenario.model import Scenario
+    from gfm_hil.scenario import Scenario
 
 LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
 
@@ -268,12 +268,13 @@ class FrameReader:
     def of(cls, role: Role, scenario: Scenario) -> FrameReader:
         """The reader of one side, with the limits that its scenario sets.
 
-        A gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone. The
-        plant's loop writes its own tick into ``newest`` at every tick.
+        In lockstep the sides wait for each other, so a tick comes after the one before. In real
+        time a gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone.
+        The plant's loop writes its own tick into ``newest`` at every tick.
         """
         reader = cls("u" if role == "plant" else "y", scenario.has_inner)
         lockstep, r = scenario.mode == "lockstep", reader.record
-        r["delta"] = math.ceil(scenario.peer_timeout_s / scenario.T_s) + 1
+        r["delta"] = 1 if lockstep else math.ceil(scenario.peer_timeout_s / scenario.T_s) + 1
         asked = math.ceil(min(scenario.peer_timeout_s / scenario.link.repeat_s, LONGEST_JUMP))
         r["jump"] = min(int(r["delta"][0]) + asked + LAST_TIMES, LONGEST_JUMP)
         r["again"] = asked if lockstep else 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import zmq
 
@@ -14,12 +14,11 @@ from gfm_hil.core.identity import Identity, local
 from gfm_hil.core.roles import Role
 from gfm_hil.engine.announcement import LARGEST, announced, not_running, present
 from gfm_hil.recording.live import LiveRun
-from gfm_hil.scenario.events import CONTROLLER_EVENTS
+from gfm_hil.scenario.events import EVENTS
 from gfm_plant import TRIP_REASONS
 from gfm_runtime.states import REASONS, STATES
 
 _ANSWER_MS = 6000
-_CONTROLLERS = {get_args(e.model_fields["type"].annotation)[0] for e in CONTROLLER_EVENTS}
 
 
 def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
@@ -70,7 +69,7 @@ class Operator:
         kind = event.get("type", "")
         if not isinstance(kind, str):
             raise UserError(f"type = {str(kind)[:60]}: must be the name of an event")
-        return self._ask("controller" if kind in _CONTROLLERS else "plant", event, by)
+        return self._ask(EVENTS[kind].side if kind in EVENTS else "plant", event, by)
 
     def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
         """The former name of ``command``, for one version."""

@@ -124,7 +124,8 @@ def most_bytes(ticks: int) -> int:
 
 
 def read_log(*paths: Path, most: int = _MOST) -> list[dict[str, Any]]:
-    """The lines of one or more logs of at most so many bytes each, in order of their ticks.
+    """The lines of one or more logs of at most so many bytes each, in order of their ticks; of one
+    tick, a cause stands before what the other role says of it.
 
     It skips damaged lines: the last line of a process that was killed may be incomplete.
 
@@ -144,7 +145,7 @@ def read_log(*paths: Path, most: int = _MOST) -> list[dict[str, Any]]:
                 _Line.model_validate(line)
                 if line.keys() >= _NEEDS.get(line["event"], set()):
                     found.append(line)
-    return sorted(found, key=lambda line: line["tick"])
+    return sorted(found, key=lambda line: (line["tick"], line.get("reason") in _SECONDARY))
 
 
 def read_events(folder: Path, ticks: int) -> list[dict[str, Any]]:

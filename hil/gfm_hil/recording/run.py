@@ -30,8 +30,7 @@ from gfm_hil.recording.columns import (
 from gfm_hil.recording.log import most_bytes, read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
 from gfm_hil.recording.waveforms import three_phase
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.profiles import look_beside
+from gfm_hil.scenario import Scenario, look_beside
 from gfm_plant import Bases, load_converter
 from gfm_runtime.toml_file import read_toml
 

@@ -18,8 +18,8 @@ from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.scenario.events import Fault
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
 from gfm_runtime import law_titles
 

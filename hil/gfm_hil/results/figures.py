@@ -22,8 +22,8 @@ from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, Columns, Rows
 from gfm_hil.recording.run import bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
+from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
-from gfm_hil.scenario.model import Scenario
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart, and which print well
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

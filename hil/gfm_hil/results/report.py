@@ -2,43 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gfm_hil.core.files import write_text
 from gfm_hil.recording.run import Run, controlled_by
+from gfm_hil.results.page import fragment, inline, write_page
+from gfm_hil.results.table import Cell, Table, shown
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.summary import END_METRICS
-from gfm_hil.scenario.model import Scenario
 
 if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture
-
-#: of every page that this program writes
-STYLE = """
-:root{color-scheme:light dark;--ink:#222;--paper:#fff;--line:#e4e4e4;--soft:#f6f6f6;--wrong:#b34500}
-@media (prefers-color-scheme:dark){
-:root{--ink:#ddd;--paper:#1a1a1a;--line:#3a3a3a;--soft:#262626;--wrong:#ff9d66}
-a{color:#8ab4f8} svg,img{filter:invert(.9) hue-rotate(180deg)}}
-body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;
-color:var(--ink);background:var(--paper);overflow-wrap:break-word}
-h1{font-size:1.4rem;margin-bottom:.2rem} h2{font-size:1.1rem;margin-top:2rem}
-table{border-collapse:collapse;margin:.6rem 0} th,td{padding:.25rem .8rem .25rem 0;text-align:left;
-border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums}
-.scroll :is(th,td):not(:first-child){text-align:right}
-.scroll{overflow-x:auto} .scroll th{white-space:nowrap}
-.panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,28rem),1fr));
-gap:1rem;align-items:end;margin:1.5rem 0} .panels svg{width:100%}
-.status{display:inline-block;padding:.1rem .6rem;border-radius:.3rem;color:#fff;background:#555}
-.completed,.expected{background:#00734f} .oscillating,.tripped,.safe{background:#b34500}
-.unmet{color:var(--wrong)}
-pre{background:var(--soft);padding:1rem;overflow-x:auto;font-size:13px}
-"""
 
 EVENT_COLUMNS = (
     ("label", "event"),
@@ -82,18 +60,6 @@ def as_expected(summary: dict[str, Any]) -> bool:
     return summary["status"] != "completed" and not summary["unmet"]
 
 
-def cell(value: Any) -> str:
-    """A value as people read it; – for one that is unknown or that there is not."""
-    match value:
-        case None:
-            return "–"
-        case float():
-            return f"{value:.4g}" if abs(value) < 10 else f"{value:.5g}"
-        case list():
-            return ", ".join(cell(v) for v in value) or "–"
-    return str(value)
-
-
 def finite(value: Any) -> Any:
     """None in place of NaN and infinity, which JSON does not know, in lists and dicts too."""
     match value:
@@ -119,17 +85,6 @@ def inner_stages(summary: Mapping[str, Any]) -> str:
     return ", ".join(f"{law}: {kind}" for law, kind in kinds.items())
 
 
-def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
-    """A table in HTML, which may be wider than the page."""
-
-    def line(tag: str, cells: Sequence[str]) -> str:
-        return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
-
-    title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-    body = line("th", heads) + "".join(line("td", row) for row in rows)
-    return f'<div class="scroll"><table>{title}{body}</table></div>'
-
-
 def write_report(run: Run | NetworkRun) -> None:
     """Draw the figures of a run and write report.html into its folder; of several converters in a
     network only the figures that they share."""
@@ -144,94 +99,100 @@ def write_report(run: Run | NetworkRun) -> None:
         draw_diagram(folder, scenario)
         return
     pictures = draw_run(folder, scenario, run.columns, run.timing, run.summary)
-    _write_page(folder, scenario, run.summary, pictures, draw_diagram(folder, scenario))
+    _write_page(run, folder, pictures, draw_diagram(folder, scenario))
 
 
-def _write_page(
-    folder: Path,
-    scenario: Scenario,
-    summary: dict[str, Any],
-    pictures: Sequence[Picture],
-    diagram: Path,
-) -> None:
-    status = html.escape(summary["status"])
-    look, expected = ("expected", ", as expected:") if as_expected(summary) else (status, "")
-    facts = [
-        ("controlled by", controlled_by(summary)),
-        *([("inner stage", inner_stages(summary))] if staged(summary) else []),
-        ("link, mode", f"{summary['link']}, {summary['mode']}"),
-        (
-            "simulated",
-            f"{summary['duration_s']:g} s, {summary['ticks']} ticks of {summary['T_s'] * 1e6:g} µs",
+def _write_page(run: Run, folder: Path, pictures: Sequence[Picture], diagram: Path) -> None:
+    summary, scenario = run.summary, run.scenario
+    resolved = (folder / "scenario.toml").read_text("utf-8")
+    for one in [scenario, *map(scenario.of, scenario.converters)]:
+        for law in {*one.laws(), *one.compare}:
+            resolved = resolved.replace(f'"{law}"', f'"{Path(law).name}"')
+    write_page(
+        folder / "report.html",
+        "run.html",
+        title=scenario.title,
+        description=scenario.description,
+        status=summary["status"],
+        look="expected" if as_expected(summary) else summary["status"],
+        reason=summary["reason"],
+        unmet=summary["unmet"],
+        facts=Table(
+            (), [(Cell(name, "head"), value) for name, value in _facts(summary)], text=None
         ),
-        ("wall clock", f"{summary['wall_s']:.2f} s"),
-        ("misses", cell(summary["misses"])),
-        ("bump at a law change [p.u.]", cell(summary["bump_pu"])),
-    ]
+        pictures=pictures,
+        diagram=inline(diagram),
+        events=_events(summary["events"]),
+        resolved=resolved,
+    )
+
+
+def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What the report says of a run before its figures."""
+    yield "controlled by", controlled_by(summary)
+    if staged(summary):
+        yield "inner stage", inner_stages(summary)
+    yield "link, mode", f"{summary['link']}, {summary['mode']}"
+    T_us = summary["T_s"] * 1e6
+    yield "simulated", f"{summary['duration_s']:g} s, {summary['ticks']} ticks of {T_us:g} µs"
+    yield "wall clock", f"{summary['wall_s']:.2f} s"
+    yield "misses", summary["misses"]
+    yield "bump at a law change [p.u.]", summary["bump_pu"]
     if summary["round_trip_us"]:
-        times = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
-        facts.append(("round trip [µs]", times))
+        yield (
+            "round trip [µs]",
+            ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items()),
+        )
     if "instructions" in summary:
-        counts = ", ".join(f"{k} {v}" for k, v in summary["instructions"].items())
-        facts.append(("instructions of a step", counts))
+        counts = summary["instructions"].items()
+        yield "instructions of a step", ", ".join(f"{k} {v}" for k, v in counts)
     date = datetime.fromisoformat(summary["date"]).strftime("%Y-%m-%d %H:%M:%S UTC")
-    facts.append(("date, version", f"{date}, gfmhil {summary['version']}"))
-    for machine, found in summary["machines"].items():
-        judged = f", doctor: {found['worst']} ({'; '.join(found['findings'])})" if found else ""
-        facts.append(("machine", machine + judged))
+    yield "date, version", f"{date}, gfmhil {summary['version']}"
+    for machine, judged in summary["machines"].items():
+        said = f", doctor: {judged['worst']} ({'; '.join(judged['findings'])})" if judged else ""
+        yield "machine", machine + said
     if any(summary["faults"].values()):
         missing = (
             f"{role}: {', '.join(f'{number} {name}' for name, number in counted.items()) or 'none'}"
             for role, counted in summary["faults"].items()
         )
-        facts.append(("frames refused or lost", "; ".join(missing)))
+        yield "frames refused or lost", "; ".join(missing)
     if summary["e2e"]:
-        states = ", ".join(f"{role} {state}" for role, state in summary["e2e"].items())
-        facts.append(("end-to-end protection", states))
-    rows = "".join(f"<tr><th>{html.escape(a)}</th><td>{html.escape(b)}</td></tr>" for a, b in facts)
-    images = "".join(figure(picture.path.stem, picture.panels) for picture in pictures)
-    images += f'<p class="scroll"><img alt="network" src="{inline(diagram)}"></p>'
-    unmet = "".join(
-        f'<p class="unmet">not as expected: {html.escape(part)}</p>' for part in summary["unmet"]
-    )
-    resolved = (folder / "scenario.toml").read_text("utf-8")
-    for one in [scenario, *map(scenario.of, scenario.converters)]:
-        for law in {*one.laws(), *one.compare}:
-            resolved = resolved.replace(f'"{law}"', f'"{Path(law).name}"')
-    resolved = html.escape(resolved)
-    path = folder / "report.html"
-    write_text(
-        path,
-        f"""<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{html.escape(scenario.title)}</title><style>{STYLE}</style>
-<h1>{html.escape(scenario.title)}</h1>
-<p><span class="status {look}">{status}</span>{expected} {html.escape(summary["reason"])}</p>
-{unmet}
-<p>{html.escape(scenario.description)}</p>
-<table>{rows}</table>
-{images}
-<h2>Events</h2>{_events(summary["events"])}
-<h2>Scenario as resolved</h2><pre>{resolved}</pre></html>
-""",
-    )
+        yield (
+            "end-to-end protection",
+            ", ".join(f"{role} {state}" for role, state in summary["e2e"].items()),
+        )
 
 
-def _events(events: Sequence[dict[str, Any]]) -> str:
+def _events(events: Sequence[dict[str, Any]]) -> Table:
     """What each event brought: a column each, or a row each if there are many."""
     columns = event_rows(events)
-    rows = [[title, *(cell(event.get(name)) for event in events)] for name, title in columns]
+    rows: list[list[Any]] = [
+        [title, *(event.get(name) for event in events)] for name, title in columns
+    ]
     if len(events) > len(columns):
         rows = [list(row) for row in zip(*rows, strict=True)]
-    return html_table(rows[0], rows[1:]) if rows else "<p>None.</p>"
+    return Table(rows[0] if rows else (), rows[1:])
+
+
+def events_table(events: Sequence[dict[str, Any]]) -> Table:
+    """What each event brought: a quantity a row, an event a column."""
+    heads = [f"{event['label']} @ {event['t']:g} s" for event in events]
+    rows = [row for row in event_rows(events) if row[0] not in ("label", "t")]
+    cells = [[title, *(event.get(name) for event in events)] for name, title in rows]
+    return Table(["", *heads], cells)
+
+
+# what the pages of the bench and of the conformity tests still take
+STYLE = (Path(__file__).parent / "pages/style.css").read_text(encoding="utf-8")
+cell = shown
+
+
+def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
+    """A table in HTML, which may be wider than the page."""
+    return fragment(Table(heads, [*rows], caption))
 
 
 def figure(name: str, panels: Sequence[str]) -> str:
     """A figure of which a page sets as many panels side by side as are readable there."""
     return f'<figure class="panels" aria-label="{html.escape(name)}">{"".join(panels)}</figure>'
-
-
-def inline(picture: Path) -> str:
-    """A picture as the address of an image in a page that needs no other file."""
-    kind = {".png": "png", ".svg": "svg+xml"}[picture.suffix]
-    return f"data:image/{kind};base64,{base64.b64encode(picture.read_bytes()).decode()}"

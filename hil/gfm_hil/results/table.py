@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -53,7 +52,7 @@ class Table:
     Attributes:
         heads: of the columns; none for a table without a line of heads.
         rows: values, as ``shown`` writes them, or cells.
-        title: above it.
+        title, caption: above and below it.
         text: how many columns from the left are text; the others are numbers, at the right. None:
             all are text.
         fold: which column of text is broken first where the terminal is narrow.
@@ -62,6 +61,7 @@ class Table:
     heads: Sequence[str]
     rows: Sequence[Sequence[Any]]
     title: str = ""
+    caption: str = ""
     text: int | None = 1
     fold: int | None = None
 
@@ -69,13 +69,17 @@ class Table:
         """Whether a column is text."""
         return self.text is None or column < self.text
 
+    def cells(self) -> Iterator[list[Cell]]:
+        """The rows as cells."""
+        return ([x if isinstance(x, Cell) else Cell(x) for x in row] for row in self.rows)
+
     def markdown(self) -> str:
         """As Markdown; a cell's text must not hold a bar."""
         lines = [f"| {' | '.join(map(shown, cells))} |" for cells in (self.heads, *self.rows)]
         return "\n".join([lines[0], f"|{'---|' * len(self.heads)}", *lines[1:]])
 
-    def terminal(self) -> RichTable:
-        """As a table of rich, without lines."""
+    def __rich__(self) -> RichTable:
+        """As a table of rich, without lines, which a console prints."""
         from rich.table import Column
         from rich.table import Table as Drawn
         from rich.text import Text
@@ -91,11 +95,17 @@ class Table:
             for k in range(width)
         ]
         table = Drawn(
-            *columns, title=Text(self.title) if self.title else None, title_justify="left",
-            box=None, pad_edge=False, show_header=bool(self.heads),
-        )  # fmt: skip
-        for row in self.rows:
-            table.add_row(*(_text(cell) for cell in row))
+            *columns,
+            title=Text(self.title) if self.title else None,
+            caption=Text(self.caption) if self.caption else None,
+            title_justify="left",
+            caption_justify="left",
+            box=None,
+            pad_edge=False,
+            show_header=bool(self.heads),
+        )
+        for row in self.cells():
+            table.add_row(*(Text(shown(x), STYLES.get(x.style, "")) for x in row))
         return table
 
     def _is_whole(self, column: int) -> bool:
@@ -104,7 +114,7 @@ class Table:
             return False
         return column == 0 or (not self.is_text(column) and " " not in self.heads[column])
 
-    def fitting(self, console: Console) -> Iterator[RichTable]:
+    def fitting(self, console: Console) -> Iterator[Table]:
         """As tables of as many columns as the console shows without breaking any, at least one
         beside the first."""
         free, left = console.options.update(max_width=_ANY), [*range(1, len(self.heads))]
@@ -112,11 +122,10 @@ class Table:
             count = len(left)
             while (
                 count > 1
-                and console.measure(self._of(left[:count]).terminal(), options=free).maximum
-                > console.width
+                and console.measure(self._of(left[:count]), options=free).maximum > console.width
             ):
                 count -= 1
-            yield self._of(left[:count]).terminal()
+            yield self._of(left[:count])
             left = left[count:]
 
     def _of(self, columns: Sequence[int]) -> Table:
@@ -124,23 +133,3 @@ class Table:
         some = [0, *columns]
         rows = [[row[k] for k in some if k < len(row)] for row in self.rows]
         return replace(self, heads=[self.heads[k] for k in some], rows=rows)
-
-
-def _text(cell: Any) -> Any:
-    from rich.text import Text
-
-    style = STYLES.get(cell.style, "") if isinstance(cell, Cell) else ""
-    return Text(shown(cell), style=style)
-
-
-def terminal(**options: Any) -> Console:
-    """A console with rich's ``options``, which breaks and cuts nothing where it is no terminal.
-
-    As everywhere, the variable COLUMNS says another width.
-    """
-    from rich.console import Console
-
-    console = Console(**options)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = _ANY
-    return console

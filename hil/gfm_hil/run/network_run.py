@@ -13,8 +13,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import Run, read_scenario
 from gfm_hil.run.run_folder import Report, recover, save
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import Scenario, write_scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,8 +22,9 @@ from scipy.fft import next_fast_len
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.run.cycles import hann
-from gfm_hil.scenario.events import Fault, GridUnbalance
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.events.fault import Fault
+from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
 
 _SIGNALS = {"p": "p", "V": "V", "omega_u": "omega_u", "i": "|i|"}
 _SPAN = 1.0  # s at the end that are judged, at most

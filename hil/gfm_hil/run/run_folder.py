@@ -34,8 +34,7 @@ from gfm_hil.recording.npz import Table, write_npz
 from gfm_hil.recording.parts import check_parts, place_of, remove_parts
 from gfm_hil.recording.run import Run, began, converters_of, read_recording, read_scenario
 from gfm_hil.run.summary import origin, stages, summarise
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import Scenario, load_scenario, write_scenario
 
 #: draws the figures of a ``Run`` and writes its report into its folder, as ``results.report`` does;
 #: is called with a ``NetworkRun`` too, for what its runs share

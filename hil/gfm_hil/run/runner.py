@@ -29,8 +29,7 @@ from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.run_folder import Report, check_free, cut_short, finish, in_use
 from gfm_hil.run.summary import origin, stages, summarise
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import write_scenario
+from gfm_hil.scenario import Scenario, write_scenario
 
 Notice = Callable[[str], None]
 

@@ -22,8 +22,8 @@ from gfm_hil.run.doctor import verdict
 from gfm_hil.run.metrics import event_metrics
 from gfm_hil.run.modes import acting, free_from
 from gfm_hil.run.ripple import remaining_ripple
+from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name, unmet
-from gfm_hil.scenario.model import Scenario
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.inner_file import NO_INNER
 

@@ -1,4 +1,4 @@
-"""A scenario: its model and events, loading, checking, and writing as TOML."""
+"""A scenario: its schema and events, loading and checking it, and writing it as TOML."""
 
 import lazy_loader
 

@@ -22,7 +22,7 @@ from gfm_runtime.states import OK, OPERATOR, PLANT_TRIP, REASONS
 
 if TYPE_CHECKING:
     from gfm_hil.recording.log import Outcome
-    from gfm_hil.scenario.model import Scenario
+    from gfm_hil.scenario import Scenario
 
 
 #: names of the possible reasons of a run's end, by its status

@@ -22,17 +22,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 from scipy.optimize import least_squares
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.studies.law import Law, law_files
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_plant import make_plant
 
 Vector = NDArray[np.float64]
@@ -52,15 +51,15 @@ _REST_S, _SAMPLES = 0.1, 4000  # before the jump of a measurement, and at most i
 class Unit:
     """A grid-forming unit as the envelopes know it.
 
-    Attributes:
-        D: damping, p.u. of power per p.u. of frequency.
-        H: inertia constant, s.
-        X_eff: effective reactance, p.u. of the unit.
+    Raises:
+        UserError: a value that cannot be.
     """
 
-    D: float
-    H: float
-    X_eff: float
+    __pydantic_config__ = ConfigDict(extra="forbid")  # where a file declares one
+
+    D: Annotated[float, Field(ge=0, description="damping, p.u. of power over p.u. of frequency")]
+    H: Annotated[float, Field(gt=0, description="inertia constant, s")]
+    X_eff: Annotated[float, Field(gt=0, description="effective reactance, p.u. of the unit")]
 
     def __post_init__(self) -> None:
         for name in ("D", "H", "X_eff"):
@@ -393,40 +392,27 @@ def fit_ramp(t: Vector, change: Vector, rate: float, settled_s: float) -> tuple[
     return float(-slope / rate), float(-level / (2 * rate))
 
 
-def measure_unit(
-    law: str | Path | Law | None = None,
-    on: str | Path | Scenario = "pref_step",
-    *,
-    degrees: float = 0.5,
-    seconds: float = 4.0,
-    **changes: Any,
-) -> Unit:
-    """D, H and X_eff of a converter under a law, fitted to its power after a phase jump.
+def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) -> Unit:
+    """D, H and X_eff of a converter, fitted to its power after a phase jump.
 
     Args:
-        law: name, law file or ``Law``; the scenario's own if None.
-        on: scenario, of which no event counts; its line is not part of X_eff.
+        start: scenario, of which no event counts; its line is not part of X_eff.
         degrees: of the jump; a small one, so that nothing limits and nothing bends.
         seconds: of the fit, after the jump.
-        changes: keys of the scenario, as for ``gfmhil.run``.
 
     Raises:
         UserError: a mistake, a run that does not complete, or no swing equation fits.
-        LawError: the law is none.
     """
     if not (0 < abs(degrees) <= 30 and 0.1 <= seconds <= 60):
         raise UserError(
             f"degrees = {degrees:g}, seconds = {seconds:g}: must lie in [-30, 30] without 0, and "
             "in [0.1, 60]"
         )
-    start = load_scenario(on, in_process=True, **changes)
     kept = {"inner", "T_s", "seed", "references", "plant", "law"}
     content = start.model_dump(mode="json", exclude_none=True, include=kept)
     jump = {"type": "grid-phase-jump", "t": _REST_S, "degrees": degrees}
     more = {"title": start.title, "duration": _REST_S + seconds, "events": [jump]}
-    with law_files([] if law is None else [law]) as files:
-        named = next(iter(files.values()), None)
-        made = run_in_memory(load_scenario(content | more, in_process=True, law=named))
+    made = run_in_memory(load_scenario(content | more, in_process=True))
     if made.status not in ("completed", "oscillating"):
         reason = made.summary["reason"]
         raise UserError(f"the run after the jump ended as {made.status}: {reason}")

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gfm_hil.api.studies import conform
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.notebook import conform
 
 
 def gate(near: Path, new_folder: Callable[[], Path]) -> Callable[..., Conformity]:

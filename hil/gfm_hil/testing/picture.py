@@ -16,7 +16,7 @@ from gfm_hil.recording.columns import unit_of
 from gfm_hil.recording.run import Run
 from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
 from gfm_hil.run.checks import Finding
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 
 _BLUE, _RED, _GREEN, *_ = COLOURS
 _CONTEXT = ("p", "f_hz", "V", "i", "v_dc")  # the first four that are not the signal itself

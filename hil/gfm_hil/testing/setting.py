@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
+from gfm_hil.scenario import INPROC, Scenario, load_scenario
 
 _PLAIN = "pref_step"  # used for its grid and converter; its step is dropped
 

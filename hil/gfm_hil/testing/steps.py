@@ -17,16 +17,16 @@ from pydantic import TypeAdapter, ValidationError
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.recording.run import Run, Signals
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario.events import Event
-from gfm_hil.scenario.model import Scenario, check_scenario
+from gfm_hil.scenario import Scenario, check_scenario
+from gfm_hil.scenario.events import AnyEvent
 from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
 from gfm_runtime.signals import REF_NAMES
 
-_EVENT: TypeAdapter[Any] = TypeAdapter(Event)
+_EVENT: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
 
 
-class Plan:
+class StepPlan:
     """Events and duration of a test, in addition to a scenario's own events."""
 
     def __init__(self, base: Scenario) -> None:
@@ -45,7 +45,7 @@ class Plan:
             event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
         except ValidationError as problem:
             raise UserError(
-                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, Event))
+                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, AnyEvent))
             ) from None
         self._steps.append(event)
         try:
@@ -124,7 +124,7 @@ class Steps:
             if self._skip is None:
                 raise
             self._skip(f"--gfmhil-link {self._link_wanted}: {problem}")
-        self._plan = Plan(self._setting.scenario)
+        self._plan = StepPlan(self._setting.scenario)
         self._run: Run | None = None
         self._ran = 0  # planned ticks of ``_run``
 
@@ -240,7 +240,7 @@ class Steps:
         return self._setting
 
     @property
-    def _planned(self) -> Plan:
+    def _planned(self) -> StepPlan:
         _ = self.setting  # starts the experiment
         return self._plan
 

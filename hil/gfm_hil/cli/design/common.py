@@ -10,13 +10,13 @@ import numpy as np
 from rich.table import Table
 
 from gfm_design.norms.performance import Channel
+from gfm_hil.api.tuned_law import channels_as_json as channels_as_json
+from gfm_hil.api.tuned_law import problem_name
 from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.studies.tuned_law import channels_as_json as channels_as_json
-from gfm_hil.studies.tuned_law import problem_name
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import LawFile

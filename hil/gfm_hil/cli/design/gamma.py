@@ -8,6 +8,8 @@ from typing import Any
 
 from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
+from gfm_hil.api.design import gamma
+from gfm_hil.api.law import Law
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.cli.design.common import (
     add_judged_on,
@@ -21,8 +23,6 @@ from gfm_hil.cli.design.common import (
     singular_is_users,
 )
 from gfm_hil.core.terminal import terminal
-from gfm_hil.studies.design import gamma
-from gfm_hil.studies.law import Law
 
 
 def add(kinds: Any) -> None:

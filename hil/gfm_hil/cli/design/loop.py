@@ -6,27 +6,25 @@ import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from gfm_design.margins.all_margins import UnstableLoop
-from gfm_design.model.network import NetworkMode
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.network import NetworkLoop, NetworkMode
+from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
 from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
 from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
-from gfm_hil.studies.loop import Loop, scenario_loop
-from gfm_hil.studies.network_loop import NetworkLoop, network_loop
+from gfm_hil.studies.linear_loop import network_loop, scenario_loop
 from gfm_runtime.signals import Y_NAMES
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 #: what a command found: as JSON, and as a table
-Found = tuple[dict[str, Any], Table]
+Report = tuple[dict[str, Any], Table]
 
 _LEAST = 0.01  # of a participation that the table shows
 
@@ -34,11 +32,17 @@ _LEAST = 0.01  # of a participation that the table shows
 def add(kinds: Any) -> None:
     """Add the four commands to the parser."""
     for name, text, find, draw in (
-        ("bode", "gain and phase of L, one loop cut, and its margins", _margins, _bode),
-        ("nyquist", "L in the complex plane, one loop cut, and its margins", _margins, _nyquist),
-        ("poles", "modes of the closed loop", _modes, _pole_map),
-        ("step", "y after a unit step of one input", _step, _draw_step),
-    ):
+        ("bode", "gain and phase of L, one loop cut, and its margins", _margins, _draw_at(bode)),
+        (
+            "nyquist", "L in the complex plane, one loop cut, and its margins", _margins,
+            _draw_at(nyquist),
+        ),
+        ("poles", "modes of the closed loop", _modes, lambda loop, options: pole_map(loop)),
+        (
+            "step", "y after a unit step of one input", _step,
+            lambda loop, options: step(loop, options.of, options.seconds),
+        ),
+    ):  # fmt: skip
         command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
         command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
         add_inner_option(command)
@@ -66,7 +70,7 @@ def add(kinds: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Print the table and draw the figure; exit code 3 where an unstable loop has no margins."""
     scenario = chosen_scenario(options.scenario, options)
-    loop: Loop | NetworkLoop
+    loop: ClosedLoop | NetworkLoop
     of_all = options.find is _modes or (options.find is _step and options.converter is None)
     if of_all and scenario.network is not None:
         loop = network_loop(scenario)
@@ -119,28 +123,11 @@ def _at(options: argparse.Namespace) -> list[str]:
     return [] if options.at is None else options.at.split(",")
 
 
-def _bode(loop: Loop, options: argparse.Namespace) -> Axes:
-    return loop.bode(*_at(options))[0]
+def _draw_at(draw: Callable[..., object]) -> Callable[[ClosedLoop, argparse.Namespace], object]:
+    return lambda loop, options: draw(loop, *_at(options))
 
 
-def _nyquist(loop: Loop, options: argparse.Namespace) -> Axes:
-    return loop.nyquist(*_at(options))
-
-
-def _pole_map(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Axes:
-    return loop.pole_map()
-
-
-def _draw_step(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Axes:
-    return loop.step(_input(loop, options), options.seconds)[0]
-
-
-def _input(loop: Loop | NetworkLoop, options: argparse.Namespace) -> str:
-    default = f"{loop.names[0]}.P_ref" if isinstance(loop, NetworkLoop) else "P_ref"
-    return options.of or default
-
-
-def _margins(loop: Loop, options: argparse.Namespace) -> Found:
+def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
     found = loop.margins()
     channels = {c.name: c for c in (*found.u, *found.y)}
     wanted = _at(options) or [c.name for c in found.u]
@@ -150,7 +137,7 @@ def _margins(loop: Loop, options: argparse.Namespace) -> Found:
     return {"stable": True, "at": {c.name: channel_as_json(c) for c in some}}, loops_table(some)
 
 
-def _modes(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Found:
+def _modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
     modes = loop.modes()
     table = numbers("σ \\[1/s]", "frequency \\[Hz]", "damping ratio")
     if isinstance(loop, NetworkLoop):
@@ -165,8 +152,8 @@ def _modes(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Found:
     return {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}, table
 
 
-def _step(loop: Loop | NetworkLoop, options: argparse.Namespace) -> Found:
-    of = _input(loop, options)
+def _step(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
+    of = options.of or stepped_by_default(loop)
     try:
         t, found = loop.step_response(of, options.seconds)
     except ValueError as problem:

@@ -7,11 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn
-
 from gfm_design.margins.all_margins import UnstableLoop, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
-from gfm_hil.cli.common import progress
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_hil.cli.common import watching
 from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
 from gfm_hil.cli.design.margin_report import margins_as_json, no_margins, print_margins
 from gfm_hil.core.errors import UserError
@@ -19,7 +18,7 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import Run
 from gfm_hil.results.report import finite
 from gfm_hil.run.loop_delay import loop_delay
-from gfm_hil.studies.loop import Loop, scenario_loop
+from gfm_hil.studies.linear_loop import scenario_loop
 from gfm_hil.studies.margin_figures import draw_delay, draw_region
 
 
@@ -77,11 +76,10 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _draw(folder: Path, loop: Loop, label: str, margin: float) -> Region:
+def _draw(folder: Path, loop: ClosedLoop, label: str, margin: float) -> Region:
     folder.mkdir(parents=True, exist_ok=True)
-    with progress("{task.description}", BarColumn()) as bar:
-        task = bar.add_task("stable region", total=POINTS)
-        region = stable_region(loop, POINTS, lambda rows: bar.update(task, completed=rows))
+    with watching("stable region") as watch:
+        region = stable_region(loop, POINTS, lambda rows: watch.progress(rows, POINTS, ""))
     draw_region(folder / "region.png", loop, label, region)
     draw_delay(folder / "delay.png", loop, label, margin)
     return region

@@ -7,10 +7,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn
-
 from gfm_design.tuning.paper_tune import EVALUATIONS
-from gfm_hil.cli.common import EXIT_OTHERWISE, progress
+from gfm_hil.api.design import NotTuned, Tuning, tune
+from gfm_hil.api.law import Law
+from gfm_hil.api.tuned_law import problem_name, write_law
+from gfm_hil.cli.common import EXIT_OTHERWISE, watching
 from gfm_hil.cli.design.common import (
     add_judged_on,
     add_law_options,
@@ -24,10 +25,7 @@ from gfm_hil.cli.design.common import (
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.studies.design import NotTuned, Tuning, tune
-from gfm_hil.studies.law import Law
-from gfm_hil.studies.tuned_law import problem_name, write_law
+from gfm_hil.scenario import Scenario
 
 
 def add(kinds: Any) -> None:
@@ -104,13 +102,7 @@ def call(options: argparse.Namespace) -> int:
 
 def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tuning:
     """The search, with a bar on stderr."""
-    columns = "{task.description}", BarColumn(), "γ {task.fields[best]}"
-    with progress(*columns, quiet=options.quiet) as bar:
-        task = bar.add_task(f"tuning {law.name}", best="–")
-
-        def tell(done: int, of: int, best: float) -> None:
-            bar.update(task, completed=done, total=of, best=f"{best:.4g}")
-
+    with watching(f"tuning {law.name}", options.quiet) as watch:
         return tune(
             law,
             start=read_gains(options.gains),
@@ -122,7 +114,7 @@ def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tun
             seed=options.seed,
             evaluations=options.evaluations,
             starts=options.starts,
-            progress=tell,
+            watch=watch,
         )
 
 

@@ -23,7 +23,7 @@ from gfm_hil.ports.modbus.droops import LawDroops
 from gfm_hil.ports.modbus.image import Value
 from gfm_hil.ports.modbus.run_state import RunState
 from gfm_hil.ports.modbus.writes import Effect
-from gfm_hil.scenario.events import check_reference
+from gfm_hil.scenario.events.reference import check_reference
 
 COMPLETED, FAILED = 1, 2
 _SPAN = 100.0  # %: the two points that show the droop in force have Var = ± this

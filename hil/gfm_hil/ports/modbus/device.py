@@ -24,7 +24,7 @@ from gfm_hil.ports.modbus.run_state import RunState, Slack
 from gfm_hil.ports.modbus.setpoints import SetPoint
 from gfm_hil.ports.modbus.writes import Effect, PointGroup
 from gfm_hil.ports.port import Refusal
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
 
 #: carries out a command, or raises UserError

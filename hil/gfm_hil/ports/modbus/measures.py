@@ -10,7 +10,7 @@ from typing import Any
 
 from gfm_hil.ports.modbus.image import VENDOR, Value
 from gfm_hil.ports.modbus.run_state import RunState, Slack
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_plant import Bases, load_converter
 from gfm_plant.names import TRIPS
 from gfm_runtime.signals import SIGNALS

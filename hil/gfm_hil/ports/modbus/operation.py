@@ -9,7 +9,7 @@ from gfm_hil.ports.modbus.droops import LawDroops
 from gfm_hil.ports.modbus.image import VENDOR, Value
 from gfm_hil.ports.modbus.run_state import RunState
 from gfm_hil.ports.modbus.writes import Effect, PointGroup
-from gfm_hil.scenario.events import check_reference
+from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime.states import RUNNING
 
 STOP, START = 0, 1  # of OpCtl

@@ -20,7 +20,7 @@ from gfm_hil.ports.modbus.device import TICK_S, Device
 from gfm_hil.ports.modbus.image import BASE, vendor_model
 from gfm_hil.ports.modbus.run_state import Watcher
 from gfm_hil.ports.port import BesideRun, Port, make_tls, say
-from gfm_hil.scenario.model import load_scenario
+from gfm_hil.scenario import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
 _LOOK_S = 0.1  # poll interval of what changes rarely

@@ -13,7 +13,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.recording.timing import SLACK
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime.states import SAFE
 
 _NAMES_S = 0.1  # how old names and gains may be

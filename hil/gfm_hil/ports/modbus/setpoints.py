@@ -15,7 +15,7 @@ from typing import Any
 from gfm_hil.ports.modbus.image import Value
 from gfm_hil.ports.modbus.run_state import RunState
 from gfm_hil.ports.modbus.writes import Effect
-from gfm_hil.scenario.events import check_reference
+from gfm_hil.scenario.events.reference import check_reference
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from gfm_hil.recording.live import LiveRun
 from gfm_hil.recording.live import begun as recording
 from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.run import Run, nominal_frequency, read_scenario
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_runtime import LawError, law_titles, load_law
 
 Law = dict[str, str]  #: label and name of a law, and in words its changes against its file

@@ -29,7 +29,7 @@ from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
 from gfm_hil.ports.scope.session import SEND_S, Session, in_words
-from gfm_hil.scenario.model import INPROC
+from gfm_hil.scenario import INPROC
 from gfm_runtime import law_titles
 from gfm_runtime.signals import group
 from gfm_runtime.states import STATES

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.port import Refusal
 from gfm_hil.recording.columns import describe, signals_of
-from gfm_hil.scenario.events import check_reference
+from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime import LawError, law_file
 from gfm_runtime.firmware import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.c_text import identifier

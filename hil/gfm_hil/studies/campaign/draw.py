@@ -13,18 +13,14 @@ from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from gfm_hil.core.schema import StrictSchema
 
 _LEAST = 1e-9  # of a normal's probability that must lie within its bounds
 
 
-class Model(BaseModel):
-    """Base of all that a campaign file holds: unknown keys, wrong types and NaN are errors."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-class _Drawn(Model):
+class _Drawn(StrictSchema):
     path: str = Field(description="dotted path in the scenario, e.g. plant.factors.L_g")
     also: list[str] = Field([], description="further paths that get the same value")
     label: str | None = Field(None, description="of the figure's axis, the path if none")

@@ -1,130 +1,123 @@
-"""Chunks of runs on the cores of this machine or on a Dask cluster; what is done is kept."""
+"""A campaign: checked, and run in chunks on the cores of this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
-import os
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import forkserver
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import check_empty
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_scenario
+from gfm_hil.studies.campaign.axes import find_axes
+from gfm_hil.studies.campaign.loading import Tell, load_campaign
+from gfm_hil.studies.campaign.result import CampaignResult, verdict
 from gfm_hil.studies.campaign.spec import Campaign
-from gfm_hil.studies.campaign.worker import Job, Record, record, run_chunk
-from gfm_runtime.children import end_with_parent
+from gfm_hil.studies.campaign.store import Store
+from gfm_hil.studies.campaign.worker import Job, Record, compile_once, record, run_chunk
+from gfm_hil.studies.workers import SILENT, Watch, WorkerLost, check_workers, pool_of, run_tasks
 
 CHUNK = 8  # runs a task: a quarter of a second, so that little is lost and little is waited for
-_AHEAD = 2  # tasks in hand a worker
-_POLL_S = 0.2
-
-# One thread a worker: two would fight for the cores, and a sum split in two has other last bits.
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 
-class WorkerLost(Exception):
-    """A worker died or failed; the message says what is known."""
-
-
-def execute(
-    campaign: Campaign,
-    jobs: Sequence[Job],
-    pool: Executor,
+def run_campaign(
+    given: str | Path | dict[str, Any],
+    folder: Path | None,
+    *,
+    laws: Mapping[str, str],
+    changes: Mapping[str, Any],
     workers: int,
-    keep: Callable[[list[Record]], None],
-    stopped: Callable[[], bool],
-) -> None:
-    """Run all jobs, or until ``stopped``; chunks under way then are still finished and kept.
-
-    Args:
-        campaign, jobs: what to run.
-        pool, workers: where, and how many tasks it works on at a time.
-        keep: given the records of every finished chunk.
-        stopped: asked a few times a second.
+    dask: str | None,
+    resume: bool,
+    x: str | None,
+    y: str | None,
+    watch: Watch = SILENT,
+) -> CampaignResult:
+    """As ``gfmhil.campaign``, with law files by name.
 
     Raises:
-        WorkerLost: a worker died, or a run raised an error; all other finished chunks are kept.
+        UserError: one line a mistake; the folder is in use.
+        WorkerLost: a worker died, or a run raised an error; its ``result`` has all others.
     """
-    chunks = iter([jobs[k : k + CHUNK] for k in range(0, len(jobs), CHUNK)])
-    pending: set[Future[list[Record]]] = set()
+    check_workers(workers)
+    if resume and folder is None:
+        raise UserError("resume: goes with the folder to go on with (--out)")
+    began, lost, store = time.monotonic(), None, None
     try:
-        while True:
-            if stopped():
-                pending = {future for future in pending if not future.cancel()}
-            else:
-                while len(pending) < _AHEAD * workers and (chunk := next(chunks, None)):
-                    pending.add(pool.submit(run_chunk, campaign, chunk))
-            if not pending:
-                return
-            done, pending = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-            _keep(done, keep)
-    finally:
-        for future in pending:
-            future.cancel()
+        with contextlib.ExitStack() as stack:
+            # workers import while the runs are checked
+            pool = None if dask else stack.enter_context(pool_of(workers))
+            campaign = load_campaign(given, laws, changes, checks_progress(watch))
+            axes = find_axes(campaign, x, y)
+            if dask:  # before anything is written
+                pool, workers = stack.enter_context(cluster(dask, campaign))
+            store = Store(folder, campaign, resume)
+            if jobs := store.missing(campaign):
+                if not dask:
+                    compile_once(campaign, watch.notice)
+                _execute(campaign, jobs, pool, workers, store, watch)
+    except WorkerLost as problem:
+        lost = problem
+    except KeyboardInterrupt:  # of a second signal: the runs under way are lost
+        if store is None or not watch.stopped():
+            raise
+    assert store is not None
+    where, wall_s = dask or workers, time.monotonic() - began
+    found = CampaignResult(campaign, store.sorted(campaign), folder, where, wall_s, axes)
+    if folder is not None:
+        found.write(folder)
+    if lost is not None:
+        lost.result = found
+        raise lost
+    return found
 
 
-def _keep(done: set[Future[list[Record]]], keep: Callable[[list[Record]], None]) -> None:
-    failed = None
-    for future in done:
-        problem = future.exception()
-        if problem is None:
-            keep(future.result())
-        else:
-            failed = problem
-    if isinstance(failed, BrokenProcessPool):
-        raise WorkerLost("a worker process died (killed, or out of memory?)") from failed
-    if failed is not None:
-        raise WorkerLost(str(failed) or repr(failed)) from failed
+def checks_progress(watch: Watch) -> Tell:
+    """What tells a watch of the checks of a campaign, in a line once they take long."""
+    began, told = time.monotonic(), False
+
+    def tell(done: int, of: int) -> None:
+        nonlocal told
+        if watch.stopped():
+            raise KeyboardInterrupt
+        watch.progress(done, of, "checking the runs")
+        if not told and time.monotonic() - began >= _PATIENCE_S:
+            told = True
+            watch.notice(f"checking the runs: {done} of {of} done …")
+
+    return tell
 
 
-@contextlib.contextmanager
-def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes with one thread each. They are forked, when there is work, from a server
-    that at once begins to import what all need. All end with this process, and a KeyboardInterrupt
-    in this context ends them at once."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    context = multiprocessing.get_context("forkserver")
-    # scipy loads its parts when they are first used
-    first = f"{__package__}.forked"
-    context.set_forkserver_preload([first, run_chunk.__module__, "scipy.signal"])
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
-    try:
-        # it starts with SIGINT blocked: Ctrl-C is the parent's to handle, also while it imports
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        forkserver.ensure_running()
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        try:
-            yield pool
-        finally:
-            pool.shutdown(cancel_futures=True)
-    except KeyboardInterrupt:
-        for process in multiprocessing.active_children():
-            process.kill()
-        raise
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def _execute(
+    campaign: Campaign,
+    jobs: Sequence[Job],
+    pool: Executor | None,
+    workers: int,
+    store: Store,
+    watch: Watch,
+) -> None:
+    """Run all jobs, or until the watch stops them; arguments and errors as for ``run_tasks``."""
+    of = campaign.file.runs * len(campaign.file.laws)
+    verdicts = [verdict(one) for one in store.sorted(campaign)]
 
+    def keep(records: list[Record]) -> None:
+        store.append(records)
+        verdicts.extend(map(verdict, records))
+        counts = {v: verdicts.count(v) for v in dict.fromkeys(verdicts)}
+        told = ", ".join(f"{n} {v.replace('-', ' ')}" for v, n in counts.items())
+        watch.progress(len(verdicts), of, told)
 
-def _set_up() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    end_with_parent(by=signal.SIGKILL)
-    command = multiprocessing.parent_process()
-    if command is not None and not command.is_alive():  # it ended before
-        os._exit(1)
+    chunks = (jobs[k : k + CHUNK] for k in range(0, len(jobs), CHUNK))
+    run_tasks(partial(run_chunk, campaign), chunks, pool, workers, keep, watch.stopped)
 
 
 @contextlib.contextmanager
@@ -167,8 +160,7 @@ def run_alone(campaign: Campaign, run: int, law: str, folder: Path) -> Record:
     """
     scenario, drawn = campaign.scenario(run, law)
     scenario = scenario.model_copy(update={"title": f"{campaign.file.title}: run {run}"})
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder}: is not empty; choose another --out")
+    check_empty(folder)
     try:
         whole = run_scenario(scenario, folder, report=write_report)
         summary, p = whole.summary, whole.signals["true_p"]

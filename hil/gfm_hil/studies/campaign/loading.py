@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
-from gfm_hil.scenario.model import check_scenario, find_file, load_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import check_scenario, find_file, load_scenario, toml_text
 from gfm_hil.studies.campaign.draw import Distribution
 from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
 from gfm_plant import make_plant
@@ -42,45 +43,34 @@ def _silent(done: int, of: int) -> None:
     """Report no progress."""
 
 
-def load_campaign(name: str, tell: Tell = _silent) -> Campaign:
+def load_campaign(
+    given: str | Path | dict[str, Any],
+    laws: Mapping[str, str] = MappingProxyType({}),
+    changes: Mapping[str, Any] = MappingProxyType({}),
+    tell: Tell = _silent,
+) -> Campaign:
     """Read and check a campaign, its runs included.
 
     Args:
-        name: path or shipped name.
+        given: path or shipped name, or the content of a file. The stem of the file is the
+            campaign's name, and the scenario and the law files may lie beside it.
+        laws: in place of those of the file: law files by name.
+        changes: keys of the file with other values.
         tell: told the checks done and how many there are, as they go on; there may be thousands.
 
     Raises:
         UserError: one line a mistake, each with its path, the value and what is allowed.
     """
-    path = find_campaign(name)
-    try:
-        text = read_text(path)
-        content = parse_toml(text)
-    except ValueError as problem:
-        raise UserError(f"{path}: {problem}") from None
-    return check_campaign(content, path, text, tell=tell)
-
-
-def check_campaign(
-    content: dict[str, Any],
-    path: Path,
-    text: str | None = None,
-    laws: Mapping[str, str] | None = None,
-    tell: Tell = _silent,
-) -> Campaign:
-    """The campaign of a dict, its runs checked.
-
-    Args:
-        content: what a campaign file holds.
-        path: the file, for messages; its stem is the campaign's name, and the scenario and the
-            law files may lie beside it.
-        text: of the file; written from ``content`` if None.
-        laws: the law file of some of the laws, by the name that ``content`` gives them.
-        tell: as for ``load_campaign``.
-
-    Raises:
-        UserError: as ``load_campaign``.
-    """
+    path, text, content = Path("campaign"), None, given
+    if not isinstance(content, dict):
+        path = find_campaign(os.fspath(content))
+        try:
+            text = read_text(path)
+            content = parse_toml(text)
+        except ValueError as problem:
+            raise UserError(f"{path}: {problem}") from None
+    if changes or laws:
+        text, content = None, {**content, **changes} | ({"laws": [*laws]} if laws else {})
     try:
         file = CampaignFile.model_validate(content)
     except ValidationError as problem:
@@ -98,8 +88,7 @@ def check_campaign(
     _check_paths(path, file, content)
     for target, value in file.set.items():
         put(content, target, value)
-    given = laws or {}
-    files = {law: given.get(law) or _beside(path, law) for law in file.laws}
+    files = {law: laws.get(law) or _beside(path, law) for law in file.laws}
     titles = law_titles(files.values())
     file = file.model_copy(update={"laws": [titles[law] for law in files.values()]})
     for label, law in files.items():

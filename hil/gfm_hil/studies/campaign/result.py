@@ -34,16 +34,26 @@ class CampaignResult:
         campaign: what was run, with its file.
         records: one a run and law, by run number; the page on campaigns lists their keys.
         folder: where it is; None for a campaign in memory.
+        workers: number of processes, or the address of the cluster.
+        wall_s: how long the last call took, s.
+        axes: of the map.
     """
 
     campaign: Campaign
     records: list[Record]
-    folder: Path | None = None
+    folder: Path | None
+    workers: int | str
+    wall_s: float
+    axes: tuple[Axis, Axis | None]
 
     @cached_property
     def summary(self) -> dict[str, Any]:
         """Counts, quantiles over the stable runs and the worst runs by law, as campaign.json."""
         return summary(self.campaign, self.records)
+
+    def plain(self) -> dict[str, Any]:
+        """The content of campaign.json."""
+        return {**self.summary, "workers": self.workers, "wall_s": self.wall_s}
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
@@ -89,6 +99,19 @@ class CampaignResult:
             raise UserError("plot: the campaign has no run yet")
         return fill_map(pyplot.figure(), self.campaign, self.records, *axes)
 
+    def write(self, folder: Path) -> None:
+        """Write campaign.json and map.png into a folder that is there."""
+        if self.records:
+            from matplotlib.figure import Figure
+
+            from gfm_hil.studies.campaign.figure import fill_map
+
+            figure = Figure()
+            fill_map(figure, self.campaign, self.records, *self.axes)
+            figure.savefig(folder / "map.png", dpi=130)
+        text = json.dumps(self.plain(), indent=2) + "\n"
+        (folder / "campaign.json").write_text(text, "utf-8")
+
     def __repr__(self) -> str:
         lines = [
             f"  {law}: " + ", ".join(f"{n} {v}" for v, n in found.items() if n)
@@ -96,35 +119,6 @@ class CampaignResult:
         ]
         title = self.campaign.file.title
         return "\n".join([f"<CampaignResult {title!r}, {len(self.records)} runs", *lines, ">"])
-
-
-def write_result(
-    found: CampaignResult,
-    folder: Path,
-    axes: tuple[Axis, Axis | None],
-    workers: int | str,
-    wall_s: float,
-) -> dict[str, Any]:
-    """Write campaign.json and map.png into the folder; returns the content of the former.
-
-    Args:
-        found: what the campaign showed.
-        folder: it is there.
-        axes: of the map.
-        workers: number of processes, or the address of the cluster.
-        wall_s: how long the last call took, s.
-    """
-    if found.records:
-        from matplotlib.figure import Figure
-
-        from gfm_hil.studies.campaign.figure import fill_map
-
-        figure = Figure()
-        fill_map(figure, found.campaign, found.records, *axes)
-        figure.savefig(folder / "map.png", dpi=130)
-    content = {**found.summary, "workers": workers, "wall_s": wall_s}
-    (folder / "campaign.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
-    return content
 
 
 def verdict(record: Record) -> str:

@@ -12,8 +12,9 @@ from typing import Any
 
 from pydantic import Field
 
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.studies.campaign.draw import Distribution, Model, draw
+from gfm_hil.core.schema import StrictSchema
+from gfm_hil.scenario import Scenario
+from gfm_hil.studies.campaign.draw import Distribution, draw
 
 
 def put(content: dict[str, Any], path: str, value: Any) -> None:
@@ -52,7 +53,7 @@ def _words(place: Any, path: str, above: str) -> str:
     return f"path {path!r}: {where} is {place!r} and holds nothing"
 
 
-class Axes(Model):
+class Axes(StrictSchema):
     """What the figure is drawn over: drawn paths, or sums of them ("a + b")."""
 
     x: str | None = Field(
@@ -65,7 +66,7 @@ class Axes(Model):
     )
 
 
-class CampaignFile(Model):
+class CampaignFile(StrictSchema):
     """The whole file."""
 
     title: str = Field(description="of tables and the figure")

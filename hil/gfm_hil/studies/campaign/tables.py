@@ -16,26 +16,28 @@ from gfm_hil.core.terminal import fitting, numbers, terminal
 from gfm_hil.results.report import EVENT_COLUMNS, cell
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.campaign.axes import Axis
-from gfm_hil.studies.campaign.result import VERDICTS
+from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult
 from gfm_hil.studies.campaign.worker import Record
 
 _COLOURS = {"stable": "green", "oscillating": "yellow"}
 
 
-def print_campaign(result: dict[str, Any], axes: tuple[Axis, Axis | None], folder: Path) -> None:
+def print_campaign(found: CampaignResult) -> None:
     """Counts, quantiles of the stable runs' metrics, and the worst runs of every law."""
-    console = terminal()
+    console, result = terminal(), found.plain()
     console.print(f"[bold]{escape(result['title'])}[/]", highlight=False)
     console.print(
-        f"{result['done']} runs in {result['wall_s']:.1f} s on "
-        + (f"{w} workers" if isinstance(w := result["workers"], int) else escape(w)),
+        f"{result['done']} runs in {found.wall_s:.1f} s on "
+        + (f"{w} workers" if isinstance(w := found.workers, int) else escape(w)),
         highlight=False,
     )
     for table in fitting(console, list(result["laws"]), partial(_counts, result["laws"])):
         console.print(table)
-    for law, found in result["laws"].items():
-        console.print(_worst(law, found["worst"], [a for a in axes if a]))
-    console.print(escape(f"folder: {folder}, figure: {folder / 'map.png'}"), soft_wrap=True)
+    for law, one in result["laws"].items():
+        console.print(_worst(law, one["worst"], [a for a in found.axes if a]))
+    if found.folder is not None:
+        where = f"folder: {found.folder}, figure: {found.folder / 'map.png'}"
+        console.print(escape(where), soft_wrap=True)
 
 
 def _counts(all_laws: dict[str, Any], names: Sequence[str]) -> Table:

@@ -15,17 +15,14 @@ from gfm_hil.recording.parts import Kept
 from gfm_hil.results.report import finite
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.run.summary import READ
-from gfm_hil.scenario.model import Scenario
+from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
+from gfm_hil.studies.workers import RunFailed
 
 Job = tuple[int, str]  # run number, law
 Record = dict[str, Any]
 
 _EVENT_KEYS = ("t", "tick", "label", "cut_short")  # of a summary's event; the scenario has them
-
-
-class RunFailed(Exception):
-    """A run ended by an error of the program; the message names the run."""
 
 
 def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:

@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
 from gfm_hil.results.report import cell
-from gfm_hil.studies.conformity.judge import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_hil.studies.conformity.result import document, status, table
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_runtime.errors import printable
 
 Change = Literal["worse", "better", "gone", "new", "moved"]
@@ -36,7 +36,7 @@ class _Read(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True)
 
 
-class Clause(_Read):
+class ClauseResult(_Read):
     """What results.json says of a clause; a part without clauses is one without words.
 
     Attributes:
@@ -59,7 +59,7 @@ class _Part(_Read):
     part: str
     verdict: Outcome
     reason: str
-    clauses: list[Clause]
+    clauses: list[ClauseResult]
 
 
 class _Test(_Read):
@@ -84,7 +84,7 @@ class Results(_Read):
 
 
 @dataclass(frozen=True)
-class Row:
+class ChangedClause:
     """A clause that is not what it was.
 
     Attributes:
@@ -98,12 +98,12 @@ class Row:
     law: str
     test: str
     part: str
-    old: Clause | None
-    new: Clause | None
+    old: ClauseResult | None
+    new: ClauseResult | None
     counts: bool
 
     @property
-    def clause(self) -> Clause:
+    def clause(self) -> ClauseResult:
         """What is there now, or was."""
         found = self.new or self.old
         assert found is not None
@@ -139,7 +139,7 @@ class ReportDiff:
         share: by which part of the larger a value had to move.
     """
 
-    rows: list[Row]
+    rows: list[ChangedClause]
     notes: list[str]
     same: int
     share: float
@@ -230,9 +230,9 @@ def compare_results(old: Results, new: Results, share: float = SHARE) -> ReportD
             proven = any(c.verdict == PASS for part in there.parts for c in part.clauses)
             whole = _bare(there.verdict, "")
             if a is None:
-                rows.append(Row("new", *at, "", None, whole, False))
+                rows.append(ChangedClause("new", *at, "", None, whole, False))
             else:
-                rows.append(Row("gone", *at, "", whole, None, proven))
+                rows.append(ChangedClause("gone", *at, "", whole, None, proven))
             continue
         before, after = _clauses(a), _clauses(b)
         for key in {**before, **after}:
@@ -242,7 +242,7 @@ def compare_results(old: Results, new: Results, share: float = SHARE) -> ReportD
                 same += 1
                 continue
             counts = found == "worse" or (one is not None and other is None and one.verdict == PASS)
-            rows.append(Row(found, *at, key[0], one, other, counts))
+            rows.append(ChangedClause(found, *at, key[0], one, other, counts))
     rows.sort(key=lambda row: (not row.counts, _ORDER.index(row.change)))
     return ReportDiff(rows, list(_notes(old, new)), same, share)
 
@@ -251,7 +251,7 @@ def _tests(of: Results) -> dict[tuple[str, str], _Test]:
     return {(law, test): found for law, tests in of.laws.items() for test, found in tests.items()}
 
 
-def _clauses(of: _Test) -> dict[tuple[str, str, str, int], Clause]:
+def _clauses(of: _Test) -> dict[tuple[str, str, str, int], ClauseResult]:
     """The clauses by part, words, kind and turn."""
     found = {}
     for part in of.parts:
@@ -263,11 +263,11 @@ def _clauses(of: _Test) -> dict[tuple[str, str, str, int], Clause]:
     return found
 
 
-def _bare(verdict: Outcome, text: str) -> Clause:
-    return Clause(clause="", kind="", verdict=verdict, value=None, unit="", text=text)
+def _bare(verdict: Outcome, text: str) -> ClauseResult:
+    return ClauseResult(clause="", kind="", verdict=verdict, value=None, unit="", text=text)
 
 
-def _change(old: Clause | None, new: Clause | None, share: float) -> Change | None:
+def _change(old: ClauseResult | None, new: ClauseResult | None, share: float) -> Change | None:
     if old is None or new is None:
         return "new" if old is None else "gone"
     if _RANK[old.verdict] != _RANK[new.verdict]:
@@ -290,5 +290,5 @@ def _notes(old: Results, new: Results) -> Iterator[str]:
         yield f"The law was {next(iter(old.laws))} and is {next(iter(new.laws))}."
 
 
-def _value(of: Clause | None) -> str:
+def _value(of: ClauseResult | None) -> str:
     return "–" if of is None or of.value is None else f"{cell(of.value)} {of.unit}".rstrip()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,30 +16,36 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_external, compiled_bench, compiled_benches
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import (
+    Notice,
     external_command,
     run_in_memory,
     run_network_in_memory,
     run_scenario,
 )
-from gfm_hil.scenario.model import Link, Scenario
-from gfm_hil.scenario.toml_out import write_scenario
-from gfm_hil.studies.campaign.execute import WorkerLost, processes
-from gfm_hil.studies.conformity.judge import PASS, Outcome, Verdict, cannot, judge, judge_nfp, worst
-from gfm_hil.studies.conformity.model import Criterion, Declared, InEnvelope, Nfp, Part, UnderTest
+from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
+from gfm_hil.studies.conformity.criteria import BY_KIND
+from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.judge import cannot, judge
+from gfm_hil.studies.conformity.model import TestPart
 from gfm_hil.studies.conformity.sets import Case, scenario_of
-from gfm_hil.studies.envelopes import measure_unit
-from gfm_hil.studies.identification import identify
+from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
+from gfm_hil.studies.workers import (
+    RunFailed,
+    Watch,
+    WorkerLost,
+    pool_of,
+    run_tasks,
+)
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 
 if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture
 
-_POLL_S = 0.2
-
 
 @dataclass(frozen=True)
-class Foreign:
+class ExternalController:
     """A model as the controller, in place of a law.
 
     Attributes:
@@ -78,19 +83,19 @@ class Job:
         converters: folder for converter files, which lasts while jobs run.
         folder: where the scenario and the figure go; None writes neither.
         figures: whether to draw one.
-        foreign: the model that computes u in place of the law, or None.
+        external: the model that computes u in place of the law, or None.
     """
 
     law: str
     file: str
     case: Case
-    part: Part
+    part: TestPart
     inner: str | None
     under: UnderTest
     converters: Path
     folder: Path | None
     figures: bool
-    foreign: Foreign | None = None
+    external: ExternalController | None = None
 
     @property
     def name(self) -> str:
@@ -98,11 +103,8 @@ class Job:
         return "/".join(x for x in (self.case.id, self.part.name) if x)
 
 
-_CAUSES = {"no_trip": 0, "stays_in_step": 1}  # kinds of criteria
-
-
 @dataclass(frozen=True)
-class Found:
+class PartResult:
     """What became of a part of a test under a law.
 
     Attributes:
@@ -138,7 +140,7 @@ class Found:
         """The clauses that make it not pass; the one first that says most about why: a trip, or a
         loss of step, explains whatever comes after it."""
         told = [v for v in self.verdicts if v.verdict == self.verdict != PASS]
-        return sorted(told, key=lambda v: _CAUSES.get(v.kind, len(_CAUSES)))
+        return sorted(told, key=lambda v: BY_KIND[v.kind].explains)
 
     @property
     def cause(self) -> Verdict | None:
@@ -146,7 +148,7 @@ class Found:
         return next(iter(self.wrong), None)
 
 
-def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign | None:
+def external_controller(model: str | None, ports: str | Path | None) -> ExternalController | None:
     """The model that a user names, checked as far as that goes without loading it.
 
     Raises:
@@ -160,11 +162,11 @@ def foreign_controller(model: str | None, ports: str | Path | None) -> Foreign |
         if ports is not None:
             raise UserError(f"map {ports}: {model} has our signals, and takes no map")
         precision(model)
-        return Foreign(model)
+        return ExternalController(model)
     kind, path = controller_file(model, FORMS)
     file = None if ports is None else Path(ports).absolute()
     read_map(file)
-    return Foreign(f"{kind}:{path}", file)
+    return ExternalController(f"{kind}:{path}", file)
 
 
 def slug(name: str) -> str:
@@ -180,24 +182,24 @@ def make_jobs(
     converters: Path,
     folder: Path | None,
     figures: bool,
-    foreign: Foreign | None = None,
+    external: ExternalController | None = None,
 ) -> list[Job]:
     """A job for each part of each test under each law, and then under the model.
 
     Args:
         laws: files by name. The model begins at the operating point of the first one, or, without
             laws, of the law that a scenario has by default.
-        cases, inner, under, converters, folder, figures, foreign: as for ``Job``.
+        cases, inner, under, converters, folder, figures, external: as for ``Job``.
 
     Raises:
         UserError: the model measures currents, and its runs have no inner stage.
     """
-    each: list[tuple[str, str, Foreign | None]] = [(*law, None) for law in laws.items()]
-    if foreign is not None:
+    each: list[tuple[str, str, ExternalController | None]] = [(*law, None) for law in laws.items()]
+    if external is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
         stage = law_file(start).inner if inner is None else named_inner(inner)
-        check_currents(foreign.name, stage is not None)
-        each.append((foreign.name, start, foreign))
+        check_currents(external.name, stage is not None)
+        each.append((external.name, start, external))
     return [
         Job(law, file, case, part, inner, under, converters, folder, figures, model)
         for law, file, model in each
@@ -206,54 +208,40 @@ def make_jobs(
     ]
 
 
-def execute(
-    jobs: Sequence[Job],
-    workers: int,
-    keep: Callable[[Found], None],
-    stopped: Callable[[], bool] = lambda: False,
-    notice: Callable[[str], None] = lambda text: None,
-) -> None:
-    """Run all jobs, or until ``stopped``.
-
-    Args:
-        jobs: what to run.
-        workers: processes; 1 runs all in this one.
-        keep: given every finished part.
-        stopped: asked after each part, or a few times a second.
-        notice: told what a person should know while waiting.
+def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]:
+    """What becomes of all jobs; 1 worker runs all in this process.
 
     Raises:
+        UserError: so many workers cannot be.
         WorkerLost: a worker died, or a run raised an error.
+        KeyboardInterrupt: the watch stopped it before its end.
     """
-    if workers == 1:
-        for job in jobs:
-            if stopped():
-                return
-            keep(run_part(job))
-        return
-    _compile_once(jobs, notice)
-    with ExitStack() as stack:
-        pool: Executor = stack.enter_context(processes(workers))
-        pending = {pool.submit(run_part, job): job for job in jobs}
-        try:
-            while pending and not stopped():
-                done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-                for future in done:
-                    _finish(future, pending.pop(future), keep)
-        finally:
-            for future in pending:
-                future.cancel()
+    found: list[PartResult] = []
+
+    def keep(one: PartResult) -> None:
+        found.append(one)
+        bad = sum(f.verdict in (FAIL, CANNOT) for f in found)
+        words = f"{one.law}: {one.test}" + (f", {bad} not passed" if bad else "")
+        watch.progress(len(found), len(jobs), words)
+
+    lost = None
+    try:
+        if workers > 1:
+            compile_once(jobs, watch.notice)
+        with pool_of(workers) as pool:
+            run_tasks(run_part, jobs, pool, workers, keep, watch.stopped)
+    except WorkerLost as problem:
+        lost = problem
+    except KeyboardInterrupt:  # of a second signal: the runs under way are lost
+        if not watch.stopped():
+            raise
+    if len(found) < len(jobs):
+        done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
+        raise WorkerLost(f"{lost}; {done}") if lost else KeyboardInterrupt(f"interrupted; {done}")
+    return found
 
 
-def _finish(future: Future[Found], job: Job, keep: Callable[[Found], None]) -> None:
-    problem = future.exception()
-    if problem is not None:
-        words = f"{job.law}, {job.name}: {type(problem).__name__}: {problem}"
-        raise WorkerLost(words) from problem
-    keep(future.result())
-
-
-def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
+def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
     seen: set[tuple[bool, int, bool]] = set()
     for job in jobs:
@@ -261,10 +249,10 @@ def _compile_once(jobs: Sequence[Job], notice: Callable[[str], None]) -> None:
             continue
         try:
             scenario = _scenario(job)
-            kind = scenario.has_inner, len(scenario.converters), job.foreign is not None
+            kind = scenario.has_inner, len(scenario.converters), job.external is not None
             if kind in seen:
                 continue
-            if job.foreign is not None:
+            if job.external is not None:
                 compiled_bench(scenario, notice, ("plant",))
                 compile_external(scenario, notice)
             else:
@@ -281,89 +269,77 @@ def _scenario(job: Job) -> Scenario:
         UserError: it cannot be run.
     """
     found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
-    if job.foreign is None:
+    if job.external is None:
         return found
     if found.network is not None:
         raise UserError(f"{job.law} is one controller, and the test's network has several")
-    return found.model_copy(update={"link": Link(type="shm")})
+    return found.model_copy(update={"link": LinkSettings(type="shm")})
 
 
-def run_part(job: Job) -> Found:
-    """Run, judge and draw a part; what cannot be run cannot be judged."""
-    test, part = job.case.test, job.part
-    criteria = [*test.criteria, *part.criteria]
-    names = job.law, job.case.id, part.name
-    if part.cannot is not None:
-        reason = f"Cannot be judged: {part.cannot}"
-        return Found(*names, "none", reason, cannot(criteria, reason))
-    if isinstance(criteria[0], Nfp):
-        return _plot(job, criteria[0])
+def run_part(job: Job) -> PartResult:
+    """Run, judge and draw a part; what cannot be run cannot be judged.
+
+    Raises:
+        RunFailed: an error of the program; the message names law and test.
+    """
+    try:
+        return _run_part(job)
+    except Exception as problem:
+        words = f"{job.law}, {job.name}: {type(problem).__name__}: {problem}"
+        raise RunFailed(words) from problem
+
+
+def _run_part(job: Job) -> PartResult:
+    criteria = [*job.case.test.criteria, *job.part.criteria]
+    names = job.law, job.case.id, job.part.name
+    if job.part.cannot is not None:
+        reason = f"Cannot be judged: {job.part.cannot}"
+        return PartResult(*names, "none", reason, cannot(criteria, reason))
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
+            if isinstance(criteria[0], Nfp):
+                return _scan(job, criteria[0], scenario)
             run, others = _run(job, scenario, stack)
         except UserError as problem:
-            return _no_run(job, criteria, problem)
-        verdicts = judge(run, criteria, _declared(job, scenario, criteria), others)
+            text = str(problem).replace("\n", "; ").replace(job.file, job.law)
+            reason = f"Cannot be judged: there is no such run: {text}"
+            return PartResult(*names, "none", reason, cannot(criteria, reason))
+        under = job.under
+        if job.external is None:  # a controller that is not ours runs over a link alone
+            for criterion in criteria:
+                under = criterion.declared(under, scenario)
+        verdicts = judge(run, criteria, under, others)
         again, figure = "", None
         if job.folder is not None:
             place = _place(job.folder, job, scenario)
-            again = _again(place, job.foreign)
+            again = _again(place, job.external)
             if job.figures and run.ticks:
                 from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
 
                 figure = draw_part(place / "figure.png", _title(job, scenario), run, verdicts)
         reason = str(run.summary["reason"])
-        return Found(*names, run.status, reason, verdicts, again, figure)
+        return PartResult(*names, run.status, reason, verdicts, again, figure)
 
 
-def _declared(job: Job, scenario: Scenario, criteria: Sequence[Criterion]) -> UnderTest:
-    """What the owner declares, with the unit that is measured where it is asked for."""
-    under = job.under
-    if under.unit is not None or not any(isinstance(c, InEnvelope) for c in criteria):
-        return under
-    if job.foreign is not None:  # which runs over a link alone
-        return under
-    try:
-        found = measure_unit(None, scenario)
-    except UserError:
-        return under
-    unit = Declared(D=found.D, H=found.H, X_eff=found.X_eff)
-    return under.model_copy(update={"unit": unit})
-
-
-def _plot(job: Job, asked: Nfp) -> Found:
+def _scan(job: Job, asked: Nfp, scenario: Scenario) -> PartResult:
     """Measure, judge and draw a network-frequency-perturbation plot."""
-    foreign = job.foreign
-    try:
-        scenario = _scenario(job)
-        found = identify(
-            None, scenario, start_hz=asked.from_hz, stop_hz=asked.to_hz, points=asked.points,
-            controller_command=external_command(foreign.model, foreign.ports) if foreign else (),
-        )  # fmt: skip
-    except UserError as problem:
-        return _no_run(job, [asked], problem)
+    external = job.external
+    found = asked.scan(
+        scenario, external_command(external.model, external.ports) if external else ()
+    )
+    verdicts = asked.judge_scan(found)
     again, figure = "", None
     if job.folder is not None:
         place = _place(job.folder, job, scenario)
-        if foreign is None:
-            again = shlex.join(
-                ["gfmhil", "identify", str(place / "scenario.toml"), "--from", f"{asked.from_hz:g}",
-                 "--to", f"{asked.to_hz:g}", "--points", str(asked.points)]
-            )  # fmt: skip
+        if external is None:
+            again = shlex.join(asked.again(str(place / "scenario.toml")))
         if job.figures:
             from gfm_hil.studies.conformity.figure import draw_plot
 
-            figure = draw_plot(place / "figure.png", _title(job, scenario), found, asked)
-    verdicts = judge_nfp(found.frequency, found.nfp, asked)
-    return Found(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
-
-
-def _no_run(job: Job, criteria: Sequence[Criterion], problem: UserError) -> Found:
-    text = str(problem).replace("\n", "; ").replace(job.file, job.law)
-    reason = f"Cannot be judged: there is no such run: {text}"
-    told = cannot(criteria, reason)
-    return Found(job.law, job.case.id, job.part.name, "none", reason, told)
+            title = _title(job, scenario)
+            figure = draw_plot(place / "figure.png", title, found, asked, verdicts)
+    return PartResult(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
 
 
 def _title(job: Job, scenario: Scenario) -> str:
@@ -378,12 +354,12 @@ def _place(folder: Path, job: Job, scenario: Scenario) -> Path:
     return place
 
 
-def _again(place: Path, foreign: Foreign | None) -> str:
+def _again(place: Path, external: ExternalController | None) -> str:
     """The command that repeats the run of the scenario in a folder."""
     words = ["gfmhil", "run", str(place / "scenario.toml")]
-    if foreign is not None:
-        words += ["--controller", foreign.model]
-        words += ["--map", str(foreign.ports)] if foreign.ports else []
+    if external is not None:
+        words += ["--controller", external.model]
+        words += ["--map", str(external.ports)] if external.ports else []
     return shlex.join(words)
 
 
@@ -393,9 +369,9 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     Args:
         stack: keeps what a run of a model is read from.
     """
-    if job.foreign is not None:
+    if job.external is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        command = external_command(job.foreign.model, job.foreign.ports)
+        command = external_command(job.external.model, job.external.ports)
         run = run_scenario(scenario, folder, controller_command=command)
         if run.status == "interrupted":
             raise KeyboardInterrupt

@@ -15,18 +15,10 @@ from gfm_hil.recording.columns import printed, unit_of
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
 from gfm_hil.run.cycles import cycle_means, cycle_ticks
-from gfm_hil.studies.conformity.judge import (
-    CANNOT,
-    FAIL,
-    INFORMATIVE,
-    PASS,
-    SIGNS,
-    Verdict,
-    judge_nfp,
-)
-from gfm_hil.studies.conformity.model import Nfp
-from gfm_hil.studies.identification import Identification
-from gfm_hil.studies.identification_figures import draw_nfp
+from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS, Verdict
+from gfm_hil.studies.scan import FrequencyScan
+from gfm_hil.studies.scan_figures import nfp
 
 #: Okabe and Ito's green, vermilion, grey and blue: pass, fail, cannot judge, informative
 VERDICT_COLOURS = {
@@ -71,21 +63,12 @@ def draw_part(path: Path, title: str, run: Run, verdicts: Sequence[Verdict]) -> 
     return Picture(path, panels(figure))
 
 
-def draw_plot(path: Path, title: str, found: Identification, asked: Nfp) -> Picture:
+def draw_plot(
+    path: Path, title: str, found: FrequencyScan, asked: Nfp, verdicts: Sequence[Verdict]
+) -> Picture:
     """Draw the network-frequency-perturbation plot with the limits of its bands."""
     figure = Figure(figsize=(7.6, 5.6), layout="constrained")
-    gain, phase = draw_nfp(found, figure)
-    verdicts = iter(judge_nfp(found.frequency, found.nfp, asked))
-    for band in asked.bands:
-        for axes, low, high in (
-            (gain, band.low, band.high),
-            (phase, band.phase_low, band.phase_high),
-        ):
-            limits = [x for x in (low, high) if x is not None]
-            colour = VERDICT_COLOURS[next(verdicts).verdict] if limits else ""
-            for limit in limits:
-                span = [band.from_hz, band.to_hz]
-                axes.plot(span, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))
+    asked.draw_limits(nfp(found, figure), verdicts, VERDICT_COLOURS)
     headline(figure, title, 10)
     _save(figure, path)
     return Picture(path, panels(figure))

@@ -18,8 +18,11 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import printed
 from gfm_hil.results.report import STYLE, cell, figure, finite
-from gfm_hil.studies.conformity.execute import Found, slug
-from gfm_hil.studies.conformity.judge import (
+from gfm_hil.studies.conformity.execute import PartResult, slug
+from gfm_hil.studies.conformity.model import KNOWN
+from gfm_hil.studies.conformity.sets import Case
+from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     FAIL,
     INFORMATIVE,
@@ -29,8 +32,6 @@ from gfm_hil.studies.conformity.judge import (
     Verdict,
     worst,
 )
-from gfm_hil.studies.conformity.model import KNOWN, UnderTest
-from gfm_hil.studies.conformity.sets import Case
 
 #: characters that XML cannot hold, not even escaped
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -59,7 +60,7 @@ class Conformity:
         inner: stage of every law; None: each law's own.
         under: the converter under test.
         cases: the tests, in order.
-        found: one a law and part that ran, in any order.
+        parts: one a law and part that ran, in any order.
         folder: with the report; None without one.
     """
 
@@ -67,7 +68,7 @@ class Conformity:
     inner: str | None
     under: UnderTest
     cases: list[Case]
-    found: list[Found]
+    parts: list[PartResult]
     folder: Path | None = None
 
     @property
@@ -90,11 +91,11 @@ class Conformity:
             for case in self.cases
         }
 
-    def of(self, law: str, test: str) -> list[Found]:
+    def of(self, law: str, test: str) -> list[PartResult]:
         """The parts of a test under a law, in the order of its file."""
         case = next(case for case in self.cases if case.id == test)
         order = [part.name for part in case.test.runs()]
-        mine = [f for f in self.found if f.law == law and f.test == test]
+        mine = [f for f in self.parts if f.law == law and f.test == test]
         return sorted(mine, key=lambda f: order.index(f.part))
 
     @property
@@ -313,7 +314,7 @@ def document(title: str, body: str) -> str:
     )
 
 
-def _case(suite: Any, law: str, f: Found, name: str, verdict: str, text: str) -> None:
+def _case(suite: Any, law: str, f: PartResult, name: str, verdict: str, text: str) -> None:
     place = ".".join(x for x in (law, f.test, f.part) if x)
     entry = ElementTree.SubElement(suite, "testcase", classname=place, name=name)
     if verdict == FAIL:

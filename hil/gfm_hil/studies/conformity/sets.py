@@ -12,9 +12,9 @@ from pydantic import BaseModel, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import write_text
-from gfm_hil.scenario.model import SCENARIO_FOLDERS, Scenario, check_scenario
-from gfm_hil.scenario.toml_out import toml_text
-from gfm_hil.studies.conformity.model import Part, Test, UnderTest
+from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, check_scenario, toml_text
+from gfm_hil.studies.conformity.model import Test, TestPart
+from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_plant import ConverterParameters, load_converter
 from gfm_runtime.errors import allowed, printable
 from gfm_runtime.toml_file import read_toml
@@ -99,7 +99,7 @@ def _load_case(path: Path) -> Case:
     return case
 
 
-def _mistakes(test: Test, part: Part, content: Mapping[str, Any]) -> list[str]:
+def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[str]:
     """What does not fit together in a part, one line each."""
     found = []
     members = [*(content.get("network") or {}).get("converters", {})]
@@ -160,7 +160,7 @@ def _checked(path: Path, model: type[BaseModel], content: Any, table: str = "") 
 
 
 def scenario_of(
-    case: Case, part: Part, under: UnderTest, law: str, inner: str | None, converters: Path
+    case: Case, part: TestPart, under: UnderTest, law: str, inner: str | None, converters: Path
 ) -> Scenario:
     """The scenario of a part, checked.
 
@@ -188,7 +188,7 @@ def scenario_of(
     return check_scenario(content, str(case.path))
 
 
-def _content(case: Case, part: Part, plant: dict[str, Any]) -> dict[str, Any]:
+def _content(case: Case, part: TestPart, plant: dict[str, Any]) -> dict[str, Any]:
     """The scenario of a part as plain data, without a law."""
     base = _merged({"plant": plant, "link": {"type": "inproc"}}, case.test.scenario)
     content = _merged(base, part.scenario)

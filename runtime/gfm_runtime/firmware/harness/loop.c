@@ -65,7 +65,7 @@ int main(void)
             continue;
         }
         if (request.what == CHECK) {
-            if (!whole(to, row, sizeof row))
+            if (!whole(to, row, sizeof row) || row[1] >= GOLDEN_LAWS)
                 break;
             answer.result = golden_row(row);
             board_write(from, &answer, sizeof answer);

@@ -24,10 +24,10 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,18 +40,15 @@ from gfm_design.margins.admittance import (
     passivity,
 )
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
+from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.run.runner import run_in_memory, run_scenario
-from gfm_hil.scenario.model import INPROC, Scenario, load_scenario
-from gfm_hil.studies.law import Law
-from gfm_hil.studies.loop import scenario_loop
+from gfm_hil.scenario import INPROC, Scenario, load_scenario
+from gfm_hil.studies.linear_loop import scenario_loop
+from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, make_plant
 from gfm_plant.wiring import GRID_SOURCE
 from gfm_runtime.signals import carried
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Vector = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -72,12 +69,12 @@ _CELLS = ("dd", "dq", "qd", "qq")
 
 
 @dataclass(frozen=True, repr=False)
-class Identification:
+class FrequencyScan:
     """A measured admittance, the linear model's beside it, and what follows from them.
 
     Y is that of the converter at its terminal, the filter capacitor: the current into it is Y v, in
     the dq frame that turns steadily with the grid and lies on the converter's own frame at rest;
-    p.u. of 1/Z_b. It is the inverse of ``Loop.output_impedance``.
+    p.u. of 1/Z_b. It is the inverse of ``ClosedLoop.output_impedance``.
 
     Attributes:
         name: of the law, or what a controller that is not ours calls itself.
@@ -151,30 +148,6 @@ class Identification:
         here = self._impedance(*self.line)
         return grid_stability(self.frequency, self.Y, self.grid(scr, x_over_r), here)
 
-    def plot(self) -> list[Axes]:
-        """Draw the four entries of Y over Hz, measured and of the model, gain and phase."""
-        from gfm_hil.studies.identification_figures import draw_admittance
-
-        return draw_admittance(self)
-
-    def plot_passivity(self) -> list[Axes]:
-        """Draw the least eigenvalue of Y + Y^H, and the deviation from the model, over Hz."""
-        from gfm_hil.studies.identification_figures import draw_passivity
-
-        return draw_passivity(self)
-
-    def plot_nfp(self) -> list[Axes]:
-        """Draw the network-frequency-perturbation plot: gain and phase over Hz."""
-        from gfm_hil.studies.identification_figures import draw_nfp
-
-        return draw_nfp(self)
-
-    def plot_nyquist(self, scr: float, x_over_r: float) -> Axes:
-        """Draw the eigenvalues of Z Y for a grid, arguments as ``grid``."""
-        from gfm_hil.studies.identification_figures import draw_nyquist
-
-        return draw_nyquist(self, scr, x_over_r)
-
     def eigenloci(self, scr: float, x_over_r: float) -> Response:
         """The eigenvalues of Z Y for a grid, shape (K, 2); arguments and errors as ``grid``."""
         return eigenloci(self.Y, self.grid(scr, x_over_r))
@@ -210,11 +183,10 @@ class Identification:
         Raises:
             UserError: the folder holds something already, or cannot be written.
         """
-        from gfm_hil.studies.identification_figures import save_figures
+        from gfm_hil.studies.scan_figures import save_figures
 
         folder = Path(folder)
-        if folder.exists() and any(folder.iterdir()):
-            raise UserError(f"{folder}: is not empty; choose another folder")
+        check_empty(folder)
         content = self.summary() | {"grids": [self._judged(*grid) for grid in grids]}
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -262,7 +234,7 @@ class Identification:
     def __repr__(self) -> str:
         f, dev = self.frequency, self.deviation
         model = "" if dev is None else f", at most {100 * dev.max():.2g} % from the model"
-        return f"<Identification {self.name}: {len(f)} points, {f[0]:g} to {f[-1]:g} Hz{model}>"
+        return f"<FrequencyScan {self.name}: {len(f)} points, {f[0]:g} to {f[-1]:g} Hz{model}>"
 
 
 @dataclass(frozen=True)
@@ -293,10 +265,11 @@ class _Plan:
     bands: Sequence[_Band]
     settle: Sequence[int]
     amplitude: float
-    hz: Vector = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hz", np.concatenate([band.hz for band in self.bands]))
+    @property
+    def hz(self) -> Vector:
+        """All tones, Hz."""
+        return np.concatenate([band.hz for band in self.bands])
 
     def starts(self) -> list[int]:
         """The first tick of each band."""
@@ -304,11 +277,9 @@ class _Plan:
         return [0, *np.cumsum(lengths).astype(int).tolist()]
 
 
-def identify(
-    law: str | Path | Law | None = None,
-    on: str | Path | Scenario = "pref_step",
+def measure_admittance(
+    scenario: Scenario,
     *,
-    inner: str | None = None,
     start_hz: float = 1.0,
     stop_hz: float = 1000.0,
     points: int = POINTS,
@@ -316,15 +287,13 @@ def identify(
     settle_s: float | None = None,
     window_s: float = WINDOW_S,
     controller_command: Sequence[str] = (),
-    tell: Callable[[str], None] = lambda text: None,
-) -> Identification:
+    watch: Watch = SILENT,
+) -> FrequencyScan:
     """Measure the dq admittance of a converter on the bench.
 
     Args:
-        law: name, law file or ``Law``; the scenario's own if None.
-        on: scenario (name, file or ``Scenario``), of which plant, references, sampling time and
-            inner stage count, but no event.
-        inner: inner stage, in place of the law's own.
+        scenario: of which plant, references, sampling time, law and inner stage count, but no
+            event.
         start_hz, stop_hz, points: the frequencies, evenly apart on a logarithmic axis; each is
             moved to the nearest multiple of the inverse of its window.
         amplitude: of each tone, p.u. of the grid's voltage, and rad of its angle.
@@ -334,58 +303,52 @@ def identify(
         window_s: least length of a window, s; a longer one averages noise out.
         controller_command: program and arguments of another controller, which runs over the
             scenario's link; it has no model.
-        tell: told what goes on.
+        watch: told which injection runs.
 
     Raises:
         UserError: a value out of range, no operating point, a loop that is unstable, a run that
             does not complete, or a window whose ends still differ.
-        LawError: the law is none.
     """
-    with tempfile.TemporaryDirectory(prefix="gfmhil-identify-") as place:
-        file = law
-        if isinstance(law, Law):
-            file = law.save(Path(place) / "law.toml")
-        foreign = tuple(controller_command)
-        named = None if file is None else str(file)
-        scenario = load_scenario(on, in_process=not foreign, law=named, inner=inner)
-        _check(scenario, bool(foreign))
-        name, Y_of, slowest = controlled_by({"controller": ""}), None, None
-        if not foreign:
-            name, Y_of, slowest = _model(scenario)
-            name = law.name if isinstance(law, Law) else name
-        bands = _bands(start_hz, stop_hz, points, scenario.T_s, window_s)
-        given = settle_s is not None
-        if settle_s is None:
-            settle_s = SETTLE_S
-            if slowest is not None:
-                settle_s = min(max(math.log(_SHRINK) / -slowest, 0.2), _LONGEST_S)
-        while True:
-            plan = _plan(bands, amplitude, settle_s, scenario)
-            sides = []
-            for axis in "dq":
-                run = _run(scenario, plan, axis, Path(place), foreign, tell)
-                sides.append(_Spectra.of(run, plan))
-                if foreign:
-                    name = controlled_by(run.summary)
-            settled = max(side.ends for side in sides)
-            if given or settled <= _SETTLED:
-                break
-            if 2.0 * settle_s > _LONGEST_S:
-                raise UserError(
-                    f"after {settle_s:g} s the ends of a window still differ by {settled:.1e} of "
-                    f"the deviation, allowed is {_SETTLED:g}; the loop is too slow, or noise or "
-                    "rounding hides the tones: raise amplitude, and give settle_s"
-                )
-            settle_s *= 2.0
-        return _found(name, scenario, plan, settle_s, settled, sides, Y_of)
+    external = tuple(controller_command)
+    _check(scenario, bool(external))
+    name, Y_of, slowest = controlled_by({"controller": ""}), None, None
+    if not external:
+        name, Y_of, slowest = _model(scenario)
+    bands = _bands(start_hz, stop_hz, points, scenario.T_s, window_s)
+    given = settle_s is not None
+    if settle_s is None:
+        settle_s = SETTLE_S
+        if slowest is not None:
+            settle_s = min(max(math.log(_SHRINK) / -slowest, 0.2), _LONGEST_S)
+    while True:
+        plan = _plan(bands, amplitude, settle_s, scenario)
+        sides: list[_Spectra] = []
+        for axis in "dq":
+            seconds = plan.starts()[-1] * scenario.T_s
+            words = f"injection along {axis}: {seconds:.1f} s simulated"
+            watch.progress(len(sides), 2, words)
+            spectra, summary = _inject(scenario, plan, axis, external)
+            sides.append(spectra)
+            name = controlled_by(summary) if external else name
+        settled = max(side.ends for side in sides)
+        if given or settled <= _SETTLED:
+            break
+        if 2.0 * settle_s > _LONGEST_S:
+            raise UserError(
+                f"after {settle_s:g} s the ends of a window still differ by {settled:.1e} of "
+                f"the deviation, allowed is {_SETTLED:g}; the loop is too slow, or noise or "
+                "rounding hides the tones: raise amplitude, and give settle_s"
+            )
+        settle_s *= 2.0
+    return _found(name, scenario, plan, settle_s, settled, sides, Y_of)
 
 
-def _check(scenario: Scenario, foreign: bool) -> None:
+def _check(scenario: Scenario, external: bool) -> None:
     if scenario.network is not None:
-        raise UserError("network: identify measures one converter on its line to the grid")
+        raise UserError("network: a scan measures one converter on its line to the grid")
     if scenario.plant.grid.finite is not None:
         raise UserError("plant.grid.finite: such a grid sets its own frequency; leave it out")
-    if foreign and scenario.link.type == INPROC:
+    if external and scenario.link.type == INPROC:
         raise UserError(f"link.type = {INPROC!r}: another controller needs a link, e.g. zmq")
 
 
@@ -490,56 +453,51 @@ def _omega_b(scenario: Scenario) -> float:
     return float(make_plant(scenario.plant, scenario.T_s).net[0]["omega_b"])
 
 
-def _run(
-    scenario: Scenario,
-    plan: _Plan,
-    axis: str,
-    place: Path,
-    foreign: tuple[str, ...],
-    tell: Callable[[str], None],
-) -> Run:
-    """Play the injection of one axis.
+def _inject(
+    scenario: Scenario, plan: _Plan, axis: str, external: tuple[str, ...]
+) -> tuple[_Spectra, dict[str, Any]]:
+    """The spectra of a run with the injection along one axis, and its summary.
 
     Raises:
         UserError: the run did not complete.
     """
     grid, T_s = scenario.plant.grid, scenario.T_s
     starts, events = plan.starts(), []
-    for k, band in enumerate(plan.bands):
-        wave = _sines(plan, k, axis, scenario)
-        t = np.arange(len(wave)) * band.every * T_s
-        omega_g = grid.omega_g + (wave if axis == "q" else 0.0 * wave)
-        V_g = grid.V_g + (wave if axis == "d" else 0.0 * wave)
-        lines = np.column_stack([t, omega_g, V_g])
-        for first in range(0, len(lines) - 1, _MOST_LINES):
-            part = lines[first : first + _MOST_LINES + 1].copy()
-            part[:, 0] -= part[0, 0]
-            file = place / f"{axis}-{k}-{first}.csv"
-            np.savetxt(file, part, "%.17g", ",", header="t,omega_g,V_g", comments="")
-            tick = starts[k] + first * band.every
-            events.append({"type": "grid-profile", "tick": tick, "file": str(file)})
-    kept = {"law", "inner", "T_s", "seed", "references", "plant", "link", "late_policy"}
-    content = scenario.model_dump(mode="json", exclude_none=True, include=kept)
-    content |= {
-        "title": f"{scenario.title}: injection along {axis}",
-        "duration": (starts[-1] + 1) * T_s,  # with the state at the end of the last window
-        "mode": "lockstep",
-        "expect_ripple": 1000.0,  # the injection is one
-        "events": events,
-    }
-    tell(f"injection along {axis}: {starts[-1] * T_s:.1f} s simulated")
-    made = load_scenario(content, in_process=not foreign)
-    if foreign:
-        folder = place / f"run-{axis}-{starts[-1]}"
-        run = run_scenario(made, folder, controller_command=foreign)
-    else:
-        run = run_in_memory(made)
-    if run.status != "completed":
-        raise UserError(
-            f"the run with the injection along {axis} ended as {run.status}: "
-            f"{run.summary['reason']}; a smaller amplitude, or another grid, may help"
-        )
-    return run
+    with tempfile.TemporaryDirectory(prefix="gfmhil-scan-") as place:
+        for k, band in enumerate(plan.bands):
+            wave = _sines(plan, k, axis, scenario)
+            t = np.arange(len(wave)) * band.every * T_s
+            omega_g = grid.omega_g + (wave if axis == "q" else 0.0 * wave)
+            V_g = grid.V_g + (wave if axis == "d" else 0.0 * wave)
+            lines = np.column_stack([t, omega_g, V_g])
+            for first in range(0, len(lines) - 1, _MOST_LINES):
+                part = lines[first : first + _MOST_LINES + 1].copy()
+                part[:, 0] -= part[0, 0]
+                file = Path(place) / f"{axis}-{k}-{first}.csv"
+                np.savetxt(file, part, "%.17g", ",", header="t,omega_g,V_g", comments="")
+                tick = starts[k] + first * band.every
+                events.append({"type": "grid-profile", "tick": tick, "file": str(file)})
+        kept = {"law", "inner", "T_s", "seed", "references", "plant", "link", "late_policy"}
+        content = scenario.model_dump(mode="json", exclude_none=True, include=kept)
+        content |= {
+            "title": f"{scenario.title}: injection along {axis}",
+            "duration": (starts[-1] + 1) * T_s,  # with the state at the end of the last window
+            "mode": "lockstep",
+            "expect_ripple": 1000.0,  # the injection is one
+            "events": events,
+        }
+        made = load_scenario(content, in_process=not external)
+        if external:
+            folder = Path(place) / "run"
+            run = run_scenario(made, folder, controller_command=external)
+        else:
+            run = run_in_memory(made)
+        if run.status != "completed":
+            raise UserError(
+                f"the run with the injection along {axis} ended as {run.status}: "
+                f"{run.summary['reason']}; a smaller amplitude, or another grid, may help"
+            )
+        return _Spectra.of(run, plan), run.summary  # read while the folder is there
 
 
 @dataclass(frozen=True)
@@ -708,7 +666,7 @@ def _found(
     settled: float,
     sides: Sequence[_Spectra],
     Y_of: Callable[[Vector], Response] | None,
-) -> Identification:
+) -> FrequencyScan:
     """The result of an injection along d and one along q."""
     hz, (d, q) = plan.hz, sides
     volts, amps = (np.stack([getattr(d, x), getattr(q, x)], axis=-1) for x in ("v", "i_o"))
@@ -723,7 +681,7 @@ def _found(
         v = np.linalg.solve(np.eye(2) + Z @ model, q.v_g[..., None])
         answer = _power(np.asarray(v[..., 0]), np.asarray(-(model @ v)[..., 0]), q.rest)
         nfp_model = answer / _frequency(q.v_g, hz, q.rest[2], omega[0])
-    return Identification(
+    return FrequencyScan(
         name, scenario, hz, -amps @ np.linalg.inv(volts), model, nfp, nfp_model, line, omega,
         plan.amplitude, settle_s, settled,
     )  # fmt: skip

@@ -1,76 +1,37 @@
-"""The parts of a scenario as pydantic models, with all checks that need no plant or laws."""
+"""The keys of a scenario, with all checks that need no plant."""
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
-from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.schema import StrictSchema
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import Impairment
-from gfm_hil.scenario.events import (
-    Breaker,
-    Event,
-    Fault,
-    GridFrequency,
-    GridImpedance,
-    GridLoad,
-    GridProfile,
-    GridUnbalance,
-    GridVoltage,
-    LawChange,
-    LineBreaker,
-    PhaseJump,
-    Reset,
-    apply_grid_event,
-    check_reference,
-    nominal_hz,
-    reference_field,
-)
+from gfm_hil.scenario.events import AnyEvent
+from gfm_hil.scenario.events.base import Event
+from gfm_hil.scenario.events.grid_profile import LARGEST_FILE
+from gfm_hil.scenario.events.reference import check_reference, reference_field
 from gfm_hil.scenario.expectation import check_expectation
-from gfm_hil.scenario.profiles import content_hash, look_beside, read_profile
-from gfm_plant import (
-    ConverterParameters,
-    Network,
-    NetworkParts,
-    Plant,
-    finish_check,
-    load_converter,
-    make_network,
-    make_plant,
-)
+from gfm_plant import NetworkParts, Plant, load_converter
 from gfm_plant.records import SIZES
-from gfm_plant.synchro_check import AGREED
-from gfm_runtime import Law, LawError, discretise, law_file, load_law
-from gfm_runtime.errors import allowed, meant, printable
+from gfm_runtime import LawError, law_file
+from gfm_runtime.errors import meant
 from gfm_runtime.inner_file import named_inner
+from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import REF_NAMES, table_hash
-from gfm_runtime.toml_file import read_toml
 
-
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-_CAN_BE_IMPOSSIBLE = (
-    Breaker, Fault, GridFrequency, GridImpedance, GridLoad, GridProfile, GridUnbalance,
-    GridVoltage, LineBreaker, PhaseJump,
-)  # fmt: skip
 #: ``link.peer_timeout_s`` by mode where none is given: real time cannot wait; in lockstep no time
 #: passes meanwhile, and a busy machine may keep a side for seconds
 PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
 
-class Link(_Model):
+class LinkSettings(StrictSchema):
     """How the two sides exchange frames."""
 
     type: str = Field("zmq", description="name of a link; inproc: one compiled loop, lockstep only")
@@ -95,7 +56,7 @@ class Link(_Model):
     )
 
     @model_validator(mode="after")
-    def _known(self) -> Link:
+    def _known(self) -> LinkSettings:
         if self.type == INPROC:  # ignore endpoint and options: another link may need them
             return self
         if self.type not in link_names():
@@ -107,11 +68,16 @@ class Link(_Model):
         return self
 
 
+def file_hash(file: str) -> str:
+    """Hash of the content of a file, wherever it lies."""
+    return hashlib.sha256(read_regular(file, LARGEST_FILE)).hexdigest()[:16]
+
+
 def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-class References(_Model):
+class References(StrictSchema):
     """Y_ref at the start, p.u."""
 
     V_dcref: float = reference_field("V_dcref", 1.0)
@@ -131,7 +97,7 @@ class References(_Model):
         return [getattr(self, name) for name in REF_NAMES]
 
 
-class LatePolicy(_Model):
+class LatePolicy(StrictSchema):
     """Real time: what to do if a frame misses its deadline."""
 
     hold: int = Field(
@@ -153,14 +119,14 @@ class LatePolicy(_Model):
         return self
 
 
-class Member(_Model):
+class NetworkConverter(StrictSchema):
     """One converter of a network; what it does not give is that of the scenario."""
 
     node: str = Field(min_length=1, description="where its line ends")
     law: str | None = Field(None, description="catalogue name or path of a law file")
     inner: str | None = Field(None, description="inner stage of its laws")
     references: References | None = Field(None, description="references Y_ref at the start")
-    link: Link | None = Field(None, description="between the plant and its controller")
+    link: LinkSettings | None = Field(None, description="between the plant and its controller")
     late_policy: LatePolicy | None = Field(
         None, description="real time: what happens to late frames"
     )
@@ -170,21 +136,21 @@ class Member(_Model):
     )
 
     @model_validator(mode="after")
-    def _has_no_grid(self) -> Member:
+    def _has_no_grid(self) -> NetworkConverter:
         if self.plant is not None and self.plant.grid != Plant().grid:
             raise ValueError("plant.grid: is the scenario's own; its node is network.grid")
         return self
 
 
-class Members(NetworkParts):
+class NetworkSettings(NetworkParts):
     """Several converters and what connects them."""
 
-    converters: dict[str, Member] = Field(
+    converters: dict[str, NetworkConverter] = Field(
         min_length=1, max_length=max(SIZES), description="by name"
     )
 
 
-class Scenario(_Model):
+class Scenario(StrictSchema):
     """One experiment."""
 
     title: str = Field(description="of figures and reports")
@@ -242,18 +208,18 @@ class Scenario(_Model):
     )
     compare: list[str] = Field(default_factory=list, description="laws for `gfmhil compare`")
     references: References = Field(References(), description="references Y_ref at the start")
-    link: Link = Field(Link(), description="how the two sides exchange frames")
+    link: LinkSettings = Field(LinkSettings(), description="how the two sides exchange frames")
     late_policy: LatePolicy = Field(
         LatePolicy(), description="real time: what happens to late frames"
     )
     plant: Plant = Field(Plant(), description="converter, grid and instruments")
-    network: Members | None = Field(
+    network: NetworkSettings | None = Field(
         None, description="several converters in one network; one on its line to the grid if none"
     )
     converter: str | None = Field(
         None, description="in the folder of a converter of a network: which one it is"
     )
-    events: list[Event] = Field(
+    events: list[AnyEvent] = Field(
         default_factory=list,
         max_length=10_000,
         description="what happens in the run, each at its time",
@@ -280,7 +246,7 @@ class Scenario(_Model):
         assert self.network is not None
         given = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
 
-        def whole(member: Member) -> Member:
+        def whole(member: NetworkConverter) -> NetworkConverter:
             if self.converter is not None:  # it was made whole before
                 return member
             own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
@@ -320,13 +286,13 @@ class Scenario(_Model):
         return all(link.type == INPROC for link in self.links)
 
     @property
-    def links(self) -> list[Link]:
+    def links(self) -> list[LinkSettings]:
         """The link of each converter that runs here."""
         return [self.of(name).link for name in self.parts] or [self.link]
 
     def laws(self) -> list[str]:
         """Names of all laws that the run uses, each once, the initial law first."""
-        changes = [e.law for e in self.sorted_events() if isinstance(e, LawChange)]
+        changes = [e.law for e in self.sorted_events() if hasattr(e, "law")]
         return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
 
     def sorted_events(self) -> list[Event]:
@@ -353,8 +319,11 @@ class Scenario(_Model):
         names = self.laws()
         events = []
         for e in self.sorted_events():
-            known: dict[str, Any] = {"law": names.index(e.law)} if isinstance(e, LawChange) else {}
-            known |= {"file": content_hash(e.file)} if isinstance(e, GridProfile) else {}
+            known: dict[str, Any] = {}
+            if hasattr(e, "law"):
+                known["law"] = names.index(e.law)
+            if hasattr(e, "file"):
+                known["file"] = file_hash(e.file)
             events.append({**e.model_dump(), **known})
         return _hash([content, events, self.laws_digest(), table_hash()])
 
@@ -422,15 +391,7 @@ class Scenario(_Model):
                     f"events.{k}: at {event.at(self.T_s) * self.T_s:g} s, but the run ends at "
                     f"{self.duration:g} s"
                 )
-            if isinstance(event, Reset) and self.after_trip == "end":
-                problems.append(f"events.{k}: nothing to reset with after_trip = 'end'; use 'wait'")
-            if isinstance(event, Breaker) and self.plant.grid.load_R is None and not self.network:
-                problems.append(f"events.{k}: the breaker needs plant.grid.load_R and load_L")
-            if isinstance(event, GridImpedance) and self.network is not None:
-                problems.append(
-                    f"events.{k}: grid-impedance is for the line of one converter alone; a"
-                    " network's lines have breakers"
-                )
+            problems += [f"events.{k}: {line}" for line in event.misfits(self)]
             asked = getattr(event, "converter", None)
             if asked is not None and asked not in self.converters:
                 problems.append(
@@ -448,302 +409,3 @@ class Scenario(_Model):
         if problems:
             raise ValueError("; ".join(problems))
         return self
-
-
-__all__ = [
-    "LatePolicy",
-    "Link",
-    "References",
-    "Scenario",
-    "check_scenario",
-    "find_scenario",
-    "load_scenario",
-    "shipped_scenarios",
-]
-
-SCENARIO_FOLDERS = (
-    Path(__file__).resolve().parents[1] / "scenarios",  # in a wheel
-    Path(__file__).resolve().parents[3] / "scenarios",  # in a checkout
-)
-
-
-def find_scenario(name: str) -> Path:
-    """The file of a scenario: a path, or the name of a shipped one (with or without .toml).
-
-    Raises:
-        UserError: neither exists.
-    """
-    return find_file("scenario", name, "*.toml")
-
-
-def find_file(kind: str, name: str, pattern: str) -> Path:
-    """The file at that path, or the shipped file of that name; ``kind`` is for the message.
-
-    Raises:
-        UserError: neither exists.
-    """
-    given, shipped = Path(name), _shipped(pattern)
-    try:
-        is_file, exists = given.is_file(), given.exists()
-    except OSError as problem:  # for example a name of 300 characters
-        raise UserError(printable(f"{kind} {name}: {problem.strerror}")) from None
-    if is_file:
-        return given
-    if given.name.removesuffix(".toml") in shipped:
-        return shipped[given.name.removesuffix(".toml")]
-    what = "is not a regular file" if exists else "no such file"
-    known = allowed(given.stem, sorted(shipped), "shipped are")
-    raise UserError(printable(f"{kind} {name}: {what}; {known}"))
-
-
-def _shipped(pattern: str) -> dict[str, Path]:
-    return {p.stem: p for folder in SCENARIO_FOLDERS for p in folder.glob(pattern)}
-
-
-def shipped_scenarios() -> list[str]:
-    """Names of the scenarios that come with gfmhil."""
-    return sorted(_shipped("*.toml"))
-
-
-def load_scenario(
-    given: str | Path | Scenario | dict[str, Any],
-    options: Mapping[str, str] = MappingProxyType({}),
-    in_process: bool = False,
-    converter: str | None = None,
-    **changed: Any,
-) -> Scenario:
-    """Read, override and check a scenario, its laws and its plant.
-
-    Args:
-        given: path or shipped name; content of a file; or a checked scenario.
-        options: what the user calls an override, by its name in ``changed``, e.g.
-            ``{"link__type": "--link"}``; messages name it in place of the file.
-        in_process: the caller runs it in this process: the link is ``inproc`` unless ``changed``
-            names another one. Messages do not mention this choice, because the user did not make
-            it.
-        converter: of a network: the one that gets ``law`` and ``inner`` of ``changed``. Without it
-            all converters get them, so that none may name its own.
-        changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
-            None leaves the file's value. A link other than the file's drops the file's endpoint
-            and options. The link ``inproc`` implies lockstep unless a ``mode`` is given.
-
-    Raises:
-        UserError: one line per mistake, each with its path, the value and what is allowed.
-    """
-    where, content = "scenario", {}
-    if isinstance(given, str | Path):
-        where = str(find_scenario(str(given)))
-        try:
-            content = read_toml(where)
-        except ValueError as problem:
-            raise UserError(f"{where}: {problem}") from None
-        look_beside(content, Path(where).parent)
-        if "phi" in content:
-            raise UserError(f"{where}: is a law file; give it to a scenario as its law")
-    elif isinstance(given, Scenario):
-        content = given.model_dump(mode="json", exclude_none=True)
-    else:
-        content = copy.deepcopy(given)
-    overrides = {key: value for key, value in changed.items() if value is not None}
-    overrides, options = _of_converter(content, converter, overrides, options)
-    implied: dict[str, Any] = {}
-    if in_process or overrides.get("link__type") == INPROC:
-        implied = {"link__type": INPROC, "mode": "lockstep"}
-    link, chosen = content.get("link"), overrides.get("link__type")
-    if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
-        link.pop("endpoint", None)  # they belong to the file's link
-        link.pop("options", None)
-    if in_process or chosen is not None:  # one link for all
-        network = content.get("network")
-        members = network.get("converters") if isinstance(network, dict) else None
-        for member in members.values() if isinstance(members, dict) else ():
-            if isinstance(member, dict):
-                member.pop("link", None)
-    for key, value in (implied | overrides).items():
-        table: Any = content
-        *parents, last = key.split("__")
-        for parent in parents:
-            table = table.setdefault(parent, {}) if isinstance(table, dict) else None
-        if isinstance(table, dict):  # else the check reports what the file has instead
-            table[last] = value
-    named = {
-        tuple(key.split("__")): f"{options.get(key, key.replace('__', '.'))} {value}"
-        for key, value in overrides.items()
-    }
-    return check_scenario(content, where, named)
-
-
-def _of_converter(
-    content: dict[str, Any],
-    converter: str | None,
-    overrides: dict[str, Any],
-    options: Mapping[str, str],
-) -> tuple[dict[str, Any], Mapping[str, str]]:
-    """Overrides and their names as for ``load_scenario``, with ``law`` and ``inner`` where they
-    reach the converters of a network.
-
-    Raises:
-        UserError: there is no such converter; none is named, and one has its own law or stage.
-    """
-    network = content.get("network")
-    members = network.get("converters") if isinstance(network, dict) else None
-    members = members if isinstance(members, dict) else {}
-    if converter is not None and converter not in members:
-        allowed = f"must be one of {[*members]}" if members else "the scenario has no network"
-        option = options.get("converter", "converter")
-        raise UserError(f"{option} {converter}: {allowed}{meant(converter, members)}")
-    if converter is None and members:
-        converter = content.get("converter")  # the folder of a converter knows it
-    found, names = dict(overrides), dict(options)
-    for key in ("law", "inner"):
-        if key not in overrides or not members:
-            continue
-        named = options.get(key, key)
-        if converter is not None:
-            own = f"network__converters__{converter}__{key}"
-            found[own], names[own] = found.pop(key), named
-        elif owners := [n for n, m in members.items() if isinstance(m, dict) and key in m]:
-            other = f"set network.converters.NAME.{key}"
-            if "converter" in options:
-                other = f"name the converter that gets it with {options['converter']}"
-            whose = ", ".join(map(str, owners))
-            raise UserError(
-                printable(f"{named} {overrides[key]}: does not replace the own {key} of {whose};"
-                          f" {other}")
-            )  # fmt: skip
-    return found, names
-
-
-def check_scenario(
-    content: dict[str, Any],
-    where: str,
-    overrides: Mapping[tuple[str, ...], str] = MappingProxyType({}),
-) -> Scenario:
-    """The scenario of a dict, with its laws and its plant tried out.
-
-    Args:
-        content: plain data.
-        where: the file it comes from.
-        overrides: what does not come from there, by its path: an option with its value.
-
-    Raises:
-        UserError: as ``load_scenario``.
-    """
-
-    def source(path: tuple[str | int, ...]) -> str:
-        """Where the value at a path comes from; a table may come from several places."""
-        for part, option in overrides.items():
-            if path[: len(part)] == part:
-                return option
-        inside = [option for part, option in overrides.items() if part[: len(path)] == path]
-        return " with ".join([where, ", ".join(inside)] if inside else [where])
-
-    try:
-        scenario = Scenario.model_validate(content)
-    except ValidationError as problem:
-        raise UserError("\n".join(lines(problem, Scenario, source, content))) from None
-    wrong: list[str] = []
-    if scenario.inner is not None:
-        try:
-            named_inner(scenario.inner)
-        except LawError as problem:
-            ours = "" if ("inner",) in overrides else f"{where}: "
-            raise UserError("\n".join(ours + line for line in problem.lines)) from None
-    for member in [scenario.of(name) for name in scenario.converters]:
-        for law in member.laws():
-            try:
-                for stage in load_law(law, member.inner).laws:
-                    _try_law(law, stage, scenario.T_s)
-            except LawError as problem:
-                key = "inner" if _no_stage(member.inner) else "law"
-                at = f"network.converters.{member.converter}.{key}: "
-                wrong += [f"{where}: {at}{line}" for line in problem.lines]
-    for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
-        ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
-        try:
-            for stage in load_law(law, scenario.inner).laws:
-                _try_law(law, stage, scenario.T_s)
-        except LawError as problem:
-            wrong += [ours + line for line in problem.lines]
-    try:
-        _try_plant(scenario)
-    except UserError as problem:
-        wrong.append(f"{source(('plant',))}: {problem}")
-    if wrong:
-        raise UserError("\n".join(map(printable, wrong)))
-    return scenario
-
-
-def _no_stage(name: str | None) -> bool:
-    """Whether there is no such inner stage."""
-    try:
-        if name is not None:
-            named_inner(name)
-    except LawError:
-        return True
-    return False
-
-
-def _try_law(name: str, stage: Law, T_s: float) -> None:
-    try:
-        discretise(stage, T_s)
-    except LawError as problem:
-        raise problem.within(f"law {name}") from None
-
-
-def plant_of(scenario: Scenario) -> Network:
-    """The plant of a scenario: one converter, or those of its network.
-
-    Raises:
-        ValueError: as ``make_plant`` and ``make_network``.
-    """
-    if scenario.network is None:
-        options = scenario.plant
-        options = options.with_seed(scenario.seed) if scenario.seed else options
-        return make_plant(options, scenario.T_s)
-    converters = {}
-    for name, member in scenario.network.converters.items():
-        options = scenario.of(name).plant
-        if scenario.seed:
-            options = options.with_seed(scenario.seed)
-        converters[name] = (options, member.node)
-    return make_network(converters, scenario.T_s, scenario.plant.grid, scenario.network)
-
-
-def _try_plant(scenario: Scenario) -> None:
-    """Build the plant and try those of its events that not every plant can carry out."""
-    plants = {"plant.": scenario.plant} | {
-        f"network.converters.{name}.plant.": scenario.of(name).plant for name in scenario.converters
-    }
-    for of, options in plants.items():
-        place = f"{of}converter = {options.converter!r}"
-        if not options.converter.endswith(".toml"):
-            try:
-                load_converter(options.converter)
-            except ValueError as problem:  # names key and value itself
-                raise UserError(f"{of}{problem}") from None
-            continue
-        try:
-            ConverterParameters.model_validate(read_toml(options.converter))
-        except ValidationError as problem:
-            wrong = lines(problem, ConverterParameters)
-            raise UserError("; ".join(f"{place}: {line}" for line in wrong)) from None
-        except ValueError as problem:
-            raise UserError(f"{place}: {problem}") from None
-    try:
-        plant = plant_of(scenario)
-    except ValueError as problem:
-        raise UserError(str(problem)) from None
-    for k, event in enumerate(scenario.events):
-        if isinstance(event, _CAN_BE_IMPOSSIBLE):
-            try:
-                if isinstance(event, GridProfile):
-                    profile = read_profile(event.file, nominal_hz(plant))
-                    next(profile.points(scenario.T_s))[1].apply(plant)
-                else:
-                    apply_grid_event(event, plant)
-                    if plant.wiring.check is not None:  # what it waits for is tried too
-                        plant.now["check"] = AGREED
-                        finish_check(plant)
-            except (UserError, ValueError) as problem:
-                raise UserError(f"events.{k}: {problem}") from None

@@ -1,4 +1,4 @@
-"""Courses of the grid's frequency and voltage over time, from CSV files.
+"""A course of the grid's frequency and voltage over time, from a CSV file.
 
 A file has the columns t [s] and f_hz [Hz] or omega_g [p.u.], V_g [p.u.], or both; lines that begin
 with # are for people. Between its lines a course is straight.
@@ -6,20 +6,22 @@ with # are for people. Between its lines a course is straight.
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import hashlib
 import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from pydantic import Field
+
+import gfm_plant
 from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.events.base import EventTarget, PlantEvent, nominal_hz
 from gfm_runtime.errors import printable
-from gfm_runtime.regular import open_regular, read_regular
+from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import SIGNALS
 
 if TYPE_CHECKING:
@@ -28,11 +30,45 @@ if TYPE_CHECKING:
 _COLUMNS = ("t", "f_hz", "omega_g", "V_g")
 _RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
 _MOST = 100_000  # lines
-_MOST_BYTES = 64 << 20
+LARGEST_FILE = 64 << 20
+
+
+class GridProfile(PlantEvent):
+    """The grid's frequency and voltage follow a CSV file: t [s after the event], and f_hz [Hz] or
+    omega_g [p.u.], V_g [p.u.], or both; straight between its lines, and at the end they stay."""
+
+    type: Literal["grid-profile"] = Field(description="kind of event")
+    file: str = Field(
+        min_length=1, description="path, from the scenario's folder or where you run the command"
+    )
+
+    def lasts(self) -> float:
+        try:
+            return read_profile(self.file, None).t[-1]
+        except UserError:  # its file is gone
+            return 0.0
+
+    def label(self) -> str:
+        return f"grid profile {PurePath(self.file).stem}"
+
+    def course(self, plant: Network) -> Iterator[tuple[int, Point]]:
+        return read_profile(self.file, nominal_hz(plant)).points(float(plant.net[0]["T_s"]))
+
+    def try_on(self, plant: Network) -> None:
+        next(self.course(plant))[1].apply(plant)
+
+    def apply(self, plant: Network) -> None:
+        """Its points follow."""
+
+    def check_now(self, target: EventTarget) -> None:
+        raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
+
+
+EVENT = GridProfile
 
 
 class Point(NamedTuple):
-    """What the plant is told at a tick of a course: go to these values, in a line.
+    """What the plant does from a tick of a course on: go to these values, in a line.
 
     Attributes:
         omega_g, V_g: p.u.; None: it stays as it is.
@@ -49,12 +85,12 @@ class Point(NamedTuple):
         Raises:
             ValueError: the grid is finite and has its own frequency.
         """
-        from gfm_plant.grid import grid_frequency, grid_voltage
-
         if self.omega_g is not None:
-            grid_frequency(plant, self.omega_g, self._rate(self.omega_g, plant, "omega_g"))
+            gfm_plant.grid_frequency(
+                plant, self.omega_g, self._rate(self.omega_g, plant, "omega_g")
+            )
         if self.V_g is not None:
-            grid_voltage(plant, self.V_g, self._rate(self.V_g, plant, "V_g"))
+            gfm_plant.grid_voltage(plant, self.V_g, self._rate(self.V_g, plant, "V_g"))
 
     def _rate(self, value: float, plant: Network, name: str) -> float | None:
         """p.u./s from where the grid is now; None for a step."""
@@ -76,7 +112,7 @@ class Profile:
     V_g: list[float] | None
 
     def points(self, T_s: float) -> Iterator[tuple[int, Point]]:
-        """What to tell the plant, each with its tick after the event. Lines that fall on the same
+        """What the plant does, each with its tick after the event. Lines that fall on the same
         tick count as the last of them."""
         last = {round(t / T_s): k for k, t in enumerate(self.t)}
 
@@ -102,7 +138,7 @@ def read_profile(file: str, f_n: float | None) -> Profile:
     """
     t, columns = [], dict[str, list[float]]()
     try:
-        with io.TextIOWrapper(open_regular(file, _MOST_BYTES), "utf-8", newline="") as text:
+        with io.TextIOWrapper(open_regular(file, LARGEST_FILE), "utf-8", newline="") as text:
             for number, cells in _lines(text, file):
                 if not columns:
                     columns = {name: [] for name in _head([c.strip() for c in cells], file)}
@@ -160,58 +196,3 @@ def _value(name: str, cell: str, f_n: float | None, where: str) -> float:
     if not (math.isfinite(value) and low <= value <= high):
         raise UserError(f"{where}: {name} = {value:g}: must lie in [{low:g}, {high:g}]")
     return value
-
-
-def last_time(file: str) -> float:
-    """When a course ends, s after its event; 0 if its file is gone."""
-    try:
-        return read_profile(file, None).t[-1]
-    except UserError:
-        return 0.0
-
-
-def content_hash(file: str) -> str:
-    """Hash of a file, wherever it lies."""
-    return hashlib.sha256(read_regular(file, _MOST_BYTES)).hexdigest()[:16]
-
-
-def look_beside(content: Any, folder: Path) -> None:
-    """Make the files that a scenario names absolute where they lie in the scenario's folder: laws,
-    inner stages, converters and courses of the grid.
-
-    Args:
-        content: of the scenario's file, plain data that nobody has checked.
-        folder: of the file.
-    """
-    for table, key in _files(content):
-        file = table[key]
-        if not isinstance(file, str) or "\0" in file:
-            continue
-        if key != "file" and not file.endswith(".toml"):
-            continue
-        with contextlib.suppress(OSError):  # a name too long: the check of the file says so
-            if (folder / file).is_file():
-                table[key] = str((folder / file).absolute())
-
-
-def _files(content: Any) -> Iterator[tuple[Any, Any]]:
-    """The places of a scenario's content that may name files, each as container and key."""
-
-    def within(table: Any, *keys: str) -> Iterator[tuple[Any, Any]]:
-        for key in keys if isinstance(table, dict) else ():
-            value = table.get(key)
-            if isinstance(value, list):
-                yield from ((value, k) for k in range(len(value)))
-            elif key in table:
-                yield table, key
-
-    def inside(table: Any, key: str) -> Any:
-        return table.get(key) if isinstance(table, dict) else None
-
-    members = inside(inside(content, "network"), "converters")
-    for one in (content, *(members.values() if isinstance(members, dict) else ())):
-        yield from within(one, "law", "inner", "ready_laws", "compare")
-        yield from within(inside(one, "plant"), "converter")
-    events = inside(content, "events")
-    for event in events if isinstance(events, list) else ():
-        yield from within(event, "file", "law")

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from gfm_hil.studies.identification import Identification
+    from gfm_hil.studies.scan import FrequencyScan
 
 _GREY = "#888888"
 _CELLS = ("dd", "dq", "qd", "qq")
 _NYQUIST = 3.0  # half a side of the figure
 
 
-def draw_admittance(of: Identification) -> list[Axes]:
+def admittance(of: FrequencyScan) -> list[Axes]:
     """Gain and phase of the four entries: two rows of panels a row of Y."""
     from matplotlib import pyplot
 
@@ -47,7 +47,7 @@ def draw_admittance(of: Identification) -> list[Axes]:
     return list(panels.ravel())
 
 
-def draw_passivity(of: Identification) -> list[Axes]:
+def passivity(of: FrequencyScan) -> list[Axes]:
     """The least eigenvalue of Y + Y^H, and the deviation of Y from the model."""
     from matplotlib import pyplot
 
@@ -72,7 +72,7 @@ def draw_passivity(of: Identification) -> list[Axes]:
     return panels
 
 
-def draw_nfp(of: Identification, figure: Figure | None = None) -> list[Axes]:
+def nfp(of: FrequencyScan, figure: Figure | None = None) -> list[Axes]:
     """Gain and phase of the change of p over that of the grid's frequency; in a figure of its own
     if none is given."""
     if figure is None:
@@ -89,7 +89,7 @@ def draw_nfp(of: Identification, figure: Figure | None = None) -> list[Axes]:
     return [gain, phase]
 
 
-def draw_nyquist(of: Identification, scr: float, x_over_r: float) -> Axes:
+def nyquist_on_grid(of: FrequencyScan, scr: float, x_over_r: float) -> Axes:
     """The eigenvalues of Z Y, over positive frequencies, near -1."""
     from matplotlib import pyplot
 
@@ -112,21 +112,21 @@ def draw_nyquist(of: Identification, scr: float, x_over_r: float) -> Axes:
     return axes
 
 
-def save_figures(of: Identification, folder: Path, grids: Sequence[tuple[float, float]]) -> None:
+def save_figures(of: FrequencyScan, folder: Path, grids: Sequence[tuple[float, float]]) -> None:
     """All figures as PNG."""
     import matplotlib
     from matplotlib import pyplot
 
     matplotlib.use("Agg")
     for name, draw in (
-        ("admittance", draw_admittance),
-        ("passivity", draw_passivity),
-        ("nfp", draw_nfp),
+        ("admittance", admittance),
+        ("passivity", passivity),
+        ("nfp", nfp),
     ):
         draw(of)
         _keep(folder / f"{name}.png")
     for scr, x_over_r in grids:
-        draw_nyquist(of, scr, x_over_r)
+        nyquist_on_grid(of, scr, x_over_r)
         _keep(folder / f"nyquist_scr_{scr:g}_xr_{x_over_r:g}.png")
     pyplot.close("all")
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from gfm_design.norms.performance import Channel
-from gfm_hil.scenario.model import Scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import Scenario, toml_text
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import GridSpec, LawFile, shipped_law
 
@@ -113,6 +112,6 @@ def write_law(
     ]
     source = f"{file.source.strip()}; tuned by {by}, see the comments"
     about = {"name": path.stem, "title": f"{file.title}, tuned", "source": source}
-    found_by = f"{by}, seed {result['seed']}"
-    text = law_text(file, gains, found_by, comments, home_grid=_PAPERS_GRID, **about)
+    changed_by = f"{by}, seed {result['seed']}"
+    text = law_text(file, gains, changed_by, comments, home_grid=_PAPERS_GRID, **about)
     path.write_text(text, encoding="utf-8")

@@ -14,8 +14,7 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.scenario.toml_out import toml_text
+from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import (
     DiscreteLaw,
@@ -33,7 +32,7 @@ from gfm_runtime.lawfile import ElementSpec, LawFile, tied
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
-    from gfm_hil.studies.loop import Loop
+    from gfm_design.model.closed_loop import ClosedLoop
 
 
 def as_law(law: str | Path | Law) -> Law:
@@ -204,7 +203,7 @@ class Law:
         converter: str | None = None,
         ideal: bool = False,
         **more: Any,
-    ) -> Loop:
+    ) -> ClosedLoop:
         """This law around a plant, linearised where both rest.
 
         Args:
@@ -222,18 +221,18 @@ class Law:
             LawError: the law cannot be discretised at T_s; ``ideal`` with an inner stage, which
                 runs from tick to tick.
         """
-        from gfm_hil.studies.loop import Loop
-        from gfm_hil.studies.network_loop import loop_under
+        from gfm_design.model.closed_loop import ClosedLoop
+        from gfm_hil.studies.linear_loop import loop_under
 
         if isinstance(on, str | Path):
             on = load_scenario(on)
         try:
             if not isinstance(on, Scenario):
-                return Loop.of(self.built(), on, ideal=ideal, **more)
+                return ClosedLoop.of(self.built(), on, ideal=ideal, **more)
             law = build_law(self.staged(on, converter))
             if converter is None:
                 more = {"references": on.references.vector(), "T_s": on.T_s, **more}
-                return Loop.of(law, on.plant, ideal=ideal, **more)
+                return ClosedLoop.of(law, on.plant, ideal=ideal, **more)
             if ideal or more:
                 raise UserError(f"{', '.join(more) or 'ideal'}: not of a converter of a network")
             return loop_under(law, on, converter)

@@ -1,4 +1,4 @@
-"""gfmhil identify: the dq admittance of a converter with its controller, measured on the bench."""
+"""gfmhil scan: the dq admittance of a converter with its controller, measured on the bench."""
 
 from __future__ import annotations
 
@@ -10,18 +10,14 @@ from typing import Any
 
 from rich.markup import escape
 
-from gfm_hil.cli.common import new_folder, progress
+from gfm_hil.api.studies import scan
+from gfm_hil.cli.common import add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import check_empty
 from gfm_hil.core.terminal import numbers, terminal
 from gfm_hil.results.report import cell
-from gfm_hil.scenario.model import find_scenario, shipped_scenarios
-from gfm_hil.studies.identification import (
-    AMPLITUDE,
-    POINTS,
-    WINDOW_S,
-    Identification,
-    identify,
-)
+from gfm_hil.scenario import find_scenario, shipped_scenarios
+from gfm_hil.studies.scan import AMPLITUDE, POINTS, WINDOW_S, FrequencyScan
 from gfm_runtime import law_names, tuned_names
 from gfm_runtime.errors import meant
 from gfm_runtime.toml_file import read_toml
@@ -64,24 +60,20 @@ def add(command: argparse.ArgumentParser) -> None:
         help="measure another controller: a program with its arguments, {endpoint} and {scenario}",
     )  # fmt: skip
     command.add_argument("-o", "--out", metavar="DIR",
-                         help="folder; runs/identify-<name>-<time> by default")  # fmt: skip
-    command.add_argument("--json", action="store_true", help="print identification.json only")
-    command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+                         help="folder; runs/scan-<name>-<time> by default")  # fmt: skip
+    add_study_options(command, "identification.json")
 
 
 def call(options: argparse.Namespace) -> int:
     law, scenario = _which(options.what, options.scenario)
-    folder = new_folder(options.out, f"identify-{Path(options.what).stem}")
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder}: is not empty; choose another folder")
-    with progress("{task.description}", quiet=options.quiet) as bar:
-        task = bar.add_task("identify")
-        found = identify(
+    folder = new_folder(options.out, f"scan-{Path(options.what).stem}")
+    check_empty(folder)
+    with watching("scan", options.quiet) as watch:
+        found = scan(
             law, scenario, inner=options.inner, start_hz=options.start, stop_hz=options.stop,
             points=options.points, amplitude=options.amplitude, settle_s=options.settle,
             window_s=options.window,
-            controller_command=shlex.split(options.controller or ""),
-            tell=lambda text: bar.update(task, description=text),
+            controller_command=shlex.split(options.controller or ""), watch=watch,
         )  # fmt: skip
     found.save(folder, options.grid)
     content = json.loads((folder / "identification.json").read_text(encoding="utf-8"))
@@ -131,7 +123,7 @@ def _which(what: str, scenario: str | None) -> tuple[str | None, str]:
     return None, what
 
 
-def _print(found: Identification, content: dict[str, Any], folder: Path) -> None:
+def _print(found: FrequencyScan, content: dict[str, Any], folder: Path) -> None:
     console = terminal(highlight=False)
     console.print(f"[bold]{escape(found.name)}[/] · {escape(found.scenario.title)}")
     dev = found.deviation

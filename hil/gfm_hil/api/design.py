@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
+from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.least_stable import least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
 from gfm_design.norms.weights import read_weights
@@ -19,11 +20,11 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
 from gfm_design.tuning.synthesis import NotStabilised
+from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.scenario.model import Scenario, load_scenario
-from gfm_hil.studies.law import Law, as_law
-from gfm_hil.studies.loop import Loop
-from gfm_hil.studies.network_loop import loop_under
+from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.studies.linear_loop import loop_under, title_of
+from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import Law as BuiltLaw
 
@@ -177,7 +178,7 @@ def tune(
     seed: int = 0,
     evaluations: int = EVALUATIONS,
     starts: int | None = None,
-    progress: Callable[[int, int, float], None] = lambda done, of, best: None,
+    watch: Watch = SILENT,
 ) -> Tuning:
     """Choose the free gains of a law for the least gamma (Section III-B of the paper).
 
@@ -196,7 +197,7 @@ def tune(
         seed: of the search, >= 0; the same seed gives the same gains.
         evaluations: of each start, before its polish.
         starts: the given start and random ones; 6, and one more a gain, if None.
-        progress: told the evaluations done, how many there are to be, and the best gamma.
+        watch: told the evaluations done, how many there are to be, and the best gamma.
 
     Raises:
         NotTuned: no gains within the bounds stabilise the loop.
@@ -215,7 +216,7 @@ def tune(
         scenario = on if isinstance(on, Scenario) else load_scenario(on)
         file = law.staged(scenario, converter)
 
-        def among(built: BuiltLaw) -> Loop:
+        def among(built: BuiltLaw) -> ClosedLoop:
             return loop_under(built, scenario, converter)
 
     paper = PAPER_START.get(law.name, {}) if among is None else dict[str, float]()
@@ -229,7 +230,7 @@ def tune(
     try:
         found = tune_paper(
             problem, seed, evaluations, starts,
-            lambda done, best: progress(done, evaluations * starts, best),
+            lambda done, best: watch.progress(done, evaluations * starts, f"γ {best:.4g}"),
         )  # fmt: skip
     except NotStabilised as none:
         loop = problem.closed_loop(none.values)
@@ -269,8 +270,8 @@ def margins(
     loop = as_law(law).closed_loop(on, **more)
     if loop.around is not None:
         raise UserError(
-            f"{loop.title}: ranges of elements and grids are those of one converter on its line;"
-            " Law.closed_loop(...).margins() has the other margins"
+            f"{title_of(loop)}: ranges of elements and grids are those of one converter on its"
+            " line; Law.closed_loop(...).margins() has the other margins"
         )
     return _margins(loop)
 

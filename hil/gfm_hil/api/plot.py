@@ -1,0 +1,276 @@
+"""Figures of linear loops with matplotlib, for a notebook: ``gfmhil.plot.bode(loop)``.
+
+A loop is that of ``Law.closed_loop``, a ``ClosedLoop``; of a network ``gfmhil.design.network_loop``
+gives a ``NetworkLoop``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
+from gfm_design.model.linear import Mode
+from gfm_design.model.network import NetworkLoop
+from gfm_hil.core.errors import UserError
+from gfm_hil.studies.linear_loop import title_of
+from gfm_runtime.signals import U_NAMES, Y_NAMES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Vector = NDArray[np.float64]
+
+_LOWEST_HZ, _TOP_HZ = 0.02, 5e3  # of a figure; a sampled loop ends at its Nyquist frequency
+_POINTS = 1000
+_LEAST_DB = -100.0  # the hold has zeros at the Nyquist frequency
+_NYQUIST = 3.0  # half a side of the figure: beyond it L is not near -1
+_GREY = "#888888"
+_SHOWN = 12  # modes of the figure of participations
+_LEAST = 0.005  # of a participation that is drawn
+
+
+def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
+    """Draw gain [dB] and phase [degrees] of L over Hz, see ``ClosedLoop.loop_gain``.
+
+    Args:
+        at: channels of u or y at which one loop is cut; each command that acts if none is given.
+
+    Raises:
+        UserError: the loop does not use such a channel.
+    """
+    gain, phase = _panels(2)
+    for k, (name, hz, L) in enumerate(_gains(loop, at)):
+        _curve(gain, hz, 20 * np.log10(np.abs(L)), k, name)
+        _curve(phase, hz, _degrees(L), k, name)
+    gain.axhline(0.0, color=_GREY, lw=0.8)
+    gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
+    phase.axhline(-180.0, color=_GREY, lw=0.8)
+    return _finish([gain, phase], f"{title_of(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
+
+
+def nyquist(loop: ClosedLoop, *at: str) -> Axes:
+    """Draw L in the complex plane near -1, over positive frequencies; arguments and errors as
+    ``bode``."""
+    from matplotlib import pyplot
+
+    from gfm_hil.results.figures import COLOURS, dress
+
+    _, axes = pyplot.subplots(figsize=(5.6, 5.6), layout="constrained")
+    for k, (name, _, L) in enumerate(_gains(loop, at)):
+        axes.plot(L.real, L.imag, color=COLOURS[k % len(COLOURS)], lw=1.2, label=name)
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    axes.plot(turn.real, turn.imag, color=_GREY, lw=0.7, ls=(0, (4, 3)))
+    axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
+    axes.set(xlim=(-_NYQUIST, _NYQUIST), ylim=(-_NYQUIST, _NYQUIST), aspect="equal")
+    axes.set(xlabel="Re L", ylabel="Im L")
+    dress(axes, f"{title_of(loop)}: L, one loop cut")
+    axes.legend(fontsize=8, frameon=False, loc="upper right")
+    return axes
+
+
+def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float = 1.0) -> list[Axes]:
+    """Draw y = (v_dc, p, omega_u, q, V) [p.u.] after a unit step, of a network those of all
+    converters; see ``step_response``.
+
+    Args:
+        of: one of the loop's ``inputs``: ``P_ref`` if None, of a network ``A.P_ref`` of its first
+            converter A.
+        seconds: how long, s.
+
+    Raises:
+        UserError: no such input.
+    """
+    from matplotlib import pyplot
+
+    from gfm_hil.results.figures import COLOURS, draw_panel
+
+    of = of or stepped_by_default(loop)
+    title = f"after a unit step of {of}"
+    curves: list[tuple[Vector, str, str]]
+    try:
+        if isinstance(loop, NetworkLoop):
+            colours = _colours(loop)
+            t, each = loop.step_response(of, seconds)
+            curves = [(each[one], colours[one], one) for one in loop.names]
+        else:
+            title = f"{title_of(loop)}: {title}"
+            t, y = loop.step_response(of, seconds)
+            curves = [(y, COLOURS[0], "")]
+    except ValueError as problem:
+        raise UserError(f"step: {problem}") from None
+    figure, panels = pyplot.subplots(
+        len(Y_NAMES), 1, sharex=True, figsize=(8.6, 8.2), layout="constrained"
+    )
+    for k, (axes, signal) in enumerate(zip(panels, Y_NAMES, strict=True)):
+        lines = [(t, x[:, k], colour, name or signal) for x, colour, name in curves]
+        draw_panel(axes, f"{signal} [p.u.]", lines)
+    panels[-1].set_xlabel("t [s]", fontsize=9)
+    if len(curves) > 1:
+        panels[0].legend(fontsize=8, frameon=False, loc="best", ncols=4)
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    return list(panels)
+
+
+def stepped_by_default(loop: ClosedLoop | NetworkLoop) -> str:
+    """The active power reference, of a network that of its first converter."""
+    return f"{loop.names[0]}.P_ref" if isinstance(loop, NetworkLoop) else "P_ref"
+
+
+def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
+    """Draw the poles: sigma [1/s] and frequency [Hz], over symmetric logarithms; of a network each
+    in the colour of the part that takes part in it most."""
+    from matplotlib import pyplot
+
+    from gfm_hil.results.figures import COLOURS, dress
+
+    _, axes = pyplot.subplots(figsize=(6.6, 4.6), layout="constrained")
+    if isinstance(loop, NetworkLoop):
+        _mark_parts(axes, loop)
+        title = "poles, stable where σ < 0; colour: the part with the largest participation"
+    else:
+        poles = loop.poles()
+        for here, colour, marker in (
+            (poles.real < 0.0, COLOURS[0], "o"),
+            (poles.real >= 0.0, COLOURS[1], "X"),
+        ):
+            some = poles[here]
+            axes.plot(some.real, some.imag / (2 * np.pi), marker, color=colour, ms=5)
+        title = f"{title_of(loop)}: poles, stable where σ < 0"
+    axes.axvline(0.0, color="k", lw=0.8)
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
+    dress(axes, title)
+    if isinstance(loop, NetworkLoop):
+        axes.legend(fontsize=8, frameon=False, loc="best")
+    return axes
+
+
+def _mark_parts(axes: Axes, loop: NetworkLoop) -> None:
+    modes = loop.modes()
+    for part, colour in _colours(loop).items():
+        those = [m for m in modes if next(iter(m.participation)) == part]
+        label: str | None = part
+        for marker, some in (
+            ("o", [m for m in those if m.sigma < 0.0]),
+            ("X", [m for m in those if m.sigma >= 0.0]),
+        ):
+            sigma, hz = ([getattr(m, name) for m in some] for name in ("sigma", "frequency_hz"))
+            if some:
+                axes.plot(sigma * 2, [*hz, *(-f for f in hz)], marker, color=colour, ms=5,
+                          label=label)  # fmt: skip
+                label = None
+
+
+def impedance(loop: ClosedLoop) -> list[Axes]:
+    """Draw gain [p.u. of Z_b] and phase [degrees] of ``ClosedLoop.output_impedance`` over Hz.
+
+    Raises:
+        ValueError: the loop was made of matrices.
+    """
+    size, phase = _panels(2)
+    hz = _hz(loop)
+    Z = loop.output_impedance(2 * np.pi * hz)
+    for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        name = f"Z_{'dq'[i]}{'dq'[j]}"
+        _curve(size, hz, np.abs(Z[:, i, j]), k, name)
+        _curve(phase, hz, _degrees(Z[:, i, j]), k, name)
+    size.set_yscale("log")
+    title = f"{title_of(loop)}: output impedance at the capacitor, dq"
+    return _finish([size, phase], title, "|Z| [p.u.]", "∠Z [°]")
+
+
+def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
+    """Draw who takes part in the modes, the slowest to decay first: a bar for each, with the
+    participations of ``modes()``.
+
+    Args:
+        most: how many modes, at least 1.
+    """
+    from matplotlib import pyplot
+
+    from gfm_hil.results.figures import dress
+
+    modes = loop.modes()[:most]
+    figsize = 7.6, 1.2 + 0.3 * len(modes)
+    _, axes = pyplot.subplots(figsize=figsize, layout="constrained")
+    left = np.zeros(len(modes))
+    for part, colour in _colours(loop).items():
+        share = np.array([mode.participation[part] for mode in modes])
+        if share.max() >= _LEAST:
+            axes.barh(range(len(modes)), share, left=left, color=colour, label=part)
+        left += share
+    labels = [_label(mode) for mode in modes]
+    axes.set_yticks(range(len(modes)), labels, family="monospace", fontsize=8)
+    axes.invert_yaxis()
+    axes.set(xlim=(0.0, 1.0), xlabel="participation")
+    dress(axes)
+    axes.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
+    return axes
+
+
+def _label(mode: Mode) -> str:
+    """sigma and frequency of a mode, as wide for all."""
+    sigma = f"{mode.sigma:.3g}".replace("-", "−")
+    return f"{sigma:>7} 1/s {mode.frequency_hz:6.4g} Hz"
+
+
+def _colours(loop: NetworkLoop) -> dict[str, str]:
+    from gfm_hil.results.figures import COLOURS
+
+    return {part: COLOURS[k % len(COLOURS)] for k, part in enumerate(loop.network.parts)}
+
+
+def _gains(
+    loop: ClosedLoop, at: Sequence[str]
+) -> Iterable[tuple[str, Vector, NDArray[np.complex128]]]:
+    """L at some channels, each with its name and the frequencies, Hz."""
+    hz = _hz(loop)
+    for name in at or [U_NAMES[j] for j in loop.commands]:
+        try:
+            yield name, hz, loop.loop_gain(name, 2 * np.pi * hz)
+        except ValueError as problem:
+            raise UserError(str(problem)) from None
+
+
+def _hz(loop: ClosedLoop) -> Vector:
+    """The frequencies of a figure, closer together where the loop resonates."""
+    top = _TOP_HZ if loop.T_s is None else 0.5 / loop.T_s
+    near = frequencies_near(loop.poles()) / (2 * np.pi)
+    base = np.geomspace(_LOWEST_HZ, 0.999 * top, _POINTS)
+    return np.unique(np.concatenate([base, near[(near > _LOWEST_HZ) & (near < base[-1])]]))
+
+
+def _panels(rows: int) -> list[Axes]:
+    from matplotlib import pyplot
+
+    _, panels = pyplot.subplots(rows, 1, sharex=True, figsize=(7.6, 5.6), layout="constrained")
+    return list(panels)
+
+
+def _curve(axes: Axes, hz: Vector, values: Vector, k: int, label: str) -> None:
+    from gfm_hil.results.figures import COLOURS
+
+    axes.semilogx(hz, values, color=COLOURS[k % len(COLOURS)], lw=1.2, label=label)
+
+
+def _degrees(L: NDArray[np.complex128]) -> Vector:
+    """The phase without jumps, which begins within (-360, 0]."""
+    phase = np.degrees(np.unwrap(np.angle(L)))
+    return np.asarray(phase - 360.0 * np.ceil(phase[0] / 360.0))
+
+
+def _finish(panels: list[Axes], title: str, *labels: str) -> list[Axes]:
+    from gfm_hil.results.figures import dress
+
+    for axes, label in zip(panels, labels, strict=True):
+        dress(axes)
+        axes.set_ylabel(label, fontsize=9.5)
+    panels[0].set_title(title, loc="left", fontsize=9.5, color="#222222")
+    panels[-1].set_xlabel("frequency [Hz]", fontsize=9.5)
+    panels[0].legend(fontsize=8, frameon=False, loc="best")
+    return panels

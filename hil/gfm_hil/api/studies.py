@@ -1,0 +1,195 @@
+"""Studies: in memory and silent, or with a folder and watched by a command."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.api.law import Law, law_files
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import check_empty
+from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.studies import envelopes
+from gfm_hil.studies.campaign.execute import run_campaign
+from gfm_hil.studies.campaign.result import CampaignResult
+from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
+from gfm_hil.studies.conformity.result import Conformity
+from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test
+from gfm_hil.studies.envelopes import Unit
+from gfm_hil.studies.scan import FrequencyScan, measure_admittance
+from gfm_hil.studies.workers import SILENT, Watch, check_workers
+from gfm_runtime import law_file
+from gfm_runtime.inner_file import named_inner
+
+
+def campaign(
+    given: str | Path | dict[str, Any],
+    folder: str | Path | None = None,
+    *,
+    laws: Sequence[str | Path | Law] = (),
+    workers: int = 1,
+    dask: str | None = None,
+    resume: bool = False,
+    x: str | None = None,
+    y: str | None = None,
+    watch: Watch = SILENT,
+    **changes: Any,
+) -> CampaignResult:
+    """Run a scenario many times with drawn values, and keep one record a run.
+
+    A record depends on the seed and on the run's number alone, not on ``workers``.
+
+    Args:
+        given: name of a shipped campaign, path of a file, or content of a file.
+        folder: where to write the records as they come, campaign.json and the map; None keeps
+            the campaign in memory.
+        laws: names, law files or ``Law``; those of the campaign if there are none.
+        workers: processes; 1 runs all in this one. A program that asks for more needs
+            ``if __name__ == "__main__":``, as the module ``multiprocessing`` says.
+        dask: address of a cluster that runs it instead, e.g. ``tcp://host:8786``.
+        resume: go on with what the folder holds.
+        x, y: drawn paths of the map, or sums of them (``"a + b"``); those of the file if None.
+        watch: of the runs; if it stops them, the result says how many are missing.
+        changes: keys of the campaign file, e.g. ``runs=50``, ``seed=1``.
+
+    Raises:
+        UserError: one line a mistake; the folder is in use.
+        LawError: one of the laws is none.
+        WorkerLost: a worker died, or a run raised an error; its ``result`` has all others.
+    """
+    with law_files(laws) as files:
+        return run_campaign(
+            given, None if folder is None else Path(folder), laws=files, changes=changes,
+            workers=workers, dask=dask, resume=resume, x=x, y=y, watch=watch,
+        )  # fmt: skip
+
+
+def conform(
+    law: str | Path | Law | Sequence[str | Path | Law] = (),
+    against: str | Path | Sequence[str | Path] = ALL,
+    folder: str | Path | None = None,
+    *,
+    inner: str | None = None,
+    converter: str | Path | None = None,
+    controller: str | None = None,
+    ports: str | Path | None = None,
+    workers: int = 1,
+    figures: bool = True,
+    watch: Watch = SILENT,
+) -> Conformity:
+    """Run the published tests of grid-forming converters, and judge them clause by clause.
+
+    Args:
+        law: name, law file or ``Law``, or several of them; none with a controller.
+        against: shipped sets, ``all`` of them, or paths of your own.
+        folder: where to write the report with figures, results.json and junit.xml; None writes
+            nothing.
+        inner: inner stage of every law; each law's own if None.
+        converter: file of the converter under test; the shipped one if None.
+        controller: a model to test beside the laws, ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``. It
+            begins at the operating point of the first law, or of ``mimo-gfm`` without any. Or
+            ``pil:TARGET``: that law as firmware on a processor.
+        ports: file of the map of the model's ports.
+        workers: as for ``campaign``.
+        figures: draw one of each run.
+        watch: of the runs.
+
+    Raises:
+        UserError: one line a mistake; the folder is in use.
+        LawError: a law or the inner stage is none.
+        WorkerLost: a worker died, or a run raised an error.
+        KeyboardInterrupt: the watch stopped it.
+    """
+    check_workers(workers)
+    given = [law] if isinstance(law, str | Path | Law) else list(law)
+    external = external_controller(controller, ports)
+    if not given and external is None:
+        raise UserError("law, controller: name one to test")
+    sets = [against] if isinstance(against, str | Path) else list(against)
+    place = None if folder is None else Path(folder)
+    if place is not None:
+        check_empty(place)
+    cases, under = load_cases([str(one) for one in sets]), load_under_test(converter)
+    if inner is not None:
+        named_inner(inner)
+    with law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
+        for file in files.values():
+            law_file(file)
+        converters = Path(temporary) if place is None else place / "converters"
+        jobs = make_jobs(files, cases, inner, under, converters, place, figures, external)
+        found = execute(jobs, workers, watch)
+    names = [*files, *([external.name] if external else [])]
+    made = Conformity(names, inner, under, cases, found, place)
+    if place is not None:
+        made.write(place)
+    return made
+
+
+def scan(
+    law: str | Path | Law | None = None,
+    on: str | Path | Scenario = "pref_step",
+    *,
+    inner: str | None = None,
+    controller_command: Sequence[str] = (),
+    **how: Any,
+) -> FrequencyScan:
+    """Measure the dq admittance of a converter on the bench.
+
+    Args:
+        law: name, law file or ``Law``; the scenario's own if None.
+        on: scenario (name, file or ``Scenario``), of which plant, references, sampling time and
+            inner stage count, but no event.
+        inner: inner stage, in place of the law's own.
+        controller_command: program and arguments of another controller, which runs over the
+            scenario's link; it has no model.
+        how: ``start_hz``, ``stop_hz``, ``points``, ``amplitude``, ``settle_s``, ``window_s`` and
+            ``watch``, as for ``gfm_hil.studies.scan.measure_admittance``.
+
+    Raises:
+        UserError: a value out of range, no operating point, a loop that is unstable, a run that
+            does not complete, or a window whose ends still differ.
+        LawError: the law is none.
+    """
+    with law_files([] if law is None else [law]) as files:
+        named = next(iter(files.values()), None)
+        scenario = load_scenario(on, in_process=not controller_command, law=named, inner=inner)
+        found = measure_admittance(scenario, controller_command=controller_command, **how)
+    return replace(found, name=law.name) if isinstance(law, Law) else found
+
+
+def identify(*args: Any, **more: Any) -> FrequencyScan:
+    """The name of ``scan`` up to version 0.2."""
+    warnings.warn("gfmhil.identify is gfmhil.scan now", DeprecationWarning, stacklevel=2)
+    return scan(*args, **more)
+
+
+def measure_unit(
+    law: str | Path | Law | None = None,
+    on: str | Path | Scenario = "pref_step",
+    *,
+    degrees: float = 0.5,
+    seconds: float = 4.0,
+    **changes: Any,
+) -> Unit:
+    """D, H and X_eff of a converter under a law, fitted to its power after a phase jump.
+
+    Args:
+        law: name, law file or ``Law``; the scenario's own if None.
+        on: scenario, of which no event counts; its line is not part of X_eff.
+        degrees: of the jump; a small one, so that nothing limits and nothing bends.
+        seconds: of the fit, after the jump.
+        changes: keys of the scenario, as for ``run``.
+
+    Raises:
+        UserError: a mistake, a run that does not complete, or no swing equation fits.
+        LawError: the law is none.
+    """
+    with law_files([] if law is None else [law]) as files:
+        for file in files.values():
+            changes = {**changes, "law": file}
+        scenario = load_scenario(on, in_process=True, **changes)
+        return envelopes.measure_unit(scenario, degrees, seconds)

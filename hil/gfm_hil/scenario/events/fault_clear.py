@@ -1,0 +1,28 @@
+"""The end of a fault."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+import gfm_plant
+from gfm_hil.scenario.events.base import PlantEvent
+
+if TYPE_CHECKING:
+    from gfm_plant import Network
+
+
+class FaultClear(PlantEvent):
+    """The fault is cleared."""
+
+    type: Literal["fault-clear"] = Field(description="kind of event")
+
+    def label(self) -> str:
+        return "fault cleared"
+
+    def apply(self, plant: Network) -> None:
+        gfm_plant.clear_fault(plant)
+
+
+EVENT = FaultClear

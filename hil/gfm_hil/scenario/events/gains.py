@@ -1,0 +1,113 @@
+"""New gains of a running law: prepared off the loop, swapped in one tick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from numpy.typing import NDArray
+from pydantic import Field
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Role
+from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
+from gfm_hil.scenario.events.law import LawChange
+from gfm_hil.scenario.events.reset import Reset
+from gfm_runtime import law_file, load_law
+from gfm_runtime.errors import LawError
+from gfm_runtime.kernel import pack_law
+from gfm_runtime.lawfile import tied
+from gfm_runtime.tustin import DiscreteLaw, discretise
+
+if TYPE_CHECKING:
+    from gfm_hil.scenario.schema import Scenario
+    from gfm_runtime.assembly import Controller
+
+Retuned = tuple[DiscreteLaw, NDArray[Any]]  #: a law, and the record that the kernel takes
+
+
+class Gains(Event):
+    """New gains of the active law, by the names in its file, without a bump. Tied parameters
+    follow."""
+
+    side: ClassVar[Role] = "controller"
+    changes_law: ClassVar[bool] = True
+    type: Literal["gains"] = Field(description="kind of event")
+    values: dict[str, float] = Field(
+        min_length=1, description="a table of names and numbers, e.g. { D_p = 0.02 }"
+    )
+    converter: str | None = WHOSE
+
+    def label(self) -> str:
+        return ", ".join(f"{name} = {value:g}" for name, value in self.values.items())
+
+    def check_now(self, target: EventTarget) -> None:
+        ready_gains(target.controller, self.values)
+
+    def carry_out(self, target: EventTarget) -> None:
+        """Change gains of the law selected last, on top of earlier changes."""
+        c = target.controller
+        c.retune(*ready_gains(c, self.values), {**c.gains, **self.values})
+
+
+EVENT = Gains
+
+
+@lru_cache(maxsize=64)
+def retuned(
+    name: str, gains: tuple[tuple[str, float], ...], T_s: float, omega_b: float, inner: str | None
+) -> Retuned:
+    """A law with some gains changed, discretised, and packed for the kernel.
+
+    A gain that the law file ties to a changed one follows it unless it is given too. The newest
+    results are cached: the command server's check prepares what the loop then uses. ``omega_b`` is
+    that of the converter, rad/s, for an inner stage.
+
+    Raises:
+        ValueError: a scheduled law, a name that its file does not have, or no such law.
+    """
+    try:
+        file = law_file(name)
+        if file.schedule is not None:
+            raise LawError(f"law {name}", "is scheduled: its gains change by themselves")
+        (law,) = load_law(name, inner, **tied(file, dict(gains))).laws
+        discrete = discretise(law, T_s)
+        return discrete, pack_law(discrete, omega_b=omega_b)
+    except LawError as problem:
+        raise ValueError(str(problem)) from None
+
+
+def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
+    """The law selected last with new gains, on top of earlier changes.
+
+    Raises:
+        ValueError: as ``retuned``.
+    """
+    gains = {**controller.gains, **values}
+    name = controller.asked
+    inner = controller.sets[name].inner
+    return retuned(name, tuple(sorted(gains.items())), controller.T_s, controller.omega_b, inner)
+
+
+def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
+    """Every change of gains that the scenario names, prepared before it runs; ``omega_b`` as for
+    ``retuned``.
+
+    Raises:
+        UserError: a change that is not possible.
+    """
+    found, name, gains = list[Retuned](), scenario.law, dict[str, float]()
+    for event in scenario.sorted_events():
+        if isinstance(event, LawChange):
+            name, gains = event.law, {}
+        elif isinstance(event, Reset):
+            name, gains = scenario.law, {}
+        elif isinstance(event, Gains):
+            gains.update(event.values)
+            try:
+                given = tuple(sorted(gains.items()))
+                found.append(retuned(name, given, scenario.T_s, omega_b, scenario.inner))
+            except ValueError as problem:
+                raise UserError(f"events, {event.label()}: {problem}") from None
+    return found

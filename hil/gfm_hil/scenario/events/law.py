@@ -1,0 +1,40 @@
+"""Change to another law."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from gfm_hil.core.roles import Role
+from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
+from gfm_runtime import law_titles
+from gfm_runtime.errors import meant
+
+
+class LawChange(Event):
+    """Change to another law, without a bump."""
+
+    side: ClassVar[Role] = "controller"
+    changes_law: ClassVar[bool] = True
+    type: Literal["law"] = Field(description="kind of event")
+    law: str = Field(description="catalogue name or law file")
+    converter: str | None = WHOSE
+
+    def label(self) -> str:
+        return f"law {law_titles([self.law])[self.law]}"
+
+    def label_in(self, target: EventTarget) -> str:
+        return f"law {target.controller.titles[self.law]}"
+
+    def check_now(self, target: EventTarget) -> None:
+        if self.law not in target.controller.sets:
+            ready = sorted(target.controller.sets)
+            known = f"ready are {ready}{meant(self.law, ready)}"
+            raise ValueError(f"law = {self.law!r}: not made ready for this run; {known}")
+
+    def carry_out(self, target: EventTarget) -> None:
+        target.controller.select(self.law)
+
+
+EVENT = LawChange

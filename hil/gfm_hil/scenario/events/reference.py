@@ -1,0 +1,62 @@
+"""New references."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from gfm_hil.core.roles import Role
+from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
+from gfm_runtime.signals import SIGNALS
+
+_REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
+
+
+def reference_field(name: str, default: float | None) -> Any:
+    """A field for a reference, described as in the signal table."""
+    s = _REFERENCE[name]
+    return Field(default, description=f"{s.description}, {s.low:g} to {s.high:g} {s.unit}")
+
+
+def check_reference(name: str, value: float) -> None:
+    """Raise ValueError if a reference lies outside its range in the signal table."""
+    s = _REFERENCE[name]
+    if not s.low <= value <= s.high:
+        raise ValueError(f"{name} = {value}: must lie in [{s.low:g}, {s.high:g}] {s.unit}")
+
+
+class Reference(Event):
+    """New references; ``ramp_s`` spreads the change over a time instead of one tick."""
+
+    side: ClassVar[Role] = "controller"
+    type: Literal["reference"] = Field(description="kind of event")
+    V_dcref: float | None = reference_field("V_dcref", None)
+    P_ref: float | None = reference_field("P_ref", None)
+    omega_g: float | None = reference_field("omega_g", None)
+    Q_ref: float | None = reference_field("Q_ref", None)
+    V_ref: float | None = reference_field("V_ref", None)
+    converter: str | None = WHOSE
+    ramp_s: float = Field(0.0, ge=0, description="spreads the change evenly over so many seconds")
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Reference:
+        if not self.values():
+            raise ValueError(f"no reference given: use {sorted(_REFERENCE)}")
+        for name, value in self.values().items():
+            check_reference(name, value)
+        return self
+
+    def values(self) -> dict[str, float]:
+        """The references given."""
+        return {n: v for n in _REFERENCE if (v := getattr(self, n)) is not None}
+
+    def label(self) -> str:
+        return ", ".join(f"{name} = {value:g}" for name, value in self.values().items())
+
+    def carry_out(self, target: EventTarget) -> None:
+        for name, value in self.values().items():
+            target.controller.set(name, value, self.ramp_s)
+
+
+EVENT = Reference

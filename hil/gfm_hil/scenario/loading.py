@@ -1,0 +1,210 @@
+"""Finds, reads and overrides a scenario's file."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario.schema import INPROC, Scenario
+from gfm_hil.scenario.trial import check_scenario
+from gfm_runtime.errors import allowed, meant, printable
+from gfm_runtime.toml_file import read_toml
+
+SCENARIO_FOLDERS = (
+    Path(__file__).resolve().parents[1] / "scenarios",  # in a wheel
+    Path(__file__).resolve().parents[3] / "scenarios",  # in a checkout
+)
+
+
+def find_scenario(name: str) -> Path:
+    """The file of a scenario: a path, or the name of a shipped one (with or without .toml).
+
+    Raises:
+        UserError: neither exists.
+    """
+    return find_file("scenario", name, "*.toml")
+
+
+def find_file(kind: str, name: str, pattern: str) -> Path:
+    """The file at that path, or the shipped file of that name; ``kind`` is for the message.
+
+    Raises:
+        UserError: neither exists.
+    """
+    given, shipped = Path(name), _shipped(pattern)
+    try:
+        is_file, exists = given.is_file(), given.exists()
+    except OSError as problem:  # for example a name of 300 characters
+        raise UserError(printable(f"{kind} {name}: {problem.strerror}")) from None
+    if is_file:
+        return given
+    if given.name.removesuffix(".toml") in shipped:
+        return shipped[given.name.removesuffix(".toml")]
+    what = "is not a regular file" if exists else "no such file"
+    known = allowed(given.stem, sorted(shipped), "shipped are")
+    raise UserError(printable(f"{kind} {name}: {what}; {known}"))
+
+
+def _shipped(pattern: str) -> dict[str, Path]:
+    return {p.stem: p for folder in SCENARIO_FOLDERS for p in folder.glob(pattern)}
+
+
+def shipped_scenarios() -> list[str]:
+    """Names of the scenarios that come with gfmhil."""
+    return sorted(_shipped("*.toml"))
+
+
+def load_scenario(
+    given: str | Path | Scenario | dict[str, Any],
+    options: Mapping[str, str] = MappingProxyType({}),
+    in_process: bool = False,
+    converter: str | None = None,
+    **changed: Any,
+) -> Scenario:
+    """Read, override and check a scenario, its laws and its plant.
+
+    Args:
+        given: path or shipped name; content of a file; or a checked scenario.
+        options: what the user calls an override, by its name in ``changed``, e.g.
+            ``{"link__type": "--link"}``; messages name it in place of the file.
+        in_process: the caller runs it in this process: the link is ``inproc`` unless ``changed``
+            names another one. Messages do not mention this choice, because the user did not make
+            it.
+        converter: of a network: the one that gets ``law`` and ``inner`` of ``changed``. Without it
+            all converters get them, so that none may name its own.
+        changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
+            None leaves the file's value. A link other than the file's drops the file's endpoint
+            and options. The link ``inproc`` implies lockstep unless a ``mode`` is given.
+
+    Raises:
+        UserError: one line per mistake, each with its path, the value and what is allowed.
+    """
+    where, content = "scenario", {}
+    if isinstance(given, str | Path):
+        where = str(find_scenario(str(given)))
+        try:
+            content = read_toml(where)
+        except ValueError as problem:
+            raise UserError(f"{where}: {problem}") from None
+        look_beside(content, Path(where).parent)
+        if "phi" in content:
+            raise UserError(f"{where}: is a law file; give it to a scenario as its law")
+    elif isinstance(given, Scenario):
+        content = given.model_dump(mode="json", exclude_none=True)
+    else:
+        content = copy.deepcopy(given)
+    overrides = {key: value for key, value in changed.items() if value is not None}
+    overrides, options = _of_converter(content, converter, overrides, options)
+    implied: dict[str, Any] = {}
+    if in_process or overrides.get("link__type") == INPROC:
+        implied = {"link__type": INPROC, "mode": "lockstep"}
+    link, chosen = content.get("link"), overrides.get("link__type")
+    if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
+        link.pop("endpoint", None)  # they belong to the file's link
+        link.pop("options", None)
+    if in_process or chosen is not None:  # one link for all
+        network = content.get("network")
+        members = network.get("converters") if isinstance(network, dict) else None
+        for member in members.values() if isinstance(members, dict) else ():
+            if isinstance(member, dict):
+                member.pop("link", None)
+    for key, value in (implied | overrides).items():
+        table: Any = content
+        *parents, last = key.split("__")
+        for parent in parents:
+            table = table.setdefault(parent, {}) if isinstance(table, dict) else None
+        if isinstance(table, dict):  # else the check reports what the file has instead
+            table[last] = value
+    named = {
+        tuple(key.split("__")): f"{options.get(key, key.replace('__', '.'))} {value}"
+        for key, value in overrides.items()
+    }
+    return check_scenario(content, where, named)
+
+
+def _of_converter(
+    content: dict[str, Any],
+    converter: str | None,
+    overrides: dict[str, Any],
+    options: Mapping[str, str],
+) -> tuple[dict[str, Any], Mapping[str, str]]:
+    """Overrides and their names as for ``load_scenario``, with ``law`` and ``inner`` where they
+    reach the converters of a network.
+
+    Raises:
+        UserError: there is no such converter; none is named, and one has its own law or stage.
+    """
+    network = content.get("network")
+    members = network.get("converters") if isinstance(network, dict) else None
+    members = members if isinstance(members, dict) else {}
+    if converter is not None and converter not in members:
+        allowed = f"must be one of {[*members]}" if members else "the scenario has no network"
+        option = options.get("converter", "converter")
+        raise UserError(f"{option} {converter}: {allowed}{meant(converter, members)}")
+    if converter is None and members:
+        converter = content.get("converter")  # the folder of a converter knows it
+    found, names = dict(overrides), dict(options)
+    for key in ("law", "inner"):
+        if key not in overrides or not members:
+            continue
+        named = options.get(key, key)
+        if converter is not None:
+            own = f"network__converters__{converter}__{key}"
+            found[own], names[own] = found.pop(key), named
+        elif owners := [n for n, m in members.items() if isinstance(m, dict) and key in m]:
+            other = f"set network.converters.NAME.{key}"
+            if "converter" in options:
+                other = f"name the converter that gets it with {options['converter']}"
+            whose = ", ".join(map(str, owners))
+            raise UserError(
+                printable(f"{named} {overrides[key]}: does not replace the own {key} of {whose};"
+                          f" {other}")
+            )  # fmt: skip
+    return found, names
+
+
+def look_beside(content: Any, folder: Path) -> None:
+    """Make the files that a scenario names absolute where they lie in the scenario's folder: laws,
+    inner stages, converters and courses of the grid.
+
+    Args:
+        content: of the scenario's file, plain data that nobody has checked.
+        folder: of the file.
+    """
+    for table, key in _files(content):
+        file = table[key]
+        if not isinstance(file, str) or "\0" in file:
+            continue
+        if key != "file" and not file.endswith(".toml"):
+            continue
+        with contextlib.suppress(OSError):  # a name too long: the check of the file says so
+            if (folder / file).is_file():
+                table[key] = str((folder / file).absolute())
+
+
+def _files(content: Any) -> Iterator[tuple[Any, Any]]:
+    """The places of a scenario's content that may name files, each as container and key."""
+
+    def within(table: Any, *keys: str) -> Iterator[tuple[Any, Any]]:
+        for key in keys if isinstance(table, dict) else ():
+            value = table.get(key)
+            if isinstance(value, list):
+                yield from ((value, k) for k in range(len(value)))
+            elif key in table:
+                yield table, key
+
+    def inside(table: Any, key: str) -> Any:
+        return table.get(key) if isinstance(table, dict) else None
+
+    members = inside(inside(content, "network"), "converters")
+    for one in (content, *(members.values() if isinstance(members, dict) else ())):
+        yield from within(one, "law", "inner", "ready_laws", "compare")
+        yield from within(inside(one, "plant"), "converter")
+    events = inside(content, "events")
+    for event in events if isinstance(events, list) else ():
+        yield from within(event, "file", "law")

@@ -1,0 +1,190 @@
+"""What all criteria share: the clause of a test file, and the moment of a run at which it is
+judged.
+
+Powers, voltages, currents and frequencies are judged by their means over one cycle of the nominal
+frequency (``run.cycles``); only how fast p rises, and the angle, are of every tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from gfm_hil.core.schema import StrictSchema
+from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.run import checks
+from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
+from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.expectation import reason_name
+from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict
+
+Vector = NDArray[np.float64]
+
+
+class Clause(StrictSchema):
+    """A clause of a test. Its windows count from each time in ``at``; ``window`` is [from, to].
+
+    Attributes:
+        whole_run: it is about the whole run, whatever its events.
+        of_cut_run: a run that ended early can be judged too.
+        explains: the failure of a clause with a smaller number explains those of others.
+    """
+
+    kind: str
+    clause: str = Field(min_length=1, description="what the source asks, in its own words or short")
+    at: list[float] | None = Field(
+        None, min_length=1, description="s; the first event of the run if none"
+    )
+    informative: str | None = Field(
+        None,
+        min_length=1,
+        description="why this clause can be judged for no law on the shipped converter; where it "
+        "cannot be judged, it is informative and counts for nothing",
+    )
+
+    whole_run: ClassVar[bool] = False
+    of_cut_run: ClassVar[bool] = False
+    explains: ClassVar[int] = 2
+
+    def judge(self, m: Moment) -> Verdict:
+        """The verdict at one time of a run, whose window was recorded."""
+        raise NotImplementedError
+
+    def declared(self, under: UnderTest, scenario: Scenario) -> UnderTest:
+        """What the owner declares, with what is measured in its place where it is missing."""
+        return under
+
+
+class Windowed(Clause):
+    """A clause with a window."""
+
+    window: tuple[float, float] | None = Field(
+        None, strict=False, description="s after at; up to the next event or the end if none"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Windowed:
+        if self.window is not None and not 0 <= self.window[0] < self.window[1]:
+            raise ValueError(f"window = {list(self.window)}: must be [from, to], 0 <= from < to")
+        return self
+
+
+class Moment:
+    """One time of a finished run at which a clause is judged.
+
+    Attributes:
+        run: of the converter under test; it may have ended early.
+        under: what the owner of the converter declares.
+        others: the runs of the other converters of a network.
+        clause: that is judged.
+        at, tick: when, s, and its tick.
+        first, last: ticks of the window.
+        width: of a cycle, ticks; not a whole number.
+        T_s, f_n: s, and Hz.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        under: UnderTest,
+        others: Mapping[str, Run],
+        clause: Clause,
+        at: float,
+    ) -> None:
+        self.run, self.under, self.others, self.clause = run, under, others, clause
+        self.T_s = run.scenario.T_s
+        self.f_n = nominal_frequency(run.scenario)
+        self.width = cycle_ticks(self.T_s, self.f_n)
+        self.at, self.tick = at, round(at / self.T_s)
+        whole = run.scenario.ticks
+        later = [e.at(self.T_s) for e in run.scenario.events if e.at(self.T_s) > self.tick]
+        self.first, self.last = self.tick, min(later, default=whole)
+        if (window := getattr(clause, "window", None)) is not None:
+            self.first, self.last = (self.tick + round(x / self.T_s) for x in window)
+        if clause.whole_run:
+            self.tick = self.first = 0
+            self.last = whole
+
+    def verdict(self) -> Verdict:
+        """The verdict; a window that the run did not reach cannot be judged."""
+        if not self.clause.of_cut_run:
+            if self.run.ticks < self.last:
+                return self.cannot(f"{self.end()}, before the end of the window")
+            if self.last - self.first < 2 * whole_ticks(self.width):
+                return self.cannot("the window is shorter than two cycles")
+            if not self.clause.whole_run and self.tick < whole_ticks(self.width):
+                return self.cannot("no whole cycle was recorded before the event")
+        return self.clause.judge(self)
+
+    def says(
+        self,
+        ok: bool,
+        value: float | None,
+        unit: str,
+        limit: str,
+        text: str,
+        signal: str = "",
+        low: float | None = None,
+        high: float | None = None,
+        limited: tuple[float, float] | None = None,
+    ) -> Verdict:
+        """A verdict on the window; arguments as the attributes of ``Verdict``."""
+        return Verdict(
+            self.clause.clause, self.clause.kind, signal,
+            round(self.first * self.T_s, 9), round(self.last * self.T_s, 9),
+            PASS if ok else FAIL, value, unit, limit, f"{text.rstrip('.')}.", low, high, limited,
+        )  # fmt: skip
+
+    def cannot(self, reason: str) -> Verdict:
+        """That it cannot be judged, or is informative, and why."""
+        why = self.clause.informative
+        text = f"Cannot be judged: {reason}" + (f" (informative: {why})." if why else ".")
+        made = self.says(True, None, "", "", text, getattr(self.clause, "signal", ""))
+        return replace(made, verdict=CANNOT if why is None else INFORMATIVE)
+
+    def end(self) -> str:
+        """How the run ended early."""
+        summary = self.run.summary
+        return (
+            f"the run ended at {self.run.ticks * self.T_s:.4g} s ({summary['status']}: "
+            f"{reason_name(summary['reason'])})"
+        )
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """From when to when the window lasts, s."""
+        return self.first * self.T_s, self.last * self.T_s
+
+    def raw(self, name: str) -> Vector:
+        """Every tick of a signal."""
+        return np.asarray(self.run.signals[name], np.float64)
+
+    def means(self, name: str, first: int, last: int) -> Vector:
+        """The one-cycle means of a signal that lie within some ticks."""
+        parts = cycle_means(self.raw(name), first, last, self.width)
+        return np.concatenate([np.empty(0), *parts])
+
+    def before(self, name: str) -> float:
+        """The mean of the last cycle before the event."""
+        return float(self.means(name, self.tick - whole_ticks(self.width), self.tick)[0])
+
+    def ending(self, name: str) -> float:
+        """The mean of the last cycle of the window."""
+        return float(self.means(name, self.last - whole_ticks(self.width), self.last)[0])
+
+    def window(self, name: str) -> checks.Window:
+        """The one-cycle means of a signal in the window, each at the middle of its cycle."""
+        x = self.means(name, self.first, self.last)
+        t = self.T_s * (self.first + np.arange(len(x), dtype=np.float64) + 0.5 * (self.width - 1))
+        return checks.Window(name, t, x, self.before(name), self.at)
+
+    def way(self, direction: str) -> tuple[checks.Window, float, float]:
+        """p, the sign of "up" or "down", and how far its one-cycle means go there, p.u."""
+        w, sign = self.window("p"), 1.0 if direction == "up" else -1.0
+        return w, sign, float(np.max(sign * (w.x - w.before)))

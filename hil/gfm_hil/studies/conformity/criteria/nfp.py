@@ -1,0 +1,146 @@
+"""The network-frequency-perturbation plot stays within bands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from gfm_hil.core.schema import StrictSchema
+from gfm_hil.scenario import Scenario
+from gfm_hil.studies.conformity.criteria.base import Clause
+from gfm_hil.studies.conformity.verdict import (
+    CANNOT,
+    FAIL,
+    INFORMATIVE,
+    PASS,
+    Outcome,
+    Verdict,
+)
+from gfm_hil.studies.scan import FrequencyScan, measure_admittance
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class Band(StrictSchema):
+    """Limits of a gain and a phase between two frequencies."""
+
+    from_hz: float = Field(gt=0, description="of the perturbation, Hz")
+    to_hz: float = Field(gt=0, description="the same")
+    low: float | None = Field(None, description="least gain, p.u. of power over p.u. of frequency")
+    high: float | None = Field(None, description="largest gain, in the same unit")
+    phase_low: float | None = Field(None, description="least phase, degrees from -180 to 180")
+    phase_high: float | None = Field(None, description="largest phase, in the same unit")
+
+    @model_validator(mode="after")
+    def _limited(self) -> Band:
+        if self.from_hz >= self.to_hz:
+            raise ValueError(f"from_hz = {self.from_hz:g}: must be < to_hz = {self.to_hz:g}")
+        if {self.low, self.high, self.phase_low, self.phase_high} == {None}:
+            raise ValueError("low, high, phase_low, phase_high: give one of them")
+        return self
+
+
+class Nfp(Clause):
+    """The network-frequency-perturbation plot, measured by small sines of the grid's frequency:
+    gain and phase of the change of p over the change of the grid's frequency stay within bands. A
+    part with this criterion has no other one, and no events count."""
+
+    kind: Literal["nfp"] = Field(description="kind of criterion")
+    from_hz: float = Field(1.0, ge=0.01, description="lowest frequency of the plot, Hz")
+    to_hz: float = Field(100.0, gt=0, description="highest frequency of the plot, Hz")
+    points: int = Field(21, ge=2, le=1000, description="evenly apart on a logarithmic axis")
+    bands: list[Band] = Field([], description="limits; each gives a verdict")
+    unknown: str | None = Field(
+        None, description="without bands: why none are known; the plot is drawn, and informative"
+    )
+
+    @model_validator(mode="after")
+    def _judged_or_not(self) -> Nfp:
+        if bool(self.bands) == (self.unknown is not None):
+            raise ValueError("bands, unknown: give one of them")
+        if self.at is not None:
+            raise ValueError("at: a plot has no time")
+        if not self.from_hz < self.to_hz:
+            raise ValueError(f"from_hz = {self.from_hz:g}: must be < to_hz = {self.to_hz:g}")
+        for band in self.bands:
+            if not self.from_hz <= band.from_hz < band.to_hz <= self.to_hz:
+                raise ValueError(f"bands: from {band.from_hz:g} Hz: must lie in the plot")
+        return self
+
+    def scan(self, scenario: Scenario, controller_command: Sequence[str]) -> FrequencyScan:
+        """Measure the plot.
+
+        Raises:
+            UserError: as ``measure_admittance``.
+        """
+        return measure_admittance(
+            scenario, start_hz=self.from_hz, stop_hz=self.to_hz, points=self.points,
+            controller_command=controller_command,
+        )  # fmt: skip
+
+    def again(self, scenario: str) -> list[str]:
+        """The command that measures the plot of a scenario file again."""
+        return [
+            "gfmhil", "scan", scenario, "--from", f"{self.from_hz:g}", "--to", f"{self.to_hz:g}",
+            "--points", str(self.points),
+        ]  # fmt: skip
+
+    def judge_scan(self, found: FrequencyScan) -> list[Verdict]:
+        """The verdicts on a plot, one a band and gain or phase."""
+        made = partial(Verdict, self.clause, self.kind, "p", 0.0, 0.0)
+        hz, nfp = found.frequency, found.nfp
+        gain, phase = np.abs(nfp), np.degrees(np.angle(nfp))
+        span = f"From {hz[0]:.3g} to {hz[-1]:.3g} Hz the gain lies between {gain.min():.4g} and "
+        span += f"{gain.max():.4g} p.u./p.u."
+        if self.unknown is not None:
+            text = f"Informative: {self.unknown}. {span}"
+            return [made(INFORMATIVE, float(gain.max()), "p.u./p.u.", "", text)]
+        verdicts = []
+        for band in self.bands:
+            inside = (hz >= band.from_hz) & (hz <= band.to_hz)
+            where = f"{band.from_hz:g} to {band.to_hz:g} Hz"
+            if not inside.any():
+                verdicts.append(made(CANNOT, None, "", where, f"No point lies between {where}."))
+                continue
+            for x, low, high, unit, name in (
+                (gain, band.low, band.high, "p.u./p.u.", "gain"),
+                (phase, band.phase_low, band.phase_high, "°", "phase"),
+            ):
+                if low is None and high is None:
+                    continue
+                beyond = np.maximum(
+                    -math.inf if low is None else low - x, -math.inf if high is None else x - high
+                )
+                k = int(np.argmax(np.where(inside, beyond, -math.inf)))
+                limits = [f"at least {low:g} {unit}"] if low is not None else []
+                limits += [f"at most {high:g} {unit}"] if high is not None else []
+                text = (
+                    f"At {hz[k]:.3g} Hz the {name} is {x[k]:.4g} {unit}, the nearest to its limits "
+                    f"or the furthest beyond them between {where}."
+                )
+                limit = f"{' and '.join(limits)}, {where}"
+                verdict: Outcome = PASS if beyond[k] <= 0 else FAIL
+                verdicts.append(made(verdict, float(x[k]), unit, limit, text))
+        return verdicts
+
+    def draw_limits(
+        self, panels: Sequence[Axes], verdicts: Sequence[Verdict], colours: dict[str, str]
+    ) -> None:
+        """Draw the bands over gain and phase, each in the colour of its verdict."""
+        told = iter(verdicts)
+        for band in self.bands:
+            for axes, low, high in (
+                (panels[0], band.low, band.high),
+                (panels[1], band.phase_low, band.phase_high),
+            ):
+                limits = [x for x in (low, high) if x is not None]
+                colour = colours[next(told).verdict] if limits else ""
+                for limit in limits:
+                    span = [band.from_hz, band.to_hz]
+                    axes.plot(span, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))

@@ -1,0 +1,39 @@
+"""Nothing trips."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from gfm_hil.scenario.expectation import reason_name
+from gfm_hil.studies.conformity.criteria.base import Clause, Moment
+from gfm_hil.studies.conformity.verdict import Verdict
+
+_LASTED = ("completed", "oscillating")
+
+
+class NoTrip(Clause):
+    """The run lasts to its end: no protection trips, and the controller does not go to SAFE."""
+
+    kind: Literal["no_trip"] = Field(description="kind of criterion")
+
+    whole_run: ClassVar[bool] = True
+    of_cut_run: ClassVar[bool] = True
+    explains: ClassVar[int] = 0
+
+    def judge(self, m: Moment) -> Verdict:
+        """The value is how long the run lasted, s; no other converter of a network may trip."""
+        run = m.run
+        end, whole = run.ticks * m.T_s, run.scenario.ticks * m.T_s
+        lost = {n: r for n, r in m.others.items() if r.status not in _LASTED}
+        ok = run.status in _LASTED and run.ticks >= run.scenario.ticks and not lost
+        if ok:
+            text = f"Nothing trips in the {whole:g} s of the run."
+        elif lost:
+            name, other = next(iter(lost.items()))
+            what = reason_name(other.summary["reason"])
+            text = f"{name} ended at {other.ticks * m.T_s:.4g} s: {other.status}: {what}."
+        else:
+            text = f"The run should last {whole:g} s, but {m.end()}."
+        return m.says(ok, end, "s", f"at least {whole:g} s", text)

@@ -1,0 +1,61 @@
+"""A signal settles at a value."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from gfm_hil.run import checks
+from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
+from gfm_hil.studies.conformity.verdict import Verdict
+
+
+class Settles(Windowed):
+    """The one-cycle means of a signal come within a tolerance of a value and stay there."""
+
+    kind: Literal["settles"] = Field(description="kind of criterion")
+    signal: str = Field("p", description="as for stays_within")
+    to: float | Literal["before", "droop"] = Field(
+        description="value; before: the mean of the last cycle before at; droop: where the "
+        "declared droop and power limits put p at the frequency that the converter has"
+    )
+    tolerance: float = Field(gt=0, description="in the unit of the signal")
+    within: float = Field(gt=0, description="s after at")
+
+    def judge(self, m: Moment) -> Verdict:
+        """The value is the time that it takes, s."""
+        w = m.window(self.signal)
+        to, why = self._aim(m, w)
+        if w.t[-1] < m.at + self.within:
+            return m.cannot(f"its window ends before {self.within:g} s have passed")
+        found = checks.settles(w, to, self.within, self.tolerance)
+        took = checks.settled_after(w, to, self.tolerance)
+        if found is None:
+            text = f"{w.symbol} settles at {w.show(to)} ({why}) after {took:.3g} s."
+        else:
+            text = found.text.replace(
+                f"{w.symbol} should settle at {w.show(to)}",
+                f"The one-cycle mean of {w.symbol} should settle at {w.show(to)} ({why})",
+                1,
+            )
+        return m.says(
+            found is None, took, "s", f"within {self.within:g} s, ± {self.tolerance:g}", text,
+            self.signal, to - self.tolerance, to + self.tolerance,
+            (m.at + self.within, m.last * m.T_s),
+        )  # fmt: skip
+
+    def _aim(self, m: Moment, w: checks.Window) -> tuple[float, str]:
+        """Where it must settle, and why there."""
+        if self.to == "before":
+            return w.before, "its value before"
+        if self.to != "droop":
+            return self.to, "the value asked for"
+        omega_u, under = m.ending("omega_u"), m.under
+        asked = m.ending("ref_P_ref") + (1.0 - omega_u) / under.droop
+        to = float(np.clip(asked, under.P_min, under.P_max))
+        why = f"the declared droop of {100 * under.droop:g} % at {omega_u * m.f_n:.4g} Hz"
+        if to != asked:
+            why += f", which asks for {asked:.3g} p.u., limited to the declared power"
+        return to, why

@@ -1,0 +1,65 @@
+"""The verdict on a clause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+Outcome = Literal["pass", "fail", "cannot judge", "informative"]
+PASS: Final = "pass"
+FAIL: Final = "fail"
+CANNOT: Final = "cannot judge"
+INFORMATIVE: Final = "informative"  # no law can be judged by it: it counts for nothing
+SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?", INFORMATIVE: "i"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one clause at one time.
+
+    Attributes:
+        clause: what is asked.
+        kind: of the criterion.
+        signal: that was judged; may be empty.
+        start, stop: of the window, s.
+        verdict: pass, fail, cannot judge or informative.
+        value: measured, in ``unit``; None if there is none.
+        unit: of the value.
+        limit: of the value, with its unit.
+        text: one sentence.
+        low, high: limits of the signal itself between ``limited`` s, for the figure.
+        limited: from when to when they hold, s.
+        curve: t, s, and limits that change with it, shape (K,) each, for the figure.
+    """
+
+    clause: str
+    kind: str
+    signal: str
+    start: float
+    stop: float
+    verdict: Outcome
+    value: float | None
+    unit: str
+    limit: str
+    text: str
+    low: float | None = None
+    high: float | None = None
+    limited: tuple[float, float] | None = None
+    curve: tuple[Vector, Vector, Vector] | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """As data for JSON."""
+        return {name: x for name, x in asdict(replace(self, curve=None)).items() if name != "curve"}
+
+
+def worst(outcomes: Sequence[str]) -> Outcome:
+    """fail before cannot judge before pass before informative; no outcome at all cannot be
+    judged."""
+    order: tuple[Outcome, ...] = (FAIL, CANNOT, PASS, INFORMATIVE)
+    return next((outcome for outcome in order if outcome in outcomes), CANNOT)

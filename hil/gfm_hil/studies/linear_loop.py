@@ -1,0 +1,152 @@
+"""The linear loop of a scenario, where it rests when the run starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.network import NetworkLoop
+from gfm_hil.core.errors import UserError
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.scenario import Scenario, load_scenario, plant_of
+from gfm_plant import NoEquilibrium
+from gfm_runtime import DiscreteLaw, discretise, law_titles, load_law
+from gfm_runtime import Law as BuiltLaw
+from gfm_runtime.assembly import Controller
+
+_GROWS = 1e-6  # 1/s; rounding may move a mode that rests, as the angle of an island, by less
+
+
+def initial_law(scenario: Scenario) -> tuple[DiscreteLaw, str]:
+    """The law of one converter at its start, of a scheduled law the stage in force; its label."""
+    references = scenario.references.vector()
+    controller = Controller([load_law(scenario.law, scenario.inner)], scenario.T_s, references)
+    return controller.active_law, controller.active
+
+
+def title_of(loop: ClosedLoop) -> str:
+    """The name of the law; of a converter of a network its own name too."""
+    if loop.around is not None:
+        return loop.around.name
+    return loop.origin.law.law.name if loop.origin else "loop"
+
+
+def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[ClosedLoop, str]:
+    """The loop of the scenario's first law, and its label.
+
+    Args:
+        converter: of a network, which one; the folder of a converter knows it.
+
+    Raises:
+        NoEquilibrium, UserError: there is no operating point; or there is a network and no
+            converter is named, or one that it does not have.
+    """
+    if scenario.network is None:
+        law, label = initial_law(scenario)
+        return ClosedLoop.of(law, scenario.plant, scenario.references.vector()), label
+    name = converter or scenario.converter
+    if name is None:
+        raise UserError(
+            f"network: this takes the loop of one converter; --converter names it, one of"
+            f" {scenario.converters}"
+        )
+    try:
+        loop = network_loop(scenario).converter(name)
+    except ValueError as problem:
+        raise UserError(str(problem)) from None
+    return loop, title_of(loop)
+
+
+def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
+    """The law under which the linear loop of a scenario's start is unstable, and the mode that
+    grows fastest there, in words.
+
+    Of a network the law is empty. Of other scenarios those count that the run changes to as well.
+    None if every loop is stable, or if there is none, for example for want of an operating point.
+    """
+    alone = scenario.network is None
+    laws = scenario.model_copy(update={"ready_laws": []}).laws() if alone else [""]
+    for law, title in law_titles(laws).items():
+        under = scenario.model_copy(update={"law": law})
+        try:
+            loop = scenario_loop(under)[0] if alone else network_loop(scenario)
+            worst = max(loop.modes(), key=lambda mode: mode.sigma)
+        except (UserError, ValueError, ArithmeticError, ModuleNotFoundError):
+            continue
+        if worst.sigma > _GROWS:
+            hz = f"{worst.frequency_hz:.4g} Hz" if worst.frequency_hz else "real"
+            of = f" of {title}" if title else ""
+            words = f"the linear loop{of} has an unstable mode: {hz}, {worst.sigma:+.3g} 1/s"
+            return law, words + (_current_loop_too_fast(under) if alone else "")
+    return None
+
+
+def _current_loop_too_fast(scenario: Scenario) -> str:
+    """What to change where the current loop of the law's inner stage is too fast for T_s, or "".
+
+    The loop on L_f alone, i[k+1] = i[k] - g i[k-d] with g = k_c omega_b T_s / L_f, is stable for
+    g below 2 sin(pi / (4 d + 2)) (Levin and May, Theor. Popul. Biol. 9, 1976).
+    """
+    (inner, *_) = (law.inner for law in load_law(scenario.law, scenario.inner).laws)
+    if inner is None:
+        return ""
+    delay = scenario.plant.delay
+    d = math.ceil(delay.samples + delay.fraction)
+    turn = 2 * math.pi * nominal_frequency(scenario) * scenario.T_s
+    most = 2 * math.sin(math.pi / (4 * d + 2)) * inner.L_f / turn
+    if inner.k_c < most:
+        return ""
+    return (
+        f"; at T_s = {1e3 * scenario.T_s:g} ms, u {d} ticks late, the current loop needs "
+        f"k_c below {most:.3g} p.u. (it is {inner.k_c:g})"
+    )
+
+
+def network_loop(
+    on: str | Path | Scenario | dict[str, Any],
+    laws: Mapping[str, BuiltLaw] = MappingProxyType({}),
+    **changes: Any,
+) -> NetworkLoop:
+    """The linear loop of a scenario with a network, as it is when the run starts.
+
+    Args:
+        on: a scenario: its name, file or content, or a checked one.
+        laws: by converter, other laws than the scenario's; they bring their own inner stage.
+        changes: keys of the scenario with ``__`` for the dot, as for ``gfmhil.run``.
+
+    Raises:
+        UserError: one line a mistake; the scenario has no network; there is no operating point.
+    """
+    scenario = load_scenario(on, **changes)
+    if scenario.network is None:
+        raise UserError("network: the scenario has none; use Law.closed_loop")
+    try:
+        return _linearised(scenario, laws)
+    except NoEquilibrium as problem:
+        raise UserError(f"network: {problem}") from None
+
+
+def loop_under(law: BuiltLaw, scenario: Scenario, converter: str | None) -> ClosedLoop:
+    """The sampled loop of a checked scenario under another law, of one converter if there is a
+    network.
+
+    Raises:
+        NoEquilibrium: there is no operating point.
+    """
+    if converter is not None:
+        return _linearised(scenario, {converter: law}).converter(converter)
+    return ClosedLoop.of(law, scenario.plant, scenario.references.vector(), T_s=scenario.T_s)
+
+
+def _linearised(scenario: Scenario, laws: Mapping[str, BuiltLaw]) -> NetworkLoop:
+    each = [scenario.of(name) for name in scenario.converters]
+    built = [
+        discretise(laws[name], scenario.T_s) if name in laws else initial_law(one)[0]
+        for name, one in zip(scenario.converters, each, strict=True)
+    ]
+    references = [one.references.vector() for one in each]
+    return NetworkLoop.of(plant_of(scenario), built, references)

@@ -1,0 +1,17 @@
+"""Figures of linear loops and of frequency scans, with matplotlib."""
+
+from gfm_hil.api.plot import bode, impedance, nyquist, participations, pole_map, step
+from gfm_hil.studies.scan_figures import admittance, nfp, nyquist_on_grid, passivity
+
+__all__ = [
+    "admittance",
+    "bode",
+    "impedance",
+    "nfp",
+    "nyquist",
+    "nyquist_on_grid",
+    "participations",
+    "passivity",
+    "pole_map",
+    "step",
+]
