@@ -26,7 +26,7 @@ from websockets.asyncio.client import connect
 from gfm_hil.engine.inproc import compile_loop, run_inproc
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import check_scenario, scenario_toml
 
 TRACES = ("p", "q", "V", "omega_u", "v_dc")
@@ -34,13 +34,15 @@ BINS = 900  # as a page on a desk asks for
 T_S = 1e-4
 
 
-def record(folder: Path, seconds: float) -> tuple[Part, Part]:
+def record(folder: Path, seconds: float) -> tuple[RolePart, RolePart]:
     """A run's recording of which no tick is done yet, though all are there."""
     content = {"title": "benchmark", "duration": seconds, "T_s": T_S, "link": {"type": "inproc"}}
     content["plant"] = {"sensors": {"noise_std": {"p": 5e-4, "q": 5e-4, "V": 1e-4}}}
     scenario = check_scenario(content, "benchmark")
     (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
-    plant, controller = (Part.create(folder, s, scenario.ticks) for s in ("plant", "controller"))
+    plant, controller = (
+        RolePart.create(folder, s, scenario.ticks) for s in ("plant", "controller")
+    )
     bench = make_bench(scenario)
     compile_loop([bench])
     timeline = Timeline(bench, folder / "events_both.jsonl", ("plant", "controller"))
@@ -53,7 +55,7 @@ def record(folder: Path, seconds: float) -> tuple[Part, Part]:
     return plant, controller
 
 
-def play(parts: tuple[Part, Part], over: threading.Event) -> None:
+def play(parts: tuple[RolePart, RolePart], over: threading.Event) -> None:
     """Let ticks be done at the pace of the clock."""
     began = time.monotonic()
     while not over.wait(1e-3):

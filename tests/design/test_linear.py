@@ -16,7 +16,7 @@ from gfm_design.model.operating_point import operating_point
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import check_scenario
 from gfm_plant import Plant, make_plant, phase_jump
 from gfm_plant.model import DELTA, N_X, f, g
@@ -94,7 +94,7 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         predicted[k] = loop.plant.C[1] @ x[: len(loop.plant.A)]
         x = loop.A @ x
     phase_jump(bench.plant, -math.degrees(angle))
-    parts = [Part.create(place, role, ticks) for role in ("plant", "controller")]
+    parts = [RolePart.create(place, role, ticks) for role in ("plant", "controller")]
     done = run_ticks(
         bench.plant.records,
         stack([bench]),

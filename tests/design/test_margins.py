@@ -31,7 +31,7 @@ from gfm_hil.cli import main
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import PLANT_COLUMNS
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.run import Run
 from gfm_hil.run.loop_delay import loop_delay
 from gfm_hil.scenario import Scenario, check_scenario, load_scenario
@@ -224,7 +224,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": plant}
     bench = make_bench(check_scenario(content, "test"))
     phase_jump(bench.plant, -math.degrees(1e-7))
-    parts = [Part.create(tmp, role, ticks) for role in ("plant", "controller")]
+    parts = [RolePart.create(tmp, role, ticks) for role in ("plant", "controller")]
     run_ticks(
         bench.plant.records,
         stack([bench]),

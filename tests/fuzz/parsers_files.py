@@ -20,7 +20,7 @@ from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.streams.follow import Follower
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario, scenario_toml
 from gfm_hil.scenario.events.grid_profile import read_profile
@@ -275,7 +275,7 @@ def _run_folder(place: Path) -> Iterator[Take]:
     try:
         yield take
     finally:
-        scratch.let_go(hold)
+        scratch.release(hold)
 
 
 def _runs(place: Path) -> tuple[Path, Path]:
@@ -293,7 +293,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
     going.mkdir()
     (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")
     for role in ("plant", "controller"):
-        part = Part.create(going, role, scenario.ticks)
+        part = RolePart.create(going, role, scenario.ticks)
         part.signals[:], part.progress[:] = 1.0, (10, 0)
         (going / f"commands_{role}.json").write_text(
             f'{{"endpoint": "ipc://{held}/{role}", "T_s": 0.0001, "names": ["vsg-2"], "laws":'

@@ -21,7 +21,7 @@ import pytest
 
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links.can.dbc import write_dbc
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import load_scenario, toml_text
 
 from ..support.can_reference import quantised_run
@@ -57,7 +57,7 @@ def run_while(scenario: str, ticks: int, meanwhile: Callable[[], None]) -> dict[
     """``gfmhil run``; calls ``meanwhile`` after that many ticks; returns the summary."""
     process = start("run", scenario, "--out", "out", "--quiet", "--no-figures")
     while True:
-        part = Part.open(Path("out"), "plant")
+        part = RolePart.open(Path("out"), "plant")
         if part is not None and int(part.progress[0]) >= ticks:
             break
         assert process.poll() is None, process.communicate()[0]

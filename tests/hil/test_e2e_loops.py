@@ -25,7 +25,7 @@ from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.run_folder import finish
 from gfm_hil.scenario import Scenario, scenario_toml
 from gfm_plant import NO_FRESH_U
@@ -89,7 +89,7 @@ class Found:
     """The results of the side under test."""
 
     reader: FrameReader
-    part: Part
+    part: RolePart
     liar: Liar
     end: tuple[str, str, int]
     took_s: float
@@ -106,7 +106,7 @@ def lied_to(
     """Run one side over one of ``LINKS`` against a peer that runs ``lie``."""
     name, options = LINKS[link]
     endpoint = link_kind(name).fresh(folder)
-    bench, part = make_bench(scenario), Part.create(folder, role, scenario.ticks)
+    bench, part = make_bench(scenario), RolePart.create(folder, role, scenario.ticks)
     compile_role(role, [bench], [part])
     ends = {s: open_link(name, s, endpoint, options) for s in ROLES}
     liar = Liar(ends[OTHER[role]], OTHER[role])

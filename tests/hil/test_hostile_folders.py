@@ -168,7 +168,7 @@ def test_the_recording_of_a_renamed_folder_is_recovered(cut, tmp_path):
     try:
         for path in (cut / "parts").iterdir():
             shutil.copy(path, memory)
-        scratch.let_go(recording._holds.pop(made / "parts"))
+        scratch.release(recording._holds.pop(made / "parts"))
         for path in cut.iterdir():
             if path.is_file():
                 shutil.copy(path, made)

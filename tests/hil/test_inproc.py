@@ -14,7 +14,7 @@ from gfm_hil.engine.inproc import CHUNK, run_inproc
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import check_scenario
@@ -252,7 +252,7 @@ def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
 
     scenario = make(duration=2.0)
     bench = make_bench(scenario)
-    parts = {role: Part.create(tmp_path, role, scenario.ticks) for role in ROLES}
+    parts = {role: RolePart.create(tmp_path, role, scenario.ticks) for role in ROLES}
     timeline = Timeline(bench, tmp_path / "events_both.jsonl", ROLES)
     run_inproc(
         [bench], [parts["plant"]], [parts["controller"]], [timeline], lambda ticks: ticks < CHUNK

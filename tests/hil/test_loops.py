@@ -25,7 +25,7 @@ from gfm_hil.links import Link, Port, open_link, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.log import read_log
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import carried
 from gfm_runtime.states import LOST_PEER, REASONS, RUNNING, SAFE, STALE, STOPPED
@@ -219,7 +219,7 @@ class Alone:
     """The results of one side's loop against a played other side."""
 
     faults: dict[str, int]
-    part: Part
+    part: RolePart
     log: list[dict[str, Any]]
     said: list[tuple[int, int, int]]  # tick, state, reason of each frame that it sent
 
@@ -241,7 +241,7 @@ def alone(
     """Run one side's loop over messages that are in the link before it starts."""
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
     bench = make_bench(scenario)
-    part = Part.create(folder, role, scenario.ticks, bench.inner)
+    part = RolePart.create(folder, role, scenario.ticks, bench.inner)
     compile_role(role, [bench], [part])
     ends = {s: open_link(link, s, endpoint) for s in ROLES}
     other: Role = "plant" if role == "controller" else "controller"

@@ -134,7 +134,7 @@ def test_only_recorded_files_are_rescued(tmp_path, monkeypatch, attack_now):
             (place / name).symlink_to(secret)
         else:
             (place / name).write_bytes(SECRET)
-        scratch.let_go(handle)
+        scratch.release(handle)
 
     another = tmp_path / "another"
     another.mkdir()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import ROLES
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 
 from ..support.processes import (
     end,
@@ -203,7 +203,7 @@ def test_without_the_command_that_started_them_both_roles_end_too(start, tmp_pat
     process.communicate()
     wait_for(lambda: roles_of(folder) == {})
     for role in ROLES:
-        part = Part.open(folder, role)
+        part = RolePart.open(folder, role)
         assert not np.isnan(part.signals[:200]).any()
 
 

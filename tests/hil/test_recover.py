@@ -29,7 +29,7 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.recording import npz
 from gfm_hil.recording.merge import merge
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.run import Run
 from gfm_hil.results.export import export_run
 from gfm_hil.results.report import write_report
@@ -187,7 +187,7 @@ def test_a_run_in_process_that_was_killed_is_recovered(start, tmp_path):
     process = start("run", scenario, "--out", str(folder))
 
     def has_recorded() -> bool:
-        part = Part.open(folder, "plant")
+        part = RolePart.open(folder, "plant")
         return part is not None and len(part.signals) > 0 and not np.isnan(part.signals[999, 5])
 
     wait_for(has_recorded, process)
@@ -422,7 +422,7 @@ def test_the_memory_of_recover_does_not_grow_with_the_run(make, tmp_path, attack
     (folder / "scenario.toml").write_text(scenario_toml(scenario), encoding="utf-8")
     chance = np.random.default_rng(1)
     for role in ROLES:
-        part = Part.create(folder, role, ticks)
+        part = RolePart.create(folder, role, ticks)
         for first in range(0, ticks, 100_000):
             rows = part.signals[first : first + 100_000]
             rows[:] = chance.normal(1.0, 0.1, rows.shape)
@@ -476,7 +476,7 @@ COLUMNS = {
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("npz") / "some.npz"
-    npz.write_npz(path, [npz.Table.of(**{name: x}) for name, x in COLUMNS.items()])
+    npz.write_npz(path, [npz.ColumnGroup.of(**{name: x}) for name, x in COLUMNS.items()])
     return path
 
 
@@ -503,13 +503,13 @@ def test_what_numpy_writes_is_read(save, tmp_path):
 
 def test_a_file_that_could_not_be_written_leaves_the_old_one(tmp_path):
     path = tmp_path / "x.npz"
-    npz.write_npz(path, [npz.Table.of(a=np.arange(3))])
+    npz.write_npz(path, [npz.ColumnGroup.of(a=np.arange(3))])
 
     def read(first, last):
         raise OSError(errno.EIO, "gone")
 
     with pytest.raises(OSError):
-        npz.write_npz(path, [npz.Table({"b": np.dtype(float)}, 9, read)])
+        npz.write_npz(path, [npz.ColumnGroup({"b": np.dtype(float)}, 9, read)])
     assert list(npz.open_npz(path)) == ["a"]
     assert names(tmp_path) == {"x.npz"}
 

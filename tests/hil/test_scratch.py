@@ -19,10 +19,10 @@ pytestmark = pytest.mark.processes
 HOLD = """
 import sys, time
 from pathlib import Path
-from gfm_hil.recording.parts import Part, keep_in_memory
+from gfm_hil.recording.parts import RolePart, keep_in_memory
 folder = Path(sys.argv[1])
 keep_in_memory(folder, 100)
-part = Part.create(folder, sys.argv[2], 100)
+part = RolePart.create(folder, sys.argv[2], 100)
 part.signals[:60] = 1.5
 print("ready", flush=True)
 time.sleep(600)
@@ -71,20 +71,20 @@ def test_a_folder_is_left_behind_once_nobody_holds_it(tmp_path):
     place, first = scratch.make("x-", tmp_path)
     second = scratch.hold(place)
     assert list(scratch.left_behind("x-", tmp_path)) == []
-    scratch.let_go(first)
+    scratch.release(first)
     assert list(scratch.left_behind("x-", tmp_path)) == []
-    scratch.let_go(second)
+    scratch.release(second)
     ((found, handle),) = scratch.left_behind("x-", tmp_path)
     assert found == place
     assert list(scratch.left_behind("x-", tmp_path)) == []  # only one process can remove them
-    scratch.let_go(handle)
+    scratch.release(handle)
 
 
 def test_a_temporary_folder_goes_with_its_context_and_left_ones_go_too(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     left, handle = scratch.make("x-", tmp_path)
     (left / "link").touch()
-    scratch.let_go(handle)
+    scratch.release(handle)
     (tmp_path / "x-a-file").touch()
     with scratch.temporary("x-") as place:
         (place / "link").touch()
@@ -101,7 +101,7 @@ def test_what_a_killed_run_recorded_in_memory_is_moved_to_its_folder(record, mem
     another_run(tmp_path)
     assert not (folder / "parts").is_symlink()
     assert list(memory.iterdir()) == []
-    part = recording.Part.open(folder, "plant")
+    part = recording.RolePart.open(folder, "plant")
     assert part is not None
     assert (part.signals[:60] == 1.5).all() and np.isnan(part.signals[60:]).all()
     assert {path.name for path in folder.iterdir()} == {"parts"}
@@ -116,7 +116,7 @@ def test_it_stays_while_one_role_lives(record, memory, tmp_path):
     kill(controller)
     another_run(tmp_path)
     assert not (folder / "parts").is_symlink()
-    assert all(recording.Part.open(folder, role) for role in ("plant", "controller"))
+    assert all(recording.RolePart.open(folder, role) for role in ("plant", "controller"))
     assert list(memory.iterdir()) == []
 
 
@@ -126,7 +126,7 @@ def test_it_is_found_in_a_folder_that_was_renamed(record, memory, tmp_path):
     folder = folder.rename(tmp_path / "a better name")
     assert another_run(tmp_path) == []
     assert not (folder / "parts").is_symlink()
-    assert recording.Part.open(folder, "plant") is not None
+    assert recording.RolePart.open(folder, "plant") is not None
     assert list(memory.iterdir()) == []
 
 
@@ -140,12 +140,12 @@ def test_it_stays_and_is_named_where_the_run_folder_is_gone(record, memory, tmp_
         (said,) = another_run(tmp_path)
         assert said.startswith(f"{place}: kept, ")
         assert str(folder) in said
-    assert recording.Part.open(elsewhere, "plant") is not None
+    assert recording.RolePart.open(elsewhere, "plant") is not None
 
 
 def test_a_place_in_which_nothing_was_recorded_goes(memory, tmp_path):
     _, handle = scratch.make("gfmhil-parts-", memory)
-    scratch.let_go(handle)
+    scratch.release(handle)
     assert another_run(tmp_path) == []
     assert list(memory.iterdir()) == []
 
@@ -161,4 +161,4 @@ def test_it_stays_where_its_folder_has_no_room(record, memory, tmp_path, monkeyp
     another_run(tmp_path)
     assert (folder / "parts").is_symlink()
     assert {path.name for path in folder.iterdir()} == {"parts"}  # no incomplete copy
-    assert recording.Part.open(folder, "plant") is not None
+    assert recording.RolePart.open(folder, "plant") is not None

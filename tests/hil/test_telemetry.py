@@ -25,7 +25,7 @@ from gfm_hil.ports.streams.follow import Follower, NewRows
 from gfm_hil.ports.streams.publish import Publisher
 from gfm_hil.ports.streams.samples import Sampler
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 
 from ..support.processes import PATIENCE_S, takes_commands, wait_for
 
@@ -303,7 +303,7 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
     monkeypatch.setattr("gfm_hil.core.supervised.PAUSE_S", 0.01)
     ticks = 3000
     (tmp_path / "scenario.toml").write_text("T_s = 1e-4\n", encoding="utf-8")
-    part = Part.create(tmp_path, "plant", ticks)
+    part = RolePart.create(tmp_path, "plant", ticks)
     follower = Follower(tmp_path)
     part.signals[:], part.times[:] = 0.5, -1
     looks = iter(range(100, ticks + 1, 100))
@@ -314,15 +314,15 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
             shutil.rmtree(tmp_path / "parts", ignore_errors=True)
         return False
 
-    find, calls = Part.open, iter(range(100))
+    find, calls = RolePart.open, iter(range(100))
     problems = {2: OSError(24, "Too many open files"), 3: ValueError("a mistake of ours")}
 
-    def sometimes(folder: Path, role: Role) -> Part | None:
+    def sometimes(folder: Path, role: Role) -> RolePart | None:
         if problem := problems.get(next(calls, 0)):
             raise problem
         return find(folder, role)
 
-    monkeypatch.setattr(Part, "open", sometimes)
+    monkeypatch.setattr(RolePart, "open", sometimes)
     with Publisher("127.0.0.1", 0, 0) as publisher:
         sent = publisher.follow(follower, 500.0, stopped)
     assert sent == ticks
@@ -333,14 +333,14 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
 def test_a_side_that_begins_while_the_news_are_read_is_in_the_next(tmp_path, monkeypatch):
     """The plant's parts appear between two looks at them of one call."""
     (tmp_path / "scenario.toml").write_text("T_s = 1e-4\n", encoding="utf-8")
-    controller, plant = (Part.create(tmp_path, role, 10) for role in ROLES)
-    find = Part.open
+    controller, plant = (RolePart.create(tmp_path, role, 10) for role in ROLES)
+    find = RolePart.open
     hidden = iter([True] * 3)  # from two looks of the constructor, and from the first of the news
 
-    def begun(folder: Path, role: Role) -> Part | None:
+    def begun(folder: Path, role: Role) -> RolePart | None:
         return None if role == "plant" and next(hidden, False) else find(folder, role)
 
-    monkeypatch.setattr(Part, "open", begun)
+    monkeypatch.setattr(RolePart, "open", begun)
     follower = Follower(tmp_path)
     controller.progress[0], plant.progress[0] = 5, 7
     assert [(rows.role, len(rows.signals)) for rows in follower.news()] == [("controller", 4)]

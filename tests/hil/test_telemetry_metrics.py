@@ -18,7 +18,7 @@ from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.ports.streams.metrics import METRICS
 from gfm_hil.ports.streams.prometheus import RunCollector, serve_metrics
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 
 from ..support.processes import PATIENCE_S, wait_for
 
@@ -81,7 +81,7 @@ def recorded(tmp_path: Path) -> Follower:
     """The files of an hour's run in real time after 30 s."""
     (tmp_path / "scenario.toml").write_text('T_s = 1e-4\nmode = "realtime"\n', encoding="utf-8")
     ticks = 300_000
-    part = Part.create(tmp_path, "plant", ticks + 10)
+    part = RolePart.create(tmp_path, "plant", ticks + 10)
     due = 5_000_000_000 + np.arange(ticks) * 100_000
     part.times[:ticks, 0] = part.times[:ticks, 2] = due
     part.times[:ticks, 3] = due + 30_000  # slack 70 µs
@@ -89,7 +89,7 @@ def recorded(tmp_path: Path) -> Follower:
     part.times[ticks - 500 : ticks, 3] = -1
     part.times[ticks - 600, 3] = due[ticks - 600] + 95_000
     part.progress[:] = ticks, 500
-    controller = Part.create(tmp_path, "controller", ticks + 10)
+    controller = RolePart.create(tmp_path, "controller", ticks + 10)
     controller.signals[ticks - 1, -3:] = 1.0, 3.0, 0.5
     controller.progress[:] = ticks, 0
     return Follower(tmp_path)
@@ -111,7 +111,7 @@ def test_quantiles_are_of_the_last_ten_seconds(recorded):
 
 def test_a_run_without_a_tick_has_no_quantiles(tmp_path):
     (tmp_path / "scenario.toml").write_text('T_s = 1e-4\nmode = "realtime"\n', encoding="utf-8")
-    Part.create(tmp_path, "plant", 10)
+    RolePart.create(tmp_path, "plant", 10)
     families = {m.name: m.samples for m in RunCollector(Follower(tmp_path)).collect()}
     assert families["gfmhil_slack_seconds"] == families["gfmhil_round_trip_seconds"] == []
     assert [s.value for s in families["gfmhil_ticks"]] == [0.0]

@@ -22,7 +22,7 @@ from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.merge import merge
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.run import read_recording
 from gfm_hil.scenario import Scenario
 
@@ -144,7 +144,9 @@ def run_pair(
     folder.mkdir(parents=True, exist_ok=True)
     where = endpoint or link_kind(link).fresh(folder)
     benches = {role: make_bench(scenario) for role in ROLES}
-    parts = {role: Part.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES}
+    parts = {
+        role: RolePart.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES
+    }
     for role in ROLES:
         compile_role(role, [benches[role]], [parts[role]])
     pair = Pair()

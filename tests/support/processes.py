@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import ROLES
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import toml_text
 
 
@@ -80,7 +80,7 @@ def takes_commands(folder: Path) -> bool:
 
 def has_run(folder: Path, ticks: int) -> bool:
     """Whether the plant has recorded that many ticks."""
-    part = Part.open(folder, "plant")
+    part = RolePart.open(folder, "plant")
     return part is not None and int(part.progress[0]) >= ticks
 
 

@@ -21,7 +21,7 @@ from gfm_hil.bench.rounds import RUNS, Spread, quickest, seconds, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario import load_scenario
 from gfm_plant import plant_advance, plant_sample
@@ -86,14 +86,14 @@ class Loop:
         bench.controller.set("P_ref", 0.8)
         self.bench, self.ticks = bench, ticks
         self.T_s = bench.scenario.T_s
-        self.plant = Part.create(folder, "plant", ticks).signals
-        self.controller = Part.create(folder, "controller", ticks).signals
+        self.plant = RolePart.create(folder, "plant", ticks).signals
+        self.controller = RolePart.create(folder, "controller", ticks).signals
         c = bench.controller
         self._kept = [*bench.plant.records, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
         self._start = [a.copy() for a in self._kept]
         self.whole()
         self._rows = itertools.cycle(
-            np.split(Part.create(folder / "long", "plant", RUNS * ticks).signals, RUNS)
+            np.split(RolePart.create(folder / "long", "plant", RUNS * ticks).signals, RUNS)
         )
         self._y, self._u = np.split(self.plant[:, : NY + NU].copy(), [NY], axis=1)
 

@@ -40,7 +40,7 @@ class _Setup(c.Structure):
     )
 
 
-class _Input(c.Structure):
+class _ControllerInput(c.Structure):
     _fields_ = (
         ("t", c.c_double), ("v", _Phases), ("i", _Phases), ("i_o", _Phases),
         *((name, c.c_double) for name in
@@ -48,7 +48,7 @@ class _Input(c.Structure):
     )  # fmt: skip
 
 
-class _Output(c.Structure):
+class _ControllerOutput(c.Structure):
     _fields_ = (("e", _Phases), ("i_dc", c.c_double))
 
 
@@ -96,7 +96,7 @@ class LibraryController:
                 f"{path.name}: {self.name} refuses this bench: gfmhil_new gave NULL; offered were"
                 f" {offered} (SI units; step_s in the map file sets the period)"
             )
-        self._in, self._out = _Input(), _Output()
+        self._in, self._out = _ControllerInput(), _ControllerOutput()
         self._ticks, self._speed = 0, 1.0
         y = {name: k for k, name in enumerate(carried("y", True))}
         self._pairs = {
@@ -200,7 +200,7 @@ def _loaded(path: Path) -> c.CDLL:
         )
     of.gfmhil_name.restype = c.c_char_p
     of.gfmhil_new.restype = c.c_void_p
-    given = (c.c_void_p, c.POINTER(_Input), c.POINTER(_Output))
+    given = (c.c_void_p, c.POINTER(_ControllerInput), c.POINTER(_ControllerOutput))
     of.gfmhil_start.argtypes = of.gfmhil_step.argtypes = given
     of.gfmhil_free.argtypes = (c.c_void_p,)
     of.gfmhil_free.restype = None

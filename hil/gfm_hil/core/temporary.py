@@ -59,7 +59,7 @@ def lock(handle: int, operation: int, patience_s: float = PATIENCE_S) -> None:
 
 
 def make(prefix: str, where: Path) -> tuple[Path, int]:
-    """Make a folder in ``where``; returns it with a lock to pass to ``let_go``."""
+    """Make a folder in ``where``; returns it with a lock to pass to ``release``."""
     while True:
         place = Path(tempfile.mkdtemp(prefix=prefix, dir=where))
         with contextlib.suppress(FileNotFoundError):  # removed before we locked it: try another
@@ -81,12 +81,12 @@ def hold(place: Path) -> int:
         lock(handle, fcntl.LOCK_SH)
         place.stat()  # it may have been removed meanwhile
     except BaseException:
-        let_go(handle)
+        release(handle)
         raise
     return handle
 
 
-def let_go(handle: int) -> None:
+def release(handle: int) -> None:
     """Undo ``make`` or ``hold``; the folder stays."""
     os.close(handle)
 
@@ -97,13 +97,13 @@ def temporary(prefix: str) -> Iterator[Path]:
     where = Path(tempfile.gettempdir())
     for left, handle in left_behind(prefix, where):
         shutil.rmtree(left, ignore_errors=True)
-        let_go(handle)
+        release(handle)
     place, handle = make(prefix, where)
     try:
         yield place
     finally:
         shutil.rmtree(place, ignore_errors=True)
-        let_go(handle)
+        release(handle)
 
 
 def held(place: Path) -> bool:
@@ -142,7 +142,7 @@ def left_behind(prefix: str, where: Path) -> Iterator[tuple[Path, int]]:
                     raise PermissionError
                 lock(handle, fcntl.LOCK_EX, patience_s=0.0)
             except OSError:
-                let_go(handle)
+                release(handle)
                 continue
             yield place, handle
     finally:

@@ -23,7 +23,7 @@ from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
 from gfm_hil.recording.columns import kept_of
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
 
 #: a name for people, and what compiles the functions, or loads them from the cache
@@ -182,7 +182,7 @@ def _both(found: list[Bench]) -> Set:
 def _role(role: Role, found: list[Bench], which: str = "") -> Set:
     def compile_it() -> None:
         parts = [
-            Part(
+            RolePart(
                 rows(1, 1, bench.inner)[role == "controller"][0],
                 np.empty((0, len(kept_of(role))), np.int64),
                 np.zeros(2, np.int64),

@@ -33,7 +33,7 @@ from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.recording.log import PLANT_LEFT
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_plant import NO_FRESH_U
 from gfm_plant.names import CONTROLLER_GONE, CONTROLLER_LEFT
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
@@ -53,7 +53,7 @@ class Share(NamedTuple):
 
     bench: Bench
     link: Link
-    part: Part
+    part: RolePart
     timeline: Timeline
     crowded: bool = False
 
@@ -223,7 +223,7 @@ def _records(bench: Bench) -> ControllerRecords:
     return ControllerRecords(c.ctl, c.laws, c.states, c.est)
 
 
-def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
+def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
     """Compile (or load from cache) a side's loop without running a tick."""
     nowhere: Any = _NullLink()
     unused: Any = None

@@ -20,8 +20,9 @@ from gfm_hil.core.errors import PeerLost
 from gfm_hil.engine.controller_ticks import receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
 from gfm_hil.recording.columns import kept_of
+from gfm_hil.recording.log import Status
 from gfm_hil.scenario.events.base import Event
-from gfm_hil.scenario.events.gains import Gains, Retuned, ready_gains
+from gfm_hil.scenario.events.gains import GainChange, Retuned, ready_gains
 from gfm_runtime.assembly import Controller
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import accept, bad_output, follow_plant, measured, next_law
@@ -30,7 +31,6 @@ from gfm_runtime.states import READY, RUNNING, SAFE
 
 if TYPE_CHECKING:
     from gfm_hil.controllers import PilController
-    from gfm_hil.engine.timeline import Timeline
 
 REFUSED, ACCEPTED, RESTARTED = range(3)
 _COUNT = kept_of("controller").index("instructions")
@@ -94,7 +94,9 @@ class SteppedController:
             return
         if self._ours is None:
             raise ValueError(f"{self.name} has a law of its own")
-        if isinstance(event, Gains) and not self._ours.has(ready_gains(controller, event.values)):
+        if isinstance(event, GainChange) and not self._ours.has(
+            ready_gains(controller, event.values)
+        ):
             raise ValueError(
                 f"{self.name} has only those gains in its code that the scenario names"
             )
@@ -172,7 +174,7 @@ class SteppedController:
             if why != ReturnReason.GO_ON:
                 return ReturnReason(why)
 
-    def watch(self, timeline: Timeline, patience_s: float) -> None:
+    def watch(self, end: Callable[[Status, str, int], None], patience_s: float) -> None:
         """End the run if the external controller has not answered for that long; another thread
         calls this.
 
@@ -184,7 +186,7 @@ class SteppedController:
         if silent_s > patience_s:
             self.abandoned = True
             problem = f"{self.name}: has not answered for {patience_s:g} s"
-            timeline.end("safe", problem, self._tick)
+            end("safe", problem, self._tick)
             self.last_words()
             raise PeerLost(problem)
 

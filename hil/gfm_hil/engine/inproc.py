@@ -17,7 +17,7 @@ from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.recording.columns import signals_of
-from gfm_hil.recording.parts import Kept, Part
+from gfm_hil.recording.parts import Kept, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_is_delayed, plant_step
 from gfm_plant.synchro_check import WATCHING
@@ -127,8 +127,8 @@ def run_ticks(
 
 def run_inproc(
     benches: Sequence[Bench],
-    plant_parts: Sequence[Part | Kept],
-    controller_parts: Sequence[Part | Kept],
+    plant_parts: Sequence[RolePart | Kept],
+    controller_parts: Sequence[RolePart | Kept],
     timelines: Sequence[Timeline],
     go_on: Callable[[int], bool],
 ) -> int:

@@ -71,7 +71,7 @@ def run_loop(
                 timeline.flush()
             flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
             if external is not None:
-                external.watch(timelines[0], shares[0].bench.scenario.answer_timeout_s)
+                external.watch(timelines[0].end, shares[0].bench.scenario.answer_timeout_s)
     finally:  # also after a second Ctrl-C: the thread must end before its arrays go
         flags[STOP] = 1
         while thread.is_alive() and not (external is not None and external.abandoned):

@@ -40,7 +40,7 @@ from gfm_hil.realtime.priority import (
     processors,
 )
 from gfm_hil.recording.log import SEVERITY, Outcome
-from gfm_hil.recording.parts import Part, keep_in_memory
+from gfm_hil.recording.parts import RolePart, keep_in_memory
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario import Scenario, write_scenario
 from gfm_hil.scenario.events.gains import gains_of
@@ -90,7 +90,7 @@ def run_role(
             if name in endpoints:
                 link = bench.scenario.link.model_copy(update={"endpoint": endpoints[name]})
                 bench.scenario = bench.scenario.model_copy(update={"link": link})
-            sides.append(_Side(role, bench, place, stack, notice))
+            sides.append(_SideResources(role, bench, place, stack, notice))
         compile_role(role, benches, [side.part for side in sides])
         return _run(role, sides, notice, interrupt)
 
@@ -124,7 +124,7 @@ def _begin(folder: Path, scenario: Scenario) -> None:
         write_scenario(folder, scenario)
 
 
-class _Side:
+class _SideResources:
     """A role's side of one converter: its bench, its recording and its log."""
 
     def __init__(
@@ -140,7 +140,7 @@ class _Side:
         _begin(folder, scenario)
         if scenario.mode == "realtime":
             keep_in_memory(folder, scenario.ticks, notice, bench.inner)
-        self.part = Part.create(folder, role, scenario.ticks, bench.inner)
+        self.part = RolePart.create(folder, role, scenario.ticks, bench.inner)
         self.timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         stack.callback(self.timeline.close)
 
@@ -172,7 +172,7 @@ class _Side:
 
 
 def _run(
-    role: Role, sides: list[_Side], notice: Callable[[str], None], interrupt: Interrupt
+    role: Role, sides: list[_SideResources], notice: Callable[[str], None], interrupt: Interrupt
 ) -> Outcome:
     flags = np.zeros(FLAGS, np.int64)
 
@@ -195,7 +195,7 @@ def _run(
 
 def _meet_and_run(
     role: Role,
-    sides: list[_Side],
+    sides: list[_SideResources],
     flags: NDArray[np.int64],
     notice: Callable[[str], None],
     interrupt: Interrupt,
@@ -246,7 +246,10 @@ def _meet_and_run(
 
 
 def _meet(
-    role: Role, sides: list[_Side], stopped: Callable[[], bool], notice: Callable[[str], None]
+    role: Role,
+    sides: list[_SideResources],
+    stopped: Callable[[], bool],
+    notice: Callable[[str], None],
 ) -> list[Start]:
     """Shake hands over all links at a time: the controllers of a plant may come in any order.
 
@@ -256,7 +259,7 @@ def _meet(
     meeting, failed = Meeting(len(sides)), threading.Event()
     external = sides[0].bench.external
 
-    def meet(side: _Side) -> Start:
+    def meet(side: _SideResources) -> Start:
         try:
             return shake_hands(
                 role, side.good, side.scenario, lambda: stopped() or failed.is_set(), notice,
@@ -280,7 +283,7 @@ def _meet(
     return [one.result() for one in found]
 
 
-def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[Part]) -> None:
+def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
     """Compile (or load from cache) every function that a tick calls, on copies."""
     bench, part = benches[0], parts[0]
     plant, y, u = bench.plant.copy().records, bench.y.copy(), bench.u.copy()

@@ -18,7 +18,7 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
 from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.log import Outcome
-from gfm_hil.recording.parts import Part, keep_in_memory
+from gfm_hil.recording.parts import RolePart, keep_in_memory
 from gfm_hil.scenario import Scenario
 from gfm_runtime.children import end_now, guarded
 
@@ -191,7 +191,7 @@ class Processes:
         while len(ended) < len(self._all):
             time.sleep(_LOOK_S)
             now = time.monotonic()
-            part = part or Part.open(first, "plant")
+            part = part or RolePart.open(first, "plant")
             if part is not None:
                 if int(part.progress[0]) == 0:
                     began = now
@@ -213,7 +213,7 @@ class Processes:
                     end_now(process.popen)
         return began
 
-    def _ends_all(self, ended: _Process, part: Part | None) -> tuple[bool, bool]:
+    def _ends_all(self, ended: _Process, part: RolePart | None) -> tuple[bool, bool]:
         """Whether the end of a process ends the run at once, or once the others had their time."""
         code, network = ended.popen.returncode, bool(self.scenario.parts)
         begun = part is not None and int(part.progress[0]) > 0

@@ -74,7 +74,7 @@ def bytes_per_tick(inner: bool = False) -> int:
 PIECE = 1 << 18  # ticks of a column that a reader holds in memory at a time
 
 
-class Rows(Protocol):
+class ColumnLike(Protocol):
     """A column, shape (ticks,): an array, or a column of a file of which only slices are read."""
 
     @property
@@ -83,10 +83,10 @@ class Rows(Protocol):
     def __getitem__(self, rows: slice, /) -> Any: ...
 
 
-Columns = Mapping[str, Rows]  #: columns of a run by name, all of the same length
+Columns = Mapping[str, ColumnLike]  #: columns of a run by name, all of the same length
 
 
-def pieces(column: Rows, first: int, last: int) -> Iterator[Any]:
+def pieces(column: ColumnLike, first: int, last: int) -> Iterator[Any]:
     """Rows [first, last) of a column, at most ``PIECE`` at a time, so that memory is bounded."""
     return (column[a : min(a + PIECE, last)] for a in range(first, last, PIECE))
 

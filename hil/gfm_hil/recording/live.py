@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import Columns, named, recorded_in
-from gfm_hil.recording.parts import Part
+from gfm_hil.recording.parts import RolePart
 from gfm_runtime.toml_file import read_toml
 
 
@@ -26,7 +26,7 @@ class LiveRun:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self._opening = folder, threading.Lock()
-        self._parts: Mapping[Role, Part] = {}
+        self._parts: Mapping[Role, RolePart] = {}
         self._columns: Mapping[str, NDArray[Any]] = {}
 
     @cached_property
@@ -45,12 +45,15 @@ class LiveRun:
         return T_s
 
     @property
-    def parts(self) -> Mapping[Role, Part]:
+    def parts(self) -> Mapping[Role, RolePart]:
         """The arrays of the sides that have begun to record by now; a side that begins later is in
         the next one."""
         with self._opening:  # by any of the threads that read
             for role in ROLES:
-                if role not in self._parts and (part := Part.open(self.folder, role)) is not None:
+                if (
+                    role not in self._parts
+                    and (part := RolePart.open(self.folder, role)) is not None
+                ):
                     self._parts = {**self._parts, role: part}
                     self._columns = {**self._columns, **named(role, part.signals, part.times)}
             return self._parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,8 @@ from pydantic_core import from_json
 
 from gfm_hil.core.files import SMALL, check_values, read_file, read_json
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.expectation import reason_name
 from gfm_plant.names import CONTROLLER_LEFT, CONTROLLER_SAFE
 from gfm_runtime.states import PLANT_TRIP, REASONS
 
@@ -74,14 +77,14 @@ _NEEDS = {
 _LOGS = tuple(f"events_{side}.jsonl" for side in (*ROLES, "both"))
 
 
-class _Event(_Said):
+class _EventEntry(_Said):
     t: FiniteFloat
     tick: Tick
     type: str
     label: str
 
 
-class _Trip(_Said):
+class _TripEntry(_Said):
     t: FiniteFloat
     tick: Tick
     reason: str
@@ -110,8 +113,8 @@ class Summary(_Said):
     injected: dict[Role, dict[str, int]] = {}
     inner: dict[str, str] = {}
     bump_pu: list[float | None] | None
-    trips: list[_Trip] = []
-    events: list[_Event]
+    trips: list[_TripEntry] = []
+    events: list[_EventEntry]
     run: str | None
     date: str = ""
     version: str = ""
@@ -192,3 +195,39 @@ def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     found = own if any(o.status != "completed" for o in own) else found
     first = max(found, key=lambda o: (SEVERITY.index(o.status), o.reason not in _SECONDARY))
     return next((o for o in found if o.reason.startswith(f"{first.reason}: ")), first)
+
+
+def unmet(
+    scenario: Scenario, outcome: Outcome, log: Sequence[dict[str, Any]], done: int
+) -> list[str]:
+    """The parts of the expectation that a run did not meet, one sentence each; empty if it met all.
+
+    Args:
+        scenario: the scenario with its expectation.
+        outcome: how the run ended.
+        log: every line of the run's log. If the run waits after a trip, the time of the trip in
+            the log counts, not the end of the wait.
+        done: ticks recorded: the time of the end if both sides died before they could log it.
+    """
+    if outcome.status != scenario.expect:
+        return [f"expect = {scenario.expect!r}, but the run ended as {outcome.status!r}"]
+    missed = []
+    wanted, came = scenario.expect_reason, reason_name(outcome.reason)
+    if wanted is not None and came != wanted:
+        missed.append(f"expect_reason = {wanted!r}, but the reason was {came!r}")
+    if scenario.expect_after is not None:
+        tick = _ended_at(outcome, log, done)
+        if tick < round(scenario.expect_after / scenario.T_s):
+            missed.append(
+                f"expect_after = {scenario.expect_after:g} s, but the end came at "
+                f"{tick * scenario.T_s:.6g} s"
+            )
+    return missed
+
+
+def _ended_at(outcome: Outcome, log: Sequence[dict[str, Any]], done: int) -> int:
+    """The tick of the event that ended the run, or after which the run waited to its end."""
+    of_it = [e for e in log if e.get("reason") == outcome.reason]
+    waited = [e["tick"] for e in of_it if e["event"] == outcome.status]
+    ended = [e["tick"] for e in of_it if e["event"] == "end" and e["status"] == outcome.status]
+    return max(waited or ended or [done])

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, COUNTS_OF, kept_of, recorded_in
-from gfm_hil.recording.npz import BLOCK, Table, write_npz
-from gfm_hil.recording.parts import Part, mapped, place_of
+from gfm_hil.recording.npz import BLOCK, ColumnGroup, write_npz
+from gfm_hil.recording.parts import RolePart, mapped, place_of
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.signals import NY
 
@@ -46,7 +46,7 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> None:
         OSError: a file cannot be written; it is then not there.
         UserError: a part is damaged, or ``parts`` is a link to anything but a recording.
     """
-    parts = {role: part for role in ROLES if (part := Part.read(folder, role)) is not None}
+    parts = {role: part for role in ROLES if (part := RolePart.read(folder, role)) is not None}
     place = place_of(folder) or folder
     files = {role: place / f"{role}_signals.npy" for role in parts}
     counts = {role: _recorded(files[role], len(part.signals)) for role, part in parts.items()}
@@ -62,14 +62,14 @@ def _signals(
     done: int,
     T_s: float,
     laws: list[str],
-) -> Iterator[Table]:
+) -> Iterator[ColumnGroup]:
     kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
 
     def clock(first: int, last: int) -> list[NDArray[Any]]:
         ticks = np.arange(first, last)
         return [ticks, ticks * T_s]
 
-    yield Table(kinds, done, clock)
+    yield ColumnGroup(kinds, done, clock)
     used = 0
 
     def rows(file: Path, law: int | None) -> Callable[[int, int], NDArray[Any]]:
@@ -84,14 +84,14 @@ def _signals(
 
     if "plant" in files:
         kinds = dict.fromkeys(columns["plant"], np.dtype(float))
-        yield Table(kinds, done, rows(files["plant"], None))
+        yield ColumnGroup(kinds, done, rows(files["plant"], None))
     if "controller" in files:
         kinds = dict.fromkeys(columns["controller"], np.dtype(float))
-        yield Table(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
-    yield Table.of(laws=np.array(known_laws(laws, used)))
+        yield ColumnGroup(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
+    yield ColumnGroup.of(laws=np.array(known_laws(laws, used)))
 
 
-def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[Table]:
+def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[ColumnGroup]:
     """The times of each side that recorded some, and what it counted."""
     for role, counts in COUNTS_OF.items():
         if role not in roles:
@@ -104,7 +104,7 @@ def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[Table]:
             names = names[: len(names) - len(counts)]
         if known.any():
             kinds = {f"{role}_{name}": np.dtype(np.int64) for name in names}
-            yield Table(kinds, done, partial(_rows, file, columns=len(kinds)))
+            yield ColumnGroup(kinds, done, partial(_rows, file, columns=len(kinds)))
 
 
 def laws_used(indices: NDArray[Any]) -> int:

@@ -46,7 +46,7 @@ _LAST = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS).flush()  # ends
 
 
 @dataclass(frozen=True)
-class Table:
+class ColumnGroup:
     """Columns to be written that are read together.
 
     Attributes:
@@ -60,14 +60,16 @@ class Table:
     read: Callable[[int, int], Iterable[NDArray[Any]]]
 
     @staticmethod
-    def of(**arrays: NDArray[Any]) -> Table:
+    def of(**arrays: NDArray[Any]) -> ColumnGroup:
         """Arrays of shape (rows,)."""
         kinds = {name: x.dtype for name, x in arrays.items()}
         rows = len(next(iter(arrays.values())))
-        return Table(kinds, rows, lambda first, last: [x[first:last] for x in arrays.values()])
+        return ColumnGroup(
+            kinds, rows, lambda first, last: [x[first:last] for x in arrays.values()]
+        )
 
 
-def write_npz(path: Path, tables: Iterable[Table]) -> None:
+def write_npz(path: Path, tables: Iterable[ColumnGroup]) -> None:
     """Write ``path`` as a whole, one table after the other, each read once from its first row on.
 
     Raises:

@@ -34,7 +34,7 @@ _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that link
 
 
 @dataclass
-class Part:
+class RolePart:
     """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
     ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress`` for
     observers: ticks done; of the plant the misses, of the controller the reason of SAFE."""
@@ -44,7 +44,7 @@ class Part:
     progress: NDArray[np.int64]
 
     @staticmethod
-    def create(folder: Path, role: Role, ticks: int, inner: bool = False) -> Part:
+    def create(folder: Path, role: Role, ticks: int, inner: bool = False) -> RolePart:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop.
 
         ``inner``: the run has an inner stage, and records its signals.
@@ -64,7 +64,7 @@ class Part:
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
-        return Part(
+        return RolePart(
             made("signals", "f8", (ticks, len(columns)), np.nan),
             made("times", "i8", (ticks, len(times)), -1),
             made("progress", "i8", (2,), 0),
@@ -75,14 +75,14 @@ class Part:
         self.signals[first : first + len(rows)] = rows
 
     @staticmethod
-    def open(folder: Path, role: Role) -> Part | None:
+    def open(folder: Path, role: Role) -> RolePart | None:
         """The files of a role, or None if they do not exist or one of them is damaged."""
         with contextlib.suppress(UserError, OSError):  # OSError: just removed
-            return Part.read(folder, role)
+            return RolePart.read(folder, role)
         return None
 
     @staticmethod
-    def read(folder: Path, role: Role) -> Part | None:
+    def read(folder: Path, role: Role) -> RolePart | None:
         """The files of a role, or None if one of them does not exist.
 
         Raises:
@@ -99,7 +99,7 @@ class Part:
         whole = types and widths and progress.shape == (2,) and len(signals) == len(times)
         if not whole or not 0 <= progress[0] <= len(signals):
             raise UserError(f"{files[0]}: is no recording of a {role}, nor are those beside it")
-        return Part(signals, times, progress)
+        return RolePart(signals, times, progress)
 
 
 def mapped(file: Path) -> NDArray[Any]:
@@ -124,7 +124,7 @@ def check_parts(folder: Path, ticks: int) -> None:
             its files before it begins, and writes no zeros over a whole page.
     """
     for role in ROLES:
-        part, place = Part.read(folder, role), place_of(folder)
+        part, place = RolePart.read(folder, role), place_of(folder)
         if part is None or place is None:
             continue
         if len(part.signals) != ticks:
@@ -157,7 +157,7 @@ class Kept:
         self._columns = np.empty((len(self._names), ticks))
 
     def put(self, first: int, rows: NDArray[np.float64]) -> None:
-        """As ``Part.put``."""
+        """As ``RolePart.put``."""
         self._columns[:, first : first + len(rows)] = rows.T[self._places]
 
     def named(self, done: int) -> dict[str, NDArray[np.float64]]:
@@ -194,7 +194,7 @@ def keep_in_memory(
             return
         except FileExistsError:  # another process of this run was first
             shutil.rmtree(place)
-            scratch.let_go(_holds.pop(parts))
+            scratch.release(_holds.pop(parts))
     place = place_of(folder) or parts.readlink()
     try:
         _holds[parts] = scratch.hold(place)
@@ -250,7 +250,7 @@ def _rescue(notice: Callable[[str], None]) -> None:
                 )
             if home is not None or not recorded:
                 shutil.rmtree(place)
-        scratch.let_go(hold)
+        scratch.release(hold)
 
 
 def _home_of(place: Path) -> tuple[int, str] | None:
@@ -308,4 +308,4 @@ def remove_parts(folder: Path) -> None:
     if parts.is_symlink():
         parts.unlink()
     if parts in _holds:
-        scratch.let_go(_holds.pop(parts))
+        scratch.release(_holds.pop(parts))

@@ -18,7 +18,7 @@ MISS_NEEDS = ("plant_scheduled", "plant_received")
 
 
 @dataclass(frozen=True)
-class Spread:
+class DurationHistogram:
     """A histogram of durations, which takes little memory: many ticks have the same duration.
 
     Attributes:
@@ -30,7 +30,7 @@ class Spread:
     count: NDArray[np.int64]
 
     @staticmethod
-    def of(durations: Iterable[NDArray[np.int64]]) -> Spread:
+    def of(durations: Iterable[NDArray[np.int64]]) -> DurationHistogram:
         """The histogram of durations in ns, given in pieces of any length."""
         ns, count = np.empty(0, np.int64), np.empty(0, np.int64)
         for piece in durations:
@@ -39,7 +39,7 @@ class Spread:
             ns, at = np.unique(np.concatenate([ns, new]), return_inverse=True)
             count = np.zeros(len(ns), np.int64)
             np.add.at(count, at, every)
-        return Spread(ns, count)
+        return DurationHistogram(ns, count)
 
     def __len__(self) -> int:
         return int(self.count.sum())
@@ -91,12 +91,12 @@ class Duration:
 
     def spread(
         self, columns: Columns, T_s: float, first: int = 0, last: int | None = None
-    ) -> Spread:
+    ) -> DurationHistogram:
         """The histogram over the ticks [first, last) with both stamps; read piece by piece."""
         last = len(columns[self.end]) if last is None else last
         both = zip(*(pieces(columns[name], first, last) for name in self.needs), strict=True)
         known = ((a, b, (a >= 0) & (b >= 0)) for a, b in both)
-        return Spread.of(self._ns(a[there], b[there], T_s) for a, b, there in known)
+        return DurationHistogram.of(self._ns(a[there], b[there], T_s) for a, b, there in known)
 
     def _ns(
         self, begin: NDArray[np.int64], end: NDArray[np.int64], T_s: float

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import PHASES, WAVES, Columns, Rows, wave
+from gfm_hil.recording.columns import PHASES, WAVES, ColumnLike, Columns, wave
 from gfm_plant import Bases
 
 NEEDS = ("t", "true_v_re", "true_v_im", "true_i_re", "true_i_im", "true_p", "true_q")
@@ -63,7 +63,7 @@ class Phase:
         return self.factor * (x.real * np.cos(angle) - x.imag * np.sin(angle))
 
 
-def three_phase(columns: Columns, bases: Bases, si: bool = False) -> dict[str, Rows]:
+def three_phase(columns: Columns, bases: Bases, si: bool = False) -> dict[str, ColumnLike]:
     """The phases of v, i and i_o as columns, shape (ticks,) each, by the names of ``DERIVED``.
 
     Args:

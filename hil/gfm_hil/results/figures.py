@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image  # matplotlib needs it too
 
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, Columns, Rows, pieces, wave
+from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, ColumnLike, Columns, pieces, wave
 from gfm_hil.recording.run import bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
@@ -35,7 +35,7 @@ _BINS = 60  # of the histogram of misses
 _GREY = "#888888"
 
 
-def _thin(t: Rows, x: Rows, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
+def _thin(t: ColumnLike, x: ColumnLike, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
     """Least and largest value of each stretch, so that no oscillation is drawn away.
 
     ``t`` and ``x`` are arrays or columns of a file, of which a piece is read at a time.
@@ -78,7 +78,7 @@ def dress(axes: Axes, title: str = "") -> None:
 def draw_panel(
     axes: Axes,
     title: str,
-    curves: Sequence[tuple[Rows, Rows, str, str]],
+    curves: Sequence[tuple[ColumnLike, ColumnLike, str, str]],
     factor: float = 1.0,
     styles: Sequence[Any] = _STYLES,
 ) -> None:
@@ -141,7 +141,7 @@ def _mark(
 class Magnitude:
     """The size of a vector of which two columns hold the components; only slices are read."""
 
-    def __init__(self, d: Rows, q: Rows) -> None:
+    def __init__(self, d: ColumnLike, q: ColumnLike) -> None:
         self._d, self._q, self.dtype = d, q, d.dtype
 
     def __len__(self) -> int:
@@ -151,7 +151,7 @@ class Magnitude:
         return np.hypot(self._d[rows], self._q[rows])
 
 
-def _shade(axes: Axes, t: Rows, x: Rows) -> None:
+def _shade(axes: Axes, t: ColumnLike, x: ColumnLike) -> None:
     """Shade the times at which a column of 0 and 1 is 1; one artist, read piece by piece."""
     changes, before = [], False
     for first, part in zip(range(0, len(x), PIECE), pieces(x, 0, len(x)), strict=True):

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import PIECE, Rows
+from gfm_hil.recording.columns import PIECE, ColumnLike
 
 Vector = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def hann(n: int) -> Vector:
     return window
 
 
-def cycle_means(column: Rows, first: int, last: int, width: float) -> Iterator[Vector]:
+def cycle_means(column: ColumnLike, first: int, last: int, width: float) -> Iterator[Vector]:
     """The mean of every window of ``width`` ticks that lies inside [first, last), in pieces.
 
     Value k belongs to the window that begins at tick ``first`` + k, so to the time (width − 1)/2

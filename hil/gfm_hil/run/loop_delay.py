@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
-from gfm_hil.recording.timing import ROUND_TRIP, Spread, missed
+from gfm_hil.recording.timing import ROUND_TRIP, DurationHistogram, missed
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def loop_delay(run: Run, set_s: float, margin_s: float) -> LoopDelay:
         raise UserError(f"{run.folder}: timing.npz lacks the plant's times")
     late = missed(run.timing)
     ages = _ages(~late)
-    held = Spread.of([ages * round(1e9 * T_s)])
+    held = DurationHistogram.of([ages * round(1e9 * T_s)])
     return LoopDelay(
         set_us,
         T_s_us,

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gfm_hil.recording.columns import PIECE, Columns, Rows, pieces
+from gfm_hil.recording.columns import PIECE, ColumnLike, Columns, pieces
 from gfm_hil.run.cycles import Vector, cycle_means, cycle_ticks, whole_ticks
 from gfm_hil.run.modes import LONGEST, fast_mode, swing
 
@@ -120,7 +120,7 @@ def event_metrics(
     return found
 
 
-def _mean(column: Rows, first: int, last: int) -> float:
+def _mean(column: ColumnLike, first: int, last: int) -> float:
     """The mean of a few ticks or many; exact where the column is constant."""
     base = float(column[first : first + 1][0])
     return base + sum(float(np.sum(x - base)) for x in pieces(column, first, last)) / (last - first)
@@ -134,7 +134,9 @@ def _extremes(parts: Iterable[Vector]) -> tuple[float, float]:
     return low, high
 
 
-def _crossed(p: Rows, start: int, stop: int, before: float, way: float, T_s: float) -> float | None:
+def _crossed(
+    p: ColumnLike, start: int, stop: int, before: float, way: float, T_s: float
+) -> float | None:
     """Time after ``start`` at which p first has gone ``way`` from ``before``, s."""
     for k, x in enumerate(pieces(p, start, stop)):
         there = np.flatnonzero((x - before) * math.copysign(1.0, way) >= abs(way))
@@ -143,7 +145,9 @@ def _crossed(p: Rows, start: int, stop: int, before: float, way: float, T_s: flo
     return None
 
 
-def _frequency(f: Rows, start: int, stop: int, width: int) -> tuple[float, float, float | None]:
+def _frequency(
+    f: ColumnLike, start: int, stop: int, width: int
+) -> tuple[float, float, float | None]:
     """Extremes of f, p.u., and its largest slope over ``width`` ticks, p.u. a tick."""
     least, most, slope = math.inf, -math.inf, None
     for first in range(start, stop, PIECE):

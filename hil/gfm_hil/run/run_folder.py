@@ -30,7 +30,7 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import Columns, bytes_per_tick
 from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
-from gfm_hil.recording.npz import Table, write_npz
+from gfm_hil.recording.npz import ColumnGroup, write_npz
 from gfm_hil.recording.parts import check_parts, place_of, remove_parts
 from gfm_hil.recording.run import Run, began, converters_of, read_recording, read_scenario
 from gfm_hil.run.summary import origin, stages, summarise
@@ -180,7 +180,7 @@ def _alone(folder: Path) -> Iterator[None]:
             raise UserError(f"{folder}: the run is still going on") from None
         place = place_of(folder)
         if place is not None and place.parent != folder:
-            stack.callback(scratch.let_go, scratch.hold(place))
+            stack.callback(scratch.release, scratch.hold(place))
         yield
 
 
@@ -285,8 +285,8 @@ def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
             write_text(law, run.law_text)
             scenario = scenario.model_copy(update={"law": str(law)})
         write_scenario(folder, scenario)
-        laws = Table.of(laws=np.array(run.laws))
-        write_npz(folder / "signals.npz", [laws, Table.of(**arrays)])
+        laws = ColumnGroup.of(laws=np.array(run.laws))
+        write_npz(folder / "signals.npz", [laws, ColumnGroup.of(**arrays)])
         write_npz(folder / "timing.npz", [])
         lines = "".join(json.dumps(event) + "\n" for event in run.events)
         write_text(folder / "events.jsonl", lines)
@@ -342,7 +342,7 @@ def merge_roles(first: Path, second: Path, folder: Path, report: Report | None =
         write_scenario(folder, plant.scenario)
         write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
         own = {k: v for k, v in controller.columns.items() if k not in ("tick", "t")}
-        laws = Table.of(laws=np.array(controller.laws))
+        laws = ColumnGroup.of(laws=np.array(controller.laws))
         tables = [_padded(plant.columns, done, np.nan), _padded(own, done, np.nan), laws]
         write_npz(folder / "signals.npz", tables)
         times = [_padded(run.timing, done, -1) for run in (plant, controller)]
@@ -367,7 +367,7 @@ def _link_end(role: Role, summary: dict[str, Any]) -> dict[str, Any]:
     return {key: summary[key][role] for key in keys if role in summary.get(key, {})}
 
 
-def _padded(columns: Columns, rows: int, missing: float) -> Table:
+def _padded(columns: Columns, rows: int, missing: float) -> ColumnGroup:
     """Columns of one side, cut or filled up with ``missing`` to ``rows``."""
 
     def read(first: int, last: int) -> Iterator[NDArray[Any]]:
@@ -376,7 +376,7 @@ def _padded(columns: Columns, rows: int, missing: float) -> Table:
             rest = np.full(last - first - len(found), missing, found.dtype)
             yield np.concatenate([found, rest])
 
-    return Table({name: column.dtype for name, column in columns.items()}, rows, read)
+    return ColumnGroup({name: column.dtype for name, column in columns.items()}, rows, read)
 
 
 def _conclude(run: Run, report: Report | None) -> None:

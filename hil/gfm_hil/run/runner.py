@@ -21,10 +21,10 @@ from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
-from gfm_hil.recording.columns import Rows
+from gfm_hil.recording.columns import ColumnLike
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
-from gfm_hil.recording.parts import Kept, Part, remove_parts
+from gfm_hil.recording.parts import Kept, RolePart, remove_parts
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.run_folder import Report, check_free, cut_short, finish, in_use
@@ -220,8 +220,8 @@ def _run_here(
 ) -> float:
     """Run both sides of each converter in this process; returns when the first tick was run."""
     ticks, inner = benches[0].scenario.ticks, benches[0].inner
-    plant_parts = [Part.create(place, "plant", ticks, inner) for place in places]
-    controller_parts = [Part.create(place, "controller", ticks, inner) for place in places]
+    plant_parts = [RolePart.create(place, "plant", ticks, inner) for place in places]
+    controller_parts = [RolePart.create(place, "controller", ticks, inner) for place in places]
     timelines = [
         Timeline(bench, place / "events_both.jsonl", ROLES)
         for bench, place in zip(benches, places, strict=True)
@@ -286,7 +286,10 @@ def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> l
     ):
         timeline.close()
         scenario = bench.scenario
-        columns: dict[str, Rows] = {"tick": np.arange(done), "t": np.arange(done) * scenario.T_s}
+        columns: dict[str, ColumnLike] = {
+            "tick": np.arange(done),
+            "t": np.arange(done) * scenario.T_s,
+        }
         columns |= plant.named(done) | controller.named(done)
         outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
         summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import OUR_CONTROLLER, Role, target_of
-from gfm_hil.recording.columns import INSTRUCTIONS, Columns, Rows, pieces
-from gfm_hil.recording.log import Outcome, cause
+from gfm_hil.recording.columns import INSTRUCTIONS, ColumnLike, Columns, pieces
+from gfm_hil.recording.log import Outcome, cause, unmet
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.recording.timing import ROUND_TRIP, Spread, count_misses
+from gfm_hil.recording.timing import ROUND_TRIP, DurationHistogram, count_misses
 from gfm_hil.run.doctor import verdict
 from gfm_hil.run.metrics import event_metrics
 from gfm_hil.run.modes import acting, free_from
 from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.scenario import Scenario
-from gfm_hil.scenario.expectation import reason_name, unmet
+from gfm_hil.scenario.expectation import reason_name
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.inner_file import NO_INNER
 
@@ -172,9 +172,9 @@ def _round_trip(timing: Columns, T_s: float) -> dict[str, float] | None:
     return ROUND_TRIP.spread(timing, T_s).percentiles_us() or None
 
 
-def _instructions(counted: Rows) -> dict[str, int]:
+def _instructions(counted: ColumnLike) -> dict[str, int]:
     """The fewest, the median and the most of a tick, of the ticks in which they were counted."""
-    found = Spread.of(piece[piece >= 0] for piece in pieces(counted, 0, len(counted)))
+    found = DurationHistogram.of(piece[piece >= 0] for piece in pieces(counted, 0, len(counted)))
     return {
         name: round(found.percentile(q)) for name, q in (("least", 0), ("p50", 50), ("most", 100))
     }

@@ -377,7 +377,9 @@ class Scenario(StrictSchema):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:
-        problems = check_expectation(self)
+        problems = check_expectation(
+            self.expect, self.expect_reason, self.expect_after, self.duration
+        )
         if self.ticks < 1:
             problems.append(f"duration = {self.duration:g} s: not one tick of T_s = {self.T_s:g} s")
         if self.waveforms and not 0 <= self.waveforms[0] < min(self.waveforms[1], self.duration):

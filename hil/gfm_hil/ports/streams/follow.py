@@ -20,7 +20,7 @@ _LAST = 1  # newest rows not read yet: a tick's last time is written after it co
 
 @dataclass(frozen=True)
 class NewRows:
-    """Rows of one side, as in ``recording.parts.Part``.
+    """Rows of one side, as in ``recording.parts.RolePart``.
 
     Attributes:
         role: ``"plant"`` or ``"controller"``.

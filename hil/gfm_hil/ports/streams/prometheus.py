@@ -19,7 +19,7 @@ from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.ports.streams.metrics import METRICS
-from gfm_hil.recording.timing import ROUND_TRIP, SLACK, Spread
+from gfm_hil.recording.timing import ROUND_TRIP, SLACK, DurationHistogram
 from gfm_runtime.states import STATES
 
 _FRESH_S = 0.2  # for so long all scrapes get the same metrics
@@ -111,7 +111,7 @@ def _metric(name: str) -> CounterMetricFamily | GaugeMetricFamily:
     return kind(name, about.text, labels=[about.label] if about.label else [])
 
 
-def _quantiles(name: str, found: Spread, quantiles: tuple[float, ...]) -> Metric:
+def _quantiles(name: str, found: DurationHistogram, quantiles: tuple[float, ...]) -> Metric:
     metric = _metric(name)
     for q in quantiles if found else ():
         metric.add_metric([f"{q:g}"], found.percentile(100 * q) * 1e-9)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class SynchroCheck(StrictSchema):
@@ -55,11 +52,11 @@ class Switch(PlantEvent):
         """The end of its label."""
         return "" if self.check is None else " when synchronous"
 
-    def switch(self, plant: Network) -> None:
+    def switch(self, plant: gfm_plant.Network) -> None:
         """Open or close at once."""
         raise NotImplementedError
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         by = self.check
         if by is None:
             self.switch(plant)
@@ -68,7 +65,7 @@ class Switch(PlantEvent):
         limits = by.V, f_hz, by.degrees, by.lasting_s, by.within_s
         gfm_plant.check_synchronism(plant, name, *limits)
 
-    def try_on(self, plant: Network) -> None:
+    def try_on(self, plant: gfm_plant.Network) -> None:
         from gfm_plant.synchro_check import AGREED
 
         self.apply(plant)
@@ -88,7 +85,7 @@ class LineBreaker(Switch):
     def label(self) -> str:
         return f"{self.name} " + ("on" if self.closed else "off") + self.when()
 
-    def switch(self, plant: Network) -> None:
+    def switch(self, plant: gfm_plant.Network) -> None:
         gfm_plant.line_breaker(plant, self.name, self.closed)
 
 

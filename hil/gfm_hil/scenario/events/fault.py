@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
 from gfm_plant.names import FAULTED_PHASES
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class Fault(PlantEvent):
@@ -85,7 +82,7 @@ class Fault(PlantEvent):
             where = f"node {self.node}"
         return f"{self.what} at {where}" + (f" for {self.duration:g} s" if self.duration else "")
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.fault(
             plant, self.position, self.R, self.duration, line=self.line, node=self.node,
             kind=self.kind, phases=self.phases, Z_0=self.Z_0,

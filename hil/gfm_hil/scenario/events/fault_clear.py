@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class FaultClear(PlantEvent):
@@ -21,7 +18,7 @@ class FaultClear(PlantEvent):
     def label(self) -> str:
         return "fault cleared"
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.clear_fault(plant)
 
 

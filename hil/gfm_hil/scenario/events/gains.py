@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Retuned = tuple[DiscreteLaw, NDArray[Any]]  #: a law, and the record that the kernel takes
 
 
-class Gains(Event):
+class GainChange(Event):
     """New gains of the active law, by the names in its file, without a bump. Tied parameters
     follow."""
 
@@ -51,7 +51,7 @@ class Gains(Event):
         c.retune(*ready_gains(c, self.values), {**c.gains, **self.values})
 
 
-EVENT = Gains
+EVENT = GainChange
 
 
 @lru_cache(maxsize=64)
@@ -103,7 +103,7 @@ def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
             name, gains = event.law, {}
         elif isinstance(event, Reset):
             name, gains = scenario.law, {}
-        elif isinstance(event, Gains):
+        elif isinstance(event, GainChange):
             gains.update(event.values)
             try:
                 given = tuple(sorted(gains.items()))

@@ -11,7 +11,6 @@ from gfm_hil.scenario.events.breaker import Switch
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.schema import Scenario
-    from gfm_plant import Network
 
 
 class GridBreaker(Switch):
@@ -27,7 +26,7 @@ class GridBreaker(Switch):
         alone = scenario.plant.grid.load_R is None and not scenario.network
         return ["the breaker needs plant.grid.load_R and load_L"] if alone else []
 
-    def switch(self, plant: Network) -> None:
+    def switch(self, plant: gfm_plant.Network) -> None:
         gfm_plant.breaker(plant, self.closed)
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class GridFrequency(PlantEvent):
@@ -23,7 +20,7 @@ class GridFrequency(PlantEvent):
     def label(self) -> str:
         return f"grid {self.f_hz:g} Hz" + (f" at {self.rate:g} Hz/s" if self.rate else "")
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         f_n = nominal_hz(plant)
         gfm_plant.grid_frequency(plant, self.f_hz / f_n, self.rate / f_n if self.rate else None)
 

@@ -11,7 +11,6 @@ from gfm_hil.scenario.events.base import PlantEvent
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.schema import Scenario
-    from gfm_plant import Network
 
 
 class GridImpedance(PlantEvent):
@@ -42,7 +41,7 @@ class GridImpedance(PlantEvent):
             )
         return self
 
-    def factors(self, plant: Network) -> tuple[float, float]:
+    def factors(self, plant: gfm_plant.Network) -> tuple[float, float]:
         """Of the line's nominal L and R.
 
         Raises:
@@ -70,7 +69,7 @@ class GridImpedance(PlantEvent):
             "grid-impedance is for the line of one converter alone; a network's lines have breakers"
         ]
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_impedance(plant, *self.factors(plant))
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class GridLoad(PlantEvent):
@@ -22,7 +19,7 @@ class GridLoad(PlantEvent):
     def label(self) -> str:
         return f"grid load {self.change:+g} p.u."
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_load(plant, self.change)
 
 

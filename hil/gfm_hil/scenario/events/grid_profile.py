@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -23,9 +23,6 @@ from gfm_hil.scenario.events.base import EventTarget, PlantEvent, nominal_hz
 from gfm_runtime.errors import printable
 from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import SIGNALS
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 _COLUMNS = ("t", "f_hz", "omega_g", "V_g")
 _RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
@@ -51,13 +48,13 @@ class GridProfile(PlantEvent):
     def label(self) -> str:
         return f"grid profile {PurePath(self.file).stem}"
 
-    def course(self, plant: Network) -> Iterator[tuple[int, Point]]:
+    def course(self, plant: gfm_plant.Network) -> Iterator[tuple[int, ProfilePoint]]:
         return read_profile(self.file, nominal_hz(plant)).points(float(plant.net[0]["T_s"]))
 
-    def try_on(self, plant: Network) -> None:
+    def try_on(self, plant: gfm_plant.Network) -> None:
         next(self.course(plant))[1].apply(plant)
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         """Its points follow."""
 
     def check_now(self, target: EventTarget) -> None:
@@ -67,7 +64,7 @@ class GridProfile(PlantEvent):
 EVENT = GridProfile
 
 
-class Point(NamedTuple):
+class ProfilePoint(NamedTuple):
     """What the plant does from a tick of a course on: go to these values, in a line.
 
     Attributes:
@@ -79,7 +76,7 @@ class Point(NamedTuple):
     V_g: float | None
     ticks: int
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         """Carry it out on the plant's records, between two ticks.
 
         Raises:
@@ -92,7 +89,7 @@ class Point(NamedTuple):
         if self.V_g is not None:
             gfm_plant.grid_voltage(plant, self.V_g, self._rate(self.V_g, plant, "V_g"))
 
-    def _rate(self, value: float, plant: Network, name: str) -> float | None:
+    def _rate(self, value: float, plant: gfm_plant.Network, name: str) -> float | None:
         """p.u./s from where the grid is now; None for a step."""
         way = abs(value - float(plant.now[0][name]))
         return way / (self.ticks * float(plant.net[0]["T_s"])) if self.ticks and way else None
@@ -111,14 +108,14 @@ class Profile:
     omega_g: list[float] | None
     V_g: list[float] | None
 
-    def points(self, T_s: float) -> Iterator[tuple[int, Point]]:
+    def points(self, T_s: float) -> Iterator[tuple[int, ProfilePoint]]:
         """What the plant does, each with its tick after the event. Lines that fall on the same
         tick count as the last of them."""
         last = {round(t / T_s): k for k, t in enumerate(self.t)}
 
-        def to(k: int, ticks: int) -> Point:
+        def to(k: int, ticks: int) -> ProfilePoint:
             omega_g, V_g = (x[k] if x is not None else None for x in (self.omega_g, self.V_g))
-            return Point(omega_g, V_g, ticks)
+            return ProfilePoint(omega_g, V_g, ticks)
 
         first = next(iter(last))
         yield first, to(last[first], 0)

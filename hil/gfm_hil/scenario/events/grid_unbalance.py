@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class GridUnbalance(PlantEvent):
@@ -52,7 +49,7 @@ class GridUnbalance(PlantEvent):
         turns = ", ".join(f"{angle:g}°" for angle in self.degrees) if any(self.degrees) else ""
         return f"phases at {sizes}" + (f", turned {turns}" if turns else "")
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_unbalance(plant, self.factors(), self.duration)
 
 

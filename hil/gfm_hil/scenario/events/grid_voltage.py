@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class GridVoltage(PlantEvent):
@@ -30,7 +27,7 @@ class GridVoltage(PlantEvent):
     def label(self) -> str:
         return f"grid {self.V_g:g} p.u." + (f" for {self.duration:g} s" if self.duration else "")
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_voltage(plant, self.V_g, self.rate, self.duration)
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import Field
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-
-if TYPE_CHECKING:
-    from gfm_plant import Network
 
 
 class PhaseJump(PlantEvent):
@@ -22,7 +19,7 @@ class PhaseJump(PlantEvent):
     def label(self) -> str:
         return f"phase jump {self.degrees:g}°"
 
-    def apply(self, plant: Network) -> None:
+    def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.phase_jump(plant, self.degrees)
 
 
